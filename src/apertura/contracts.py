@@ -1,0 +1,198 @@
+"""What each stage holds: dimensions, dtype and unit of every variable, and what is written beside it.
+
+Stages are nouns and data flows one way: raw → echo → profile → image → cube → files; `track` joins
+at echo. Two functions serve every step: `check` refuses a dataset that breaks its contract, and
+`stamp` writes where it came from.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from apertura import __version__
+from apertura.errors import ContractError
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of a stage."""
+
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One station of the road: its arrays and the attributes that must stand beside them."""
+
+    variables: Mapping[str, Variable]
+    attributes: Mapping[str, str]
+
+
+_PULSE_GEOMETRY = {
+    "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the pulse, transmitter's clock"),
+    "tx_position": Variable(("pulse", "axis"), "float64", "m", "transmitting phase centre, in `frame`"),
+    "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
+}
+_FRAME = {
+    "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
+    "pair": "transmitter-receiver",
+    "flags": "edges crossed so far: flag name → what was measured, in one line",
+}
+
+STAGES: Mapping[str, Stage] = {
+    "raw": Stage(
+        {
+            "iq": Variable(("channel", "pulse", "sample", "component"), "int16", "1", "ADC counts: I, Q"),
+            "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, node's own clock"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload, -1 without"),
+        },
+        {"node": "node name", "channels": "names of the channels", "sample_rate_hz": "complex samples per second"},
+    ),
+    "track": Stage(
+        {
+            "time": Variable(("epoch",), "datetime64[ns]", "", "UTC"),
+            "position": Variable(("epoch", "axis"), "float64", "m", "logged point, ECEF (EPSG:4978)"),
+            "attitude": Variable(
+                ("epoch", "axis"), "float64", "rad", "roll, pitch, yaw of forward-right-down axes; NaN where not logged"
+            ),
+        },
+        {"node": "node name"},
+    ),
+    "echo": Stage(
+        {
+            **_PULSE_GEOMETRY,
+            "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
+            "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
+            "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
+        },
+        _FRAME,
+    ),
+    "profile": Stage(
+        {
+            **_PULSE_GEOMETRY,
+            "profile": Variable(
+                ("pulse", "range"), "complex64", "1", "range profile; times exp(+j2πf_mid·path/c) it is in phase"
+            ),
+            "start": Variable(("pulse",), "float64", "m", "total path (tx → scene → rx) of range sample 0"),
+        },
+        {
+            **_FRAME,
+            "step_m": "total path between range samples, m",
+            "centre_frequency_hz": "f_mid, to which the profile is referenced, Hz",
+            "oversampling": "samples per resolution cell c/B of total path",
+            "window": "weighting over the subcarriers",
+        },
+    ),
+    "image": Stage(
+        {"image": Variable(("y", "x"), "complex64", "1", "focused scene, carrier kept")},
+        {**_FRAME, "numerical_error_db": "RMS error on random pixels against `reference`, dB"},
+    ),
+    "cube": Stage(
+        {"image": Variable(("flight", "pair", "y", "x"), "complex64", "1", "every image on the campaign grid")},
+        {},
+    ),
+}
+
+
+def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+    """Return `dataset` unchanged if it keeps the contract of `stage`.
+
+    Parameters
+    ----------
+    dataset
+        Arrays and attributes to be passed on; dask arrays are not computed.
+    stage
+        A key of `STAGES`.
+
+    Raises
+    ------
+    ContractError
+        Listing every variable or attribute that is missing or has other dimensions or dtype.
+
+    Examples
+    --------
+    >>> check(xr.Dataset(), "image")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.ContractError: image: no variable 'image'; no attribute 'frame'; ...
+    """
+    contract = STAGES[stage]
+    wrong = [f"no variable '{name}'" for name in contract.variables if name not in dataset.variables]
+    for name, promise in contract.variables.items():
+        if name not in dataset.variables:
+            continue
+        array = dataset[name]
+        if array.dims != promise.dims:
+            wrong.append(f"{name} has dims {array.dims}, not {promise.dims}")
+        if array.dtype != np.dtype(promise.dtype):
+            wrong.append(f"{name} is {array.dtype}, not {promise.dtype}")
+    wrong += [f"no attribute '{name}'" for name in contract.attributes if name not in dataset.attrs]
+    if wrong:
+        raise ContractError(f"{stage}: {'; '.join(wrong)}")
+    return dataset
+
+
+def stamp(
+    dataset: xr.Dataset,
+    stage: str,
+    *,
+    runspec: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    code_sha256: str,
+) -> xr.Dataset:
+    """Check `dataset` and write units and provenance into its attributes.
+
+    Parameters
+    ----------
+    dataset
+        What the stage computed.
+    stage
+        A key of `STAGES`.
+    runspec
+        Every setting that mattered for this stage and those before it.
+    inputs
+        Role → sha256 of each thing read.
+    code_sha256
+        Chain of the code hashes of this stage and those before it.
+
+    Returns
+    -------
+    xarray.Dataset
+        A shallow copy; the arrays are shared.
+
+    Raises
+    ------
+    ContractError
+        As `check`.
+    """
+    stamped = check(dataset, stage).copy()
+    for name, promise in STAGES[stage].variables.items():
+        if promise.unit:
+            stamped[name].attrs["units"] = promise.unit
+        stamped[name].attrs["long_name"] = promise.meaning
+    stamped.attrs |= {
+        "apertura_stage": stage,
+        "apertura_version": __version__,
+        "runspec": canonical_json(runspec),
+        "inputs": dict(sorted(inputs.items())),
+        "code_sha256": code_sha256,
+    }
+    return stamped
+
+
+def canonical_json(value: object) -> str:
+    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
+
+    Examples
+    --------
+    >>> canonical_json({"b": 1, "a": [1.5, None]})
+    '{"a":[1.5,null],"b":1}'
+    """
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

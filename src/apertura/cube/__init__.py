@@ -1,0 +1,1 @@
+"""All flights and pairs on one grid, and what they add up to."""

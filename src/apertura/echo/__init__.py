@@ -1,0 +1,1 @@
+"""From captured symbols to calibrated transfer functions and range profiles."""

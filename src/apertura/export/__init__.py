@@ -1,0 +1,1 @@
+"""Images out of the house: one file per format."""

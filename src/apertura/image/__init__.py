@@ -1,0 +1,1 @@
+"""From range profiles to a focused image on the campaign grid."""

@@ -1,0 +1,65 @@
+"""What an engine is given: the recorded history as plain arrays, without settings or files."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Calibrated transfer functions, as `reference` sums them.
+
+    Attributes
+    ----------
+    transfer
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πf(τ - reference_delay_s)).
+    frequency_hz
+        (subcarrier,) float64, RF frequency.
+    weight
+        (subcarrier,) float64, window over the subcarriers.
+    reference_delay_s
+        (pulse,) float64, delay already removed from `transfer`.
+    tx_position_m, rx_position_m
+        (pulse, 3) float64, phase centres in the frame of the pixels.
+    """
+
+    transfer: NDArray[np.complex64]
+    frequency_hz: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    reference_delay_s: NDArray[np.float64]
+    tx_position_m: NDArray[np.float64]
+    rx_position_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Range profiles of a band-limited signal, cropped to the scene.
+
+    Sample i of pulse p lies at total path ``start_m[p] + i·step_m`` and holds
+    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/c) (with H_n for absolute delay), so that
+    profile·exp(+j2π f_mid·path/c) is in phase at a target.
+
+    Attributes
+    ----------
+    samples
+        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 against c/B of total path.
+    start_m
+        (pulse,) float64, total path tx → pixel → rx of sample 0, metres.
+    step_m
+        Total path between samples, metres.
+    centre_frequency_hz
+        f_mid.
+    oversampling
+        Nyquist cells per sample inverted: (c/B)/step_m.
+    tx_position_m, rx_position_m
+        (pulse, 3) float64, phase centres in the frame of the pixels.
+    """
+
+    samples: NDArray[np.complex64]
+    start_m: NDArray[np.float64]
+    step_m: float
+    centre_frequency_hz: float
+    oversampling: float
+    tx_position_m: NDArray[np.float64]
+    rx_position_m: NDArray[np.float64]

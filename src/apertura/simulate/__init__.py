@@ -1,0 +1,1 @@
+"""Campaign folders like real ones from a scene, trajectories and impairments with known truth."""

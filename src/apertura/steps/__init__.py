@@ -1,0 +1,1 @@
+"""One module per wing, one function per rule: open → physics → stamp → save."""
