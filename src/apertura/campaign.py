@@ -1,0 +1,237 @@
+"""A campaign folder as one value: its settings, its flights, and where everything in it lies."""
+
+import csv
+import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from apertura.errors import CampaignError
+from apertura.settings import Name, OfdmWaveform, Settings
+
+CONFIG = Path("config/config.yaml")
+FLIGHTS = Path("config/flights.tsv")
+_COLUMNS = ["flight", "kind", "transmitter", "nodes"]
+_NAME: TypeAdapter[str] = TypeAdapter(Name)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One line of flights.tsv."""
+
+    name: str
+    kind: str
+    transmitter: str
+    nodes: tuple[str, ...]
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Transmitter-receiver names, as folders are named."""
+        return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A validated campaign folder.
+
+    Examples
+    --------
+    >>> Campaign.load("nowhere")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
+    """
+
+    root: Path
+    settings: Settings
+    flights: tuple[Flight, ...]
+
+    @classmethod
+    def load(cls, root: str | Path) -> "Campaign":
+        """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
+        root = Path(root)
+        settings = _read_settings(root / CONFIG)
+        return cls(root, settings, tuple(_read_flights(root / FLIGHTS, settings)))
+
+    @property
+    def image_flights(self) -> tuple[Flight, ...]:
+        """Flights that become images."""
+        return tuple(flight for flight in self.flights if flight.kind == "image")
+
+    def flight(self, name: str) -> Flight:
+        """Return the flight called `name`."""
+        return next(flight for flight in self.flights if flight.name == name)
+
+    def raw_file(self, flight: str, node: str, suffix: str) -> Path:
+        """Return raw/<flight>/<node><suffix>, which must exist."""
+        path = self.root / "raw" / flight / f"{node}{suffix}"
+        if not path.is_file():
+            raise CampaignError(
+                "no such file",
+                where=path,
+                expected=f"the recording of node {node} in flight {flight}",
+                remedy=f"Copy it there, or take {node} out of the nodes of {flight} in {FLIGHTS}.",
+            )
+        return path
+
+    def raw_files(self, flight: str, node: str) -> dict[str, Path]:
+        """Return role → file of everything recorded by `node` in `flight`."""
+        if not isinstance(self.settings.waveform, OfdmWaveform):
+            return {f"history.{path.name}": path for path in self._history_files(flight, node)}
+        return {
+            "meta": self.raw_file(flight, node, ".sigmf-meta"),
+            "data": self.raw_file(flight, node, ".sigmf-data"),
+            "track": self.track_file(flight, node),
+        }
+
+    def track_file(self, flight: str, node: str) -> Path:
+        """Return the one raw/<flight>/<node>.track.* file."""
+        found = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
+        if len(found) == 1:
+            return found[0]
+        raise CampaignError(
+            f"{len(found)} track files {[path.name for path in found]}",
+            where=self.root / "raw" / flight / f"{node}.track.*",
+            expected=f"exactly one flight log of node {node}",
+            remedy="Copy the log there, named <node>.track.<csv|pos>.",
+        )
+
+    def _history_files(self, flight: str, node: str) -> list[Path]:
+        found = sorted((self.root / "raw" / flight).glob(f"{node}.*.mat"))
+        if not found:
+            raise CampaignError(
+                "no such file",
+                where=self.root / "raw" / flight / f"{node}.*.mat",
+                expected=f"the phase history of node {node} in flight {flight}",
+                remedy="Copy the .mat files there, named <node>.<anything>.mat.",
+            )
+        return found
+
+
+def _read_settings(path: Path) -> Settings:
+    if not path.is_file():
+        raise CampaignError(
+            "no such file", where=path, expected="a campaign folder", remedy="`apertura init` writes a commented one."
+        )
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CampaignError(
+            f"not readable as YAML ({' '.join(str(error).split())})",
+            where=path,
+            expected="YAML",
+            remedy="Mend the line named.",
+        ) from error
+    return validated(document, where=path)
+
+
+def validated(document: object, *, where: object) -> Settings:
+    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+
+    Raises
+    ------
+    CampaignError
+        With file, key, what was found and what was expected.
+
+    Examples
+    --------
+    >>> validated({"campaing": "x"}, where="config.yaml")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); campaign: missing; ...
+    """
+    try:
+        return Settings.model_validate(document)
+    except ValidationError as error:
+        wrong = [_complaint(dict(item)) for item in error.errors(include_url=False)]
+        raise CampaignError(
+            "; ".join(sorted(wrong, key=lambda line: "unknown key" not in line)),
+            where=where,
+            expected="the keys and values config/README.md lists",
+            remedy="Correct what is named.",
+        ) from error
+
+
+def _complaint(item: dict[str, Any]) -> str:
+    location = [str(part) for part in item["loc"] if part not in {"ofdm", "phase_history"}]
+    key = ".".join(location) or "the whole file"
+    if item["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(location[-1], _known_keys(Settings), n=1, cutoff=0.5)
+        return f"{key}: unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
+    if item["type"] == "missing":
+        return f"{key}: missing"
+    found = "" if isinstance(item["input"], dict | BaseModel) else f" (found {item['input']!r})"
+    return f"{key}: {item['msg'].removeprefix('Value error, ')}{found}"
+
+
+def _known_keys(model: type[BaseModel]) -> list[str]:
+    return sorted(_walk_keys(model.model_json_schema()))
+
+
+def _walk_keys(schema: object) -> set[str]:
+    if isinstance(schema, list):
+        return set().union(*map(_walk_keys, schema))
+    if not isinstance(schema, dict):
+        return set()
+    nested = set().union(*map(_walk_keys, schema.values()))
+    properties = schema.get("properties", {})
+    return nested | set(properties) if isinstance(properties, dict) else nested
+
+
+def _read_flights(path: Path, settings: Settings) -> Iterator[Flight]:
+    if not path.is_file():
+        raise CampaignError(
+            "no such file",
+            where=path,
+            expected=f"a tab-separated table {_COLUMNS}",
+            remedy="Write one line per flight.",
+        )
+    with path.open(encoding="utf-8", newline="") as lines:
+        table = csv.DictReader(lines, delimiter="\t")
+        if table.fieldnames is None or [name.strip() for name in table.fieldnames] != _COLUMNS:
+            raise CampaignError(
+                f"columns {table.fieldnames}", where=path, expected=f"{_COLUMNS}, tab-separated", remedy="Mend line 1."
+            )
+        seen: set[str] = set()
+        for number, row in enumerate(table, start=2):
+            flight = _flight(row, settings, where=f"{path}: line {number}")
+            if flight.name in seen:
+                raise CampaignError(
+                    f"flight {flight.name} a second time",
+                    where=f"{path}: line {number}",
+                    expected="each flight once",
+                    remedy="Join the lines or rename one flight.",
+                )
+            seen.add(flight.name)
+            yield flight
+    if not seen:
+        raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
+
+
+def _flight(row: dict[str, str | None], settings: Settings, *, where: str) -> Flight:
+    cells = {key: (value or "").strip() for key, value in row.items() if key in _COLUMNS}
+    nodes = tuple(name.strip() for name in cells["nodes"].split(",") if name.strip())
+    problem = None
+    try:
+        _NAME.validate_python(cells["flight"])
+    except ValidationError as error:
+        problem = error.errors()[0]["msg"].removeprefix("Value error, ")
+    if cells["kind"] not in {"image", "calibration"}:
+        problem = f"kind {cells['kind']!r} is neither image nor calibration"
+    unknown = [name for name in (cells["transmitter"], *nodes) if name not in settings.nodes]
+    if unknown:
+        problem = f"node {unknown[0]!r} is not in {CONFIG}: nodes"
+    if not nodes or len(set(nodes)) != len(nodes):
+        problem = f"nodes {cells['nodes']!r} are none or doubled"
+    if problem:
+        raise CampaignError(
+            problem,
+            where=where,
+            expected=f"flight, image|calibration, a transmitter and nodes among {sorted(settings.nodes)}",
+            remedy="Mend the line.",
+        )
+    return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)

@@ -1,0 +1,100 @@
+"""Where a product comes from: hashes of files, of folders and of the code that ran."""
+
+import ast
+import functools
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+
+
+def sha256_file(path: Path) -> str:
+    """Return the sha256 of a file's bytes, hex.
+
+    Examples
+    --------
+    >>> len(sha256_file(Path(__file__)))
+    64
+    """
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_tree(folder: Path) -> dict[str, str]:
+    """Return relative path → sha256 of every file below `folder`, sorted by path."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256_file(path) for path in files}
+
+
+def code_sha256(*modules: str) -> str:
+    """Return the hash of the source of `modules` and of every apertura module they import, however deep.
+
+    A stage's hash therefore changes when, and only when, code it can run has changed.
+
+    Parameters
+    ----------
+    *modules
+        Dotted names such as ``apertura.steps.echo``.
+
+    Examples
+    --------
+    >>> code_sha256("apertura.constants") != code_sha256("apertura.errors")
+    True
+    """
+    digest = hashlib.sha256()
+    for name, path in sorted(_closure(modules).items()):
+        digest.update(f"{name}\0{sha256_file(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def chained_sha256(own: str, parents: Iterable[str]) -> str:
+    """Return one hash for a stage's own code and the chains of the stages it stands on."""
+    return hashlib.sha256("\n".join([own, *sorted(parents)]).encode()).hexdigest()
+
+
+def merged(*sources: Mapping[str, str]) -> dict[str, str]:
+    """Return the union of role → hash mappings, sorted by role.
+
+    Raises
+    ------
+    ValueError
+        If two sources give one role different hashes.
+    """
+    union: dict[str, str] = {}
+    for source in sources:
+        for role, digest in source.items():
+            if union.setdefault(role, digest) != digest:
+                raise ValueError(f"{role} has two hashes: {union[role]} and {digest}")
+    return dict(sorted(union.items()))
+
+
+def _closure(modules: Iterable[str]) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        path = _source(name)
+        if path is None or name in found:
+            continue
+        found[name] = path
+        waiting += _imports(path)
+    return found
+
+
+def _source(name: str) -> Path | None:
+    if name.split(".")[0] != _PACKAGE.name:
+        return None
+    base = _PACKAGE.joinpath(*name.split(".")[1:])
+    return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
+
+
+@functools.cache
+def _imports(path: Path) -> tuple[str, ...]:
+    names: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(names)

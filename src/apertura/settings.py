@@ -1,0 +1,169 @@
+"""The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
+
+Only `steps` and the command line see these objects; wings get plain arrays and numbers.
+"""
+
+import re
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+Metres3 = tuple[float, float, float]
+RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "benchmarks", "cube.zarr"})
+
+
+def _plain_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_.]+", name) or name.startswith("."):
+        raise ValueError(f"name {name!r}: only letters, digits, '_' and '.' may be used")
+    if name in RESERVED_NAMES:
+        raise ValueError(f"name {name!r} is taken by the results folder; choose another")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_plain_name)]
+
+
+class Section(BaseModel):
+    """A part of the config; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class OfdmWaveform(Section):
+    """One OFDM symbol per pulse."""
+
+    kind: Literal["ofdm"] = Field(description="ofdm, or phase_history for recorded frequency-domain samples")
+    codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
+    carrier_hz: float = Field(gt=0, description="RF carrier, Hz", examples=[1.2e9])
+    carrier_is: Literal["band_start", "band_centre"] = Field(
+        "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+    )
+    subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
+    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
+    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s", examples=[12.5e-6])
+    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s", examples=[3.125e-6])
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
+
+    @model_validator(mode="after")
+    def _dft_fits(self) -> Self:
+        length = self.sample_rate_hz / self.subcarrier_spacing_hz
+        if abs(length - round(length)) > 1e-6 * length:
+            raise ValueError(
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer: it is the DFT length"
+            )
+        if self.subcarriers > round(length):
+            raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
+        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
+            raise ValueError(
+                f"symbol_s={self.symbol_s:g} is shorter than the DFT window 1/subcarrier_spacing_hz = "
+                f"{1 / self.subcarrier_spacing_hz:g} s"
+            )
+        return self
+
+
+class PhaseHistoryWaveform(Section):
+    """Frequency-domain samples with antenna positions, recorded by another radar."""
+
+    kind: Literal["phase_history"] = Field(description="recorded frequency-domain samples with antenna positions")
+    format: Literal["afrl_mat"] = Field(description="afrl_mat: AFRL Gotcha .mat files raw/<flight>/<node>.*.mat")
+
+
+Waveform = Annotated[OfdmWaveform | PhaseHistoryWaveform, Field(discriminator="kind")]
+
+
+class LeverArms(Section):
+    """From the logged point to each phase centre, body axes forward-right-down."""
+
+    radar_tx: Metres3 = Field((0.0, 0.0, 0.0), description="transmitting radar antenna, m")
+    radar_rx: Metres3 = Field((0.0, 0.0, 0.0), description="receiving radar antenna, m")
+    sidelink: Metres3 = Field((0.0, 0.0, 0.0), description="sidelink antenna, m")
+
+    def any(self) -> bool:
+        """Return whether one of them is not zero."""
+        return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
+
+
+class PathOffsets(Section):
+    """Electrical path beyond geometry, metres of total path, of the receiving node."""
+
+    radar: float = Field(0.0, description="radar channel, m")
+    sidelink: float = Field(0.0, description="sidelink channel, m")
+
+
+class Node(Section):
+    """One UAV."""
+
+    lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
+    path_offset_m: PathOffsets = Field(
+        default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
+    )
+    attitude: Literal["log", "course", "none"] = Field(
+        "none", description="where attitude comes from: the log, the course over ground, or none"
+    )
+
+    @model_validator(mode="after")
+    def _lever_arm_needs_attitude(self) -> Self:
+        if self.attitude == "none" and self.lever_arms_m.any():
+            raise ValueError(
+                "lever_arms_m is not zero but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the lever arms to zero"
+            )
+        return self
+
+
+class Scene(Section):
+    """The campaign's output grid."""
+
+    crs: str = Field(
+        "auto", description="EPSG code, auto (UTM zone of the track) or local (a frame without a place on Earth)"
+    )
+    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
+        "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
+    )
+    spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
+    height_m: float = Field(0.0, description="height of the ground, m")
+    height_datum: Literal["ellipsoid"] = Field("ellipsoid", description="what height_m counts from")
+
+    @model_validator(mode="after")
+    def _bounds_are_pixels(self) -> Self:
+        if self.spacing_m != "auto" and self.spacing_m <= 0:
+            raise ValueError(f"spacing_m={self.spacing_m}: must be positive")
+        if self.bounds_m == "auto":
+            return self
+        xmin, ymin, xmax, ymax = self.bounds_m
+        if xmin >= xmax or ymin >= ymax:
+            raise ValueError(f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max")
+        if self.spacing_m != "auto":
+            self._divisible(xmin, ymin, xmax, ymax, self.spacing_m)
+        return self
+
+    def _divisible(self, xmin: float, ymin: float, xmax: float, ymax: float, spacing: float) -> None:
+        counts = ((xmax - xmin) / spacing, (ymax - ymin) / spacing)
+        if any(abs(count - round(count)) > 1e-6 * max(count, 1.0) for count in counts):
+            columns, rows = (max(1, round(count)) for count in counts)
+            nearest = [xmin, round(ymax - rows * spacing, 9), round(xmin + columns * spacing, 9), ymax]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)} is {counts[0]:.6g} × {counts[1]:.6g} pixels of {spacing} m; "
+                f"the nearest whole grid is {nearest}"
+            )
+
+
+class Processing(Section):
+    """How to compute; every key has a default."""
+
+    window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
+    accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
+    engine: Literal["auto", "numba", "reference"] = Field("auto", description="backprojection engine")
+    sidelink: Literal["auto", "divide"] = Field("auto", description="correction of a secondary node by its sidelink")
+    tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
+
+
+class Settings(Section):
+    """config/config.yaml."""
+
+    campaign: str = Field(description="name of the campaign", examples=["my_campaign"])
+    waveform: Waveform = Field(description="what was transmitted")
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
+    scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
+    processing: Processing = Field(default_factory=Processing, description="how to compute")
