@@ -22,7 +22,7 @@ class CampaignError(ValueError):
     config/config.yaml: scene: spacing_m is -1; expected a positive number. Give metres per pixel.
     """
 
-    def __init__(self, found: str, *, where: object, expected: str, remedy: str) -> None:
+    def __init__(self, found: str, where: object, expected: str, remedy: str) -> None:
         super().__init__(f"{where}: {found}; expected {expected}. {remedy}")
 
 

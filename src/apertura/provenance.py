@@ -83,7 +83,7 @@ def _closure(modules: Iterable[str]) -> dict[str, Path]:
 
 
 def _source(name: str) -> Path | None:
-    if name.split(".")[0] != _PACKAGE.name:
+    if name.split(".", maxsplit=1)[0] != _PACKAGE.name:
         return None
     base = _PACKAGE.joinpath(*name.split(".")[1:])
     return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)

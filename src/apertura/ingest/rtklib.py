@@ -1,0 +1,83 @@
+"""RTKLIB solutions (.pos): latitude, longitude, height against GPS time or UTC."""
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.constants import GPS_UTC_LEAP_S
+from apertura.errors import CampaignError
+from apertura.ingest.track import make_track
+
+_GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
+_LEAP_SINCE = np.datetime64("2017-01-01", "ns")
+
+
+def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
+    """Return the `track` stage of an RTKLIB solution.
+
+    Parameters
+    ----------
+    path
+        A .pos file in latitude, longitude (decimal degrees) and ellipsoidal height; its header says whether
+        times are GPST (ahead of UTC by 18 s since 2017) or UTC, as calendar dates or week and seconds.
+    node
+        Name of the node that logged.
+
+    Raises
+    ------
+    CampaignError
+        If the header does not say what the columns are, or a line cannot be read.
+
+    Notes
+    -----
+    Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
+    """
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    gpst = _time_system_is_gpst([line for line in lines if line.startswith("%")], path)
+    rows = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "%"]
+    times, geodetic = [], []
+    for number, cells in rows:
+        try:
+            times.append(_time(cells[0], cells[1]))
+            geodetic.append([float(cell) for cell in cells[2:5]])
+        except (ValueError, IndexError) as error:
+            raise _error(f"line {number} is {' '.join(cells)[:60]!r}", path) from error
+        if len(geodetic[-1]) != 3:
+            raise _error(f"line {number} has {len(cells)} columns", path)
+    time = np.array(times, "datetime64[ns]")
+    return make_track(_utc(time, path) if gpst else time, np.array(geodetic).reshape(-1, 3), node=node, where=path)
+
+
+def _time_system_is_gpst(header: list[str], path: Path) -> bool:
+    columns = next((line for line in header if "latitude(deg)" in line), None)
+    if columns is None:
+        raise _error("no header line with latitude(deg), longitude(deg), height(m)", path)
+    if any("/geodetic" in line for line in header):
+        raise _error("heights are geodetic (above a geoid)", path)
+    system = columns.lstrip("% ").split()[0]
+    if system not in {"GPST", "UTC"}:
+        raise _error(f"time system {system!r}", path)
+    return system == "GPST"
+
+
+def _time(first: str, second: str) -> np.datetime64:
+    if "/" in first:
+        return np.datetime64(f"{first.replace('/', '-')}T{second}", "ns")
+    return _GPS_EPOCH + np.timedelta64(7 * int(first), "D") + np.timedelta64(round(float(second) * 1e9), "ns")
+
+
+def _utc(time: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]:
+    if time.size and time.min() < _LEAP_SINCE:
+        raise _error(f"GPS times from {time.min()}, before the leap second of 2017", path)
+    return np.asarray(time - np.timedelta64(GPS_UTC_LEAP_S, "s"))
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(
+        found,
+        where=path,
+        expected="an RTKLIB solution in lat/lon/ellipsoidal height whose header says GPST or UTC",
+        remedy="Export the solution with these output settings.",
+    )

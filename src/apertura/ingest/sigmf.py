@@ -1,0 +1,174 @@
+"""SigMF recordings: one capture segment per trigger, channels interleaved per sample."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from sigmf.validate import validate as validate_schema
+
+from apertura.errors import CampaignError
+
+_BYTES_PER_SAMPLE = 4  # ci16_le: two int16
+
+
+def read_sigmf(meta_path: Path, data_path: Path, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a SigMF recording, memory-mapped.
+
+    Parameters
+    ----------
+    meta_path, data_path
+        ``.sigmf-meta`` and ``.sigmf-data``, datatype ci16_le.
+    node
+        Name of the node that recorded.
+
+    Returns
+    -------
+    xarray.Dataset
+        iq (channel, pulse, sample, component) int16 counts, time (pulse) UTC, frame (pulse).
+
+    Raises
+    ------
+    CampaignError
+        If the metadata break the SigMF schema, the data are truncated or not those hashed, a capture lies
+        past the end, or a capture holds only zeros.
+
+    Notes
+    -----
+    Source: SigMF specification 1.2, section "Captures Array".
+    """
+    meta = _read_meta(meta_path)
+    channels = _channels(meta["global"], meta_path)
+    frames = _map(data_path, len(channels), meta, meta_path)
+    starts, length = _segments(meta["captures"], len(frames), meta_path)
+    _check_hash(meta["global"], data_path)
+    iq = np.stack([frames[start : start + length] for start in starts])
+    _check_alive(iq, channels, data_path)
+    return xr.Dataset(
+        {
+            "iq": (("channel", "pulse", "sample", "component"), np.moveaxis(iq, 2, 0)),
+            "time": ("pulse", _times(meta["captures"], meta_path)),
+            "frame": ("pulse", np.array([c.get("apertura:frame", -1) for c in meta["captures"]], np.int64)),
+        },
+        attrs={
+            "node": node,
+            "channels": channels,
+            "sample_rate_hz": float(meta["global"]["core:sample_rate"]),
+            "frequency_hz": float(meta["captures"][0].get("core:frequency", 0.0)),
+        },
+    )
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        validate_schema(meta)
+    except Exception as error:  # the library raises jsonschema's, json's and its own errors
+        reason = str(getattr(error, "message", error)).splitlines()[0]
+        raise CampaignError(
+            f"not valid SigMF: {reason}", path, "metadata of the SigMF specification", "Mend it."
+        ) from error
+    datatype = meta["global"]["core:datatype"]
+    if datatype != "ci16_le":
+        raise CampaignError(f"core:datatype {datatype}", path, "ci16_le", "Convert the recording.")
+    if "core:sample_rate" not in meta["global"] or not meta["captures"]:
+        raise CampaignError(
+            "no core:sample_rate or no captures", path, "both", "Write one capture segment per trigger."
+        )
+    return dict(meta)
+
+
+def _channels(header: dict[str, Any], path: Path) -> list[str]:
+    count = int(header.get("core:num_channels", 1))
+    names = header.get("apertura:channels", ["radar", "sidelink"][:count])
+    if len(names) != count or "radar" not in names:
+        raise CampaignError(
+            f"apertura:channels {names} for core:num_channels {count}",
+            path,
+            "one name per channel, 'radar' among them",
+            "Correct the metadata.",
+        )
+    return list(names)
+
+
+def _map(path: Path, channels: int, meta: dict[str, Any], meta_path: Path) -> NDArray[np.int16]:
+    size, frame = path.stat().st_size, channels * _BYTES_PER_SAMPLE
+    last = meta["captures"][-1]["core:sample_start"]
+    if size % frame or size == 0:
+        raise CampaignError(
+            f"{size} bytes, not a whole number of {channels}-channel samples",
+            path,
+            f"a multiple of {frame} bytes",
+            "The file is truncated; copy it again.",
+        )
+    if last >= size // frame:
+        raise CampaignError(
+            f"capture {len(meta['captures']) - 1} starts at sample {last}, the data end at {size // frame}",
+            meta_path,
+            f"captures inside {path.name}",
+            "The data are truncated or the metadata belong to another file; copy both again.",
+        )
+    return np.memmap(path, np.dtype("<i2"), "r", shape=(size // frame, channels, 2))
+
+
+def _segments(captures: list[dict[str, Any]], total: int, path: Path) -> tuple[list[int], int]:
+    starts = [int(capture["core:sample_start"]) for capture in captures]
+    lengths = np.diff([*starts, total])
+    length = int(np.median(lengths))
+    short = np.flatnonzero(lengths < length)
+    if short.size:
+        pulse = int(short[0])
+        raise CampaignError(
+            f"capture {pulse} holds {lengths[pulse]} samples",
+            path,
+            f"{length}, as most captures do",
+            "The data are truncated (copy them again) or core:sample_start is wrong.",
+        )
+    return starts, length
+
+
+def _check_hash(header: dict[str, Any], path: Path) -> None:
+    if "core:sha512" not in header:
+        return
+    with path.open("rb") as stream:
+        found = hashlib.file_digest(stream, "sha512").hexdigest()
+    if found != header["core:sha512"]:
+        raise CampaignError(
+            f"sha512 {found[:12]}…",
+            path,
+            f"{header['core:sha512'][:12]}… (core:sha512 of the metadata)",
+            "The data were changed or damaged; copy them again.",
+        )
+
+
+def _check_alive(iq: NDArray[np.int16], channels: list[str], path: Path) -> None:
+    for index, name in enumerate(channels):
+        dead = np.flatnonzero(~iq[:, :, index].any(axis=(1, 2)))
+        if dead.size:
+            raise CampaignError(
+                f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
+                path,
+                "samples",
+                "The receiver or the copy failed; record or copy again, or remove those captures.",
+            )
+
+
+def _times(captures: list[dict[str, Any]], path: Path) -> NDArray[np.datetime64]:
+    try:
+        tags = np.array([capture["core:datetime"].removesuffix("Z") for capture in captures], "datetime64[ns]")
+    except (KeyError, ValueError) as error:
+        raise CampaignError(
+            f"core:datetime: {error}", path, "ISO 8601 UTC on every capture", "Write the time tags."
+        ) from error
+    backwards = np.flatnonzero(np.diff(tags) <= np.timedelta64(0, "ns"))
+    if backwards.size:
+        raise CampaignError(
+            f"capture {int(backwards[0]) + 1} is tagged {tags[backwards[0] + 1]}, not after the one before",
+            path,
+            "increasing core:datetime",
+            "Sort the captures or correct the tags.",
+        )
+    return tags
