@@ -1,0 +1,94 @@
+"""Captured symbols to transfer functions: a DFT over one period of 1/Δf, and code removal.
+
+A subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) that travelled a path of delay τ arrives as
+c_n·exp(-j2π(f_c+nΔf)τ), as long as τ stays inside the cyclic prefix (docs/theory.md, eq. 1 and 2).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+_PULSES_AT_ONCE = 64
+
+
+def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
+    """Return n of each subcarrier, ascending: 0…N-1 for band_start, -N/2…N/2-1 for band_centre.
+
+    Examples
+    --------
+    >>> subcarrier_numbers(4, carrier_is="band_centre")
+    array([-2, -1,  0,  1])
+    """
+    return np.arange(count) - (count // 2 if carrier_is == "band_centre" else 0)
+
+
+def demodulate(
+    iq: NDArray[np.int16], *, numbers: NDArray[np.int64], prefix_samples: int, dft_samples: int
+) -> NDArray[np.complex64]:
+    """Return the received code symbols c_n·H_n of captures.
+
+    Parameters
+    ----------
+    iq
+        (pulse, sample, 2) int16 ADC counts; sample 0 is the start of the cyclic prefix.
+    numbers
+        (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier.
+    prefix_samples
+        T_cp·f_s, where the DFT window begins.
+    dft_samples
+        f_s/Δf, the length of the DFT window.
+
+    Returns
+    -------
+    ndarray
+        (pulse, subcarrier) complex64, in ADC counts per subcarrier.
+
+    Raises
+    ------
+    ValueError
+        If a capture is shorter than prefix and DFT window together.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 2; the DFT length is f_s/Δf, not N (DESIGN section 4).
+
+    Examples
+    --------
+    >>> phase = 2 * np.pi * 3 * np.arange(16) / 16
+    >>> tone = np.stack([1000 * np.cos(phase), 1000 * np.sin(phase)], -1).astype(np.int16)
+    >>> symbols = demodulate(tone[None], numbers=np.arange(8), prefix_samples=0, dft_samples=16)
+    >>> abs(symbols[0]).round().astype(int).tolist()
+    [0, 0, 0, 1000, 0, 0, 0, 0]
+    """
+    pulses, samples, _ = iq.shape
+    if samples < prefix_samples + dft_samples:
+        raise ValueError(f"{samples=}: a capture needs {prefix_samples + dft_samples} (prefix and DFT window)")
+    symbols = np.empty((pulses, len(numbers)), np.complex64)
+    for first in range(0, pulses, _PULSES_AT_ONCE):
+        block = iq[first : first + _PULSES_AT_ONCE, prefix_samples : prefix_samples + dft_samples].astype(np.float32)
+        spectrum = fft.fft(block[..., 0] + 1j * block[..., 1], axis=1, norm="forward")
+        symbols[first : first + len(block)] = spectrum[:, numbers % dft_samples]
+    return symbols
+
+
+def remove_path(
+    transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
+) -> NDArray[np.complex64]:
+    """Return `transfer` with `delay_s` taken off the delay of every echo: times exp(+j2πf·delay).
+
+    Parameters
+    ----------
+    transfer
+        (pulse, subcarrier) complex64.
+    frequency_hz
+        (subcarrier,) float64, RF frequency.
+    delay_s
+        (pulse,) float64, seconds.
+
+    Examples
+    --------
+    >>> remove_path(np.ones((1, 2), np.complex64), np.array([1e9, 2e9]), delay_s=np.array([0.25e-9])).round(6)
+    array([[ 0.+1.j, -1.+0.j]], dtype=complex64)
+    """
+    turns = delay_s[:, None] * frequency_hz[None, :]
+    return np.asarray(transfer * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)

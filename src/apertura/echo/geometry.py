@@ -1,0 +1,105 @@
+"""Phase centres: where each antenna was at each pulse, from a logged track, attitude and lever arms."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from apertura.errors import CampaignError
+from apertura.geodesy import body_axes, ned_axes
+
+
+def phase_centres(
+    track_time: NDArray[np.datetime64],
+    position: NDArray[np.float64],
+    attitude: NDArray[np.float64],
+    *,
+    at: NDArray[np.datetime64],
+    lever_arm_m: tuple[float, float, float],
+    attitude_from: Literal["log", "course", "none"],
+    where: object,
+) -> NDArray[np.float64]:
+    """Return the ECEF position of an antenna at given times.
+
+    Parameters
+    ----------
+    track_time
+        (epoch,) datetime64[ns], UTC.
+    position
+        (epoch, 3) float64, logged point, ECEF metres.
+    attitude
+        (epoch, 3) float64, roll, pitch, yaw in radians; NaN where not logged.
+    at
+        (pulse,) datetime64[ns], UTC.
+    lever_arm_m
+        From the logged point to the antenna, body axes forward-right-down, metres.
+    attitude_from
+        Whether body axes come from the log, from the course over ground (level flight), or are not known.
+    where
+        The log, for messages.
+
+    Returns
+    -------
+    ndarray
+        (pulse, 3) float64, ECEF metres.
+
+    Raises
+    ------
+    CampaignError
+        If the track does not cover `at`, or the lever arm needs an attitude that the log does not hold.
+
+    Notes
+    -----
+    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
+    (DESIGN section 3).
+    """
+    _check_covered(track_time, at, where)
+    origin = track_time[0]
+    epochs, pulses = _seconds(track_time - origin), _seconds(at - origin)
+    spline = make_interp_spline(epochs, position, k=min(3, len(epochs) - 1))
+    centres = spline(pulses)
+    if not any(lever_arm_m):
+        return np.asarray(centres)
+    ned = ned_axes(centres)
+    angles = (
+        _course(spline.derivative()(pulses), ned) if attitude_from == "course" else _logged(epochs, attitude, pulses)
+    )
+    if not np.isfinite(angles).all():
+        raise CampaignError(
+            f"a lever arm of {list(lever_arm_m)} m but no attitude (attitude: {attitude_from})",
+            where=where,
+            expected="roll, pitch and yaw at every epoch of the log",
+            remedy="Log attitude, or set the node's attitude to course, or its lever arms to zero.",
+        )
+    arm = np.array(lever_arm_m)
+    return np.asarray(centres + np.einsum("pij,pjk,k->pi", ned, body_axes(angles), arm))
+
+
+def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64], where: object) -> None:
+    early = float(_seconds(track_time[0] - at.min()))
+    late = float(_seconds(at.max() - track_time[-1]))
+    if max(early, late) > 0:
+        raise CampaignError(
+            f"the track ({track_time[0]} to {track_time[-1]}) begins {max(early, 0):.3f} s after the first pulse "
+            f"and ends {max(late, 0):.3f} s before the last",
+            where=where,
+            expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
+            remedy="Check the log's time system (GPST is 18 s ahead of UTC) or give the whole log.",
+        )
+
+
+def _course(velocity: NDArray[np.float64], ned: NDArray[np.float64]) -> NDArray[np.float64]:
+    north, east, _ = np.moveaxis(np.einsum("pij,pi->pj", ned, velocity), -1, 0)
+    return np.stack([np.zeros_like(north), np.zeros_like(north), np.arctan2(east, north)], -1)
+
+
+def _logged(
+    epochs: NDArray[np.float64], attitude: NDArray[np.float64], pulses: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    smooth = np.unwrap(attitude, axis=0)
+    return np.stack([np.interp(pulses, epochs, angle) for angle in smooth.T], -1)
+
+
+def _seconds(span: NDArray[np.timedelta64]) -> NDArray[np.float64]:
+    return np.asarray(span / np.timedelta64(1, "s"))
