@@ -1,0 +1,148 @@
+"""Backprojection by interpolation in an oversampled range table, compiled by numba."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import firwin, resample_poly
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.image.history import Profiles
+
+_HALF_TAPS = 10
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Range profiles, finely sampled.
+
+    Attributes
+    ----------
+    samples
+        (pulse, range) complex64.
+    start_m
+        (pulse,) float64, total path of sample 0.
+    step_m
+        Total path between samples.
+    wavenumber_rad_m
+        2πf_mid/c.
+    tx_position_m, rx_position_m
+        (pulse, 3) float64.
+    """
+
+    samples: NDArray[np.complex64]
+    start_m: NDArray[np.float64]
+    step_m: float
+    wavenumber_rad_m: float
+    tx_position_m: NDArray[np.float64]
+    rx_position_m: NDArray[np.float64]
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
+    """Return tables of `oversampling` samples per resolution cell.
+
+    Parameters
+    ----------
+    profiles
+        At least twice oversampled, so that half the band is left for the transition of the filter.
+    oversampling
+        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (DESIGN section 5).
+    """
+    factor = max(1, round(oversampling / profiles.oversampling))
+    taps = firwin(2 * _HALF_TAPS * factor + 1, 1.0 / factor, window=("kaiser", 10.0)) if factor > 1 else None
+    fine = resample_poly(profiles.samples, factor, 1, axis=1, window=taps) if factor > 1 else profiles.samples
+    return Tables(
+        np.ascontiguousarray(fine, np.complex64),
+        profiles.start_m,
+        profiles.step_m / factor,
+        2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S,
+        profiles.tx_position_m,
+        profiles.rx_position_m,
+    )
+
+
+def form(tables: Tables, pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, R the total path.
+
+    Parameters
+    ----------
+    tables
+        From `prepare`.
+    pixels
+        (y, x, 3) float64, metres, in the frame of the phase centres.
+
+    Returns
+    -------
+    ndarray
+        (y, x) complex64. A path outside the table adds nothing.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 6; four-point Lagrange interpolation.
+    """
+    flat = np.ascontiguousarray(pixels.reshape(-1, 3))
+    image = np.zeros(len(flat), np.complex128)
+    _accumulate(
+        tables.samples,
+        tables.start_m,
+        tables.step_m,
+        tables.wavenumber_rad_m,
+        tables.tx_position_m,
+        tables.rx_position_m,
+        flat,
+        image,
+    )
+    return image.reshape(pixels.shape[:-1]).astype(np.complex64)
+
+
+def contributions(tables: Tables, pixel: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return what each pulse adds at one pixel, (pulse,) complex128: the terms of the sum of `form`.
+
+    Parameters
+    ----------
+    tables
+        From `prepare`.
+    pixel
+        (3,) float64, metres.
+    """
+    terms = np.zeros((len(tables.samples), 1), np.complex128)
+    for pulse, term in enumerate(terms):
+        one = slice(pulse, pulse + 1)
+        _accumulate(
+            tables.samples[one],
+            tables.start_m[one],
+            tables.step_m,
+            tables.wavenumber_rad_m,
+            tables.tx_position_m[one],
+            tables.rx_position_m[one],
+            pixel[None],
+            term,
+        )
+    return terms[:, 0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, image):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    pulses, length = samples.shape
+    for i in range(len(pixels)):
+        x, y, z = pixels[i, 0], pixels[i, 1], pixels[i, 2]
+        total = 0.0 + 0.0j
+        for p in range(pulses):
+            path = np.sqrt((x - tx[p, 0]) ** 2 + (y - tx[p, 1]) ** 2 + (z - tx[p, 2]) ** 2) + np.sqrt(
+                (x - rx[p, 0]) ** 2 + (y - rx[p, 1]) ** 2 + (z - rx[p, 2]) ** 2
+            )
+            place = (path - start[p]) / step
+            k = int(np.floor(place))
+            if k < 1 or k > length - 3:
+                continue
+            u = place - k
+            value = (
+                samples[p, k - 1] * (-u * (u - 1) * (u - 2) / 6)
+                + samples[p, k] * ((u + 1) * (u - 1) * (u - 2) / 2)
+                - samples[p, k + 1] * ((u + 1) * u * (u - 2) / 2)
+                + samples[p, k + 2] * ((u + 1) * u * (u - 1) / 6)
+            )
+            phase = wavenumber * path
+            total += value * (np.cos(phase) + 1j * np.sin(phase))
+        image[i] += total

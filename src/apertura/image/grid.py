@@ -1,0 +1,178 @@
+"""The scene grid as an immutable value: CRS, origin, spacing, shape, ground height; sliceable into tiles."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from apertura.errors import CampaignError
+from apertura.geodesy import ecef_from_projected
+
+LOCAL = "local"
+
+
+@dataclass(frozen=True)
+class SceneGrid:
+    """North-up pixels on the ground.
+
+    Attributes
+    ----------
+    crs
+        What pyproj reads, or 'local' for Cartesian axes without a place on Earth (x east, y north, z up).
+    west_m, north_m
+        Outer corner of pixel (0, 0), metres in `crs`.
+    spacing_m
+        Pixel spacing, metres.
+    shape
+        Rows, columns.
+    height_m
+        Ground height: ellipsoidal metres, or z of the local frame.
+
+    Examples
+    --------
+    >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60), 10.0)
+    >>> grid.bounds_m
+    (500000.0, 80.0, 500030.0, 100.0)
+    >>> grid[0:10, 5:10].shape, float(grid[0:10, 5:10].x_m[0]) == float(grid.x_m[5])
+    ((10, 5), True)
+    """
+
+    crs: str
+    west_m: float
+    north_m: float
+    spacing_m: float
+    shape: tuple[int, int]
+    height_m: float
+
+    @classmethod
+    def from_bounds(
+        cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, height_m: float
+    ) -> "SceneGrid":
+        """Return the grid anchored at (xmin, ymax) of `bounds_m` (outer pixel edges).
+
+        Raises
+        ------
+        CampaignError
+            If the CRS is unknown, is not in metres, or its area of use does not hold the bounds.
+        """
+        xmin, ymin, xmax, ymax = bounds_m
+        shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
+        if crs != LOCAL:
+            _check_crs(crs, bounds_m)
+        return cls(crs, xmin, ymax, spacing_m, shape, height_m)
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """[xmin, ymin, xmax, ymax], outer pixel edges."""
+        rows, columns = self.shape
+        south, east = self.north_m - rows * self.spacing_m, self.west_m + columns * self.spacing_m
+        return (self.west_m, south, east, self.north_m)
+
+    @property
+    def transform(self) -> tuple[float, float, float, float, float, float]:
+        """Affine coefficients a…f of (column, row) → (x, y), as rasterio takes them."""
+        return (self.spacing_m, 0.0, self.west_m, 0.0, -self.spacing_m, self.north_m)
+
+    @property
+    def x_m(self) -> NDArray[np.float64]:
+        """Pixel centres eastward, (column,) float64."""
+        return np.asarray(self.west_m + (np.arange(self.shape[1]) + 0.5) * self.spacing_m, np.float64)
+
+    @property
+    def y_m(self) -> NDArray[np.float64]:
+        """Pixel centres from north to south, (row,) float64."""
+        return np.asarray(self.north_m - (np.arange(self.shape[0]) + 0.5) * self.spacing_m, np.float64)
+
+    def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
+        """Return the grid of a window of rows and columns, without steps."""
+        rows, columns = (range(size)[part] for part, size in zip(window, self.shape, strict=True))
+        return replace(
+            self,
+            west_m=self.west_m + columns.start * self.spacing_m,
+            north_m=self.north_m - rows.start * self.spacing_m,
+            shape=(len(rows), len(columns)),
+        )
+
+    def tiles(self, side_px: int) -> Iterator[tuple[slice, slice]]:
+        """Yield the windows of square tiles, row by row; those at the south and east edges may be smaller."""
+        for row in range(0, self.shape[0], side_px):
+            for column in range(0, self.shape[1], side_px):
+                yield (
+                    slice(row, min(row + side_px, self.shape[0])),
+                    slice(column, min(column + side_px, self.shape[1])),
+                )
+
+    def positions(self) -> NDArray[np.float64]:
+        """Return the pixel centres in the processing frame.
+
+        Returns
+        -------
+        ndarray
+            (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
+        """
+        x, y = np.meshgrid(self.x_m, self.y_m)
+        return self._place(x, y)
+
+    def positions_at(self, row: NDArray[np.float64], column: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre."""
+        x = self.west_m + (np.asarray(column, np.float64) + 0.5) * self.spacing_m
+        return self._place(x, self.north_m - (np.asarray(row, np.float64) + 0.5) * self.spacing_m)
+
+    def _place(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        height = np.full_like(x, self.height_m)
+        return np.stack([x, y, height], -1) if self.crs == LOCAL else ecef_from_projected(self.crs, x, y, height)
+
+
+def local_crs(name: str) -> str:
+    """Return an engineering CRS for a frame without a place on Earth.
+
+    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth (DESIGN section 6).
+
+    Examples
+    --------
+    >>> local_crs("gotcha")
+    'LOCAL_CS["gotcha",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    """
+    return f'LOCAL_CS["{name}",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+
+
+def _check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
+    where = "config/config.yaml: scene"
+    try:
+        system = CRS(crs)
+    except CRSError as error:
+        raise CampaignError(
+            f"crs {crs!r} is unknown to PROJ",
+            where=where,
+            expected="an EPSG code such as EPSG:32632, auto, or local",
+            remedy="Correct scene.crs.",
+        ) from error
+    if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info):
+        raise CampaignError(
+            f"crs {crs} ({system.name}) is not projected in metres",
+            where=where,
+            expected="a projected CRS in metres, such as a UTM zone",
+            remedy="Choose another scene.crs.",
+        )
+    _check_area_of_use(system, bounds_m, where)
+
+
+def _check_area_of_use(system: CRS, bounds_m: tuple[float, float, float, float], where: str) -> None:
+    area = system.area_of_use
+    if area is None:
+        return
+    inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
+    xmin, ymin, xmax, ymax = bounds_m
+    longitude, latitude = inverse.transform([xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax])
+    for lon, lat in zip(longitude, latitude, strict=True):
+        if not (np.isfinite(lon) and area.west <= lon <= area.east and area.south <= lat <= area.north):
+            raise CampaignError(
+                f"bounds_m {list(bounds_m)} reach longitude {lon:.4f}, latitude {lat:.4f}",
+                where=where,
+                expected=f"inside the area of use of {system.name}: longitude {area.west} to {area.east}, "
+                f"latitude {area.south} to {area.north}",
+                remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
+            )
