@@ -1,0 +1,35 @@
+// What Python hands over, mirrored field by field in src/apertura/image/engines/native.py.
+#pragma once
+#include <cstdint>
+
+// A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".
+struct ApertureJob {
+  const float* cells;         // (pulse, 2 (degree + 1), width): re, im of each polynomial coefficient
+  const double* transmitter;  // (3, padded): pulses padded to a multiple of 8 by repeating the last
+  const double* receiver;     // (3, padded)
+  const double* first_path;   // (padded): total path of the middle of cell 0
+  const double* pixels;       // (rows, columns, 3)
+  const float* weight;        // (pulse, rows / 16 + 1, columns / 16 + 1) or null: gain at the corners of patches
+  float* image;               // (rows, columns, 2): re, im
+  int64_t* counts;            // pulses x patches handled by: shared curvature, own curvature, exact, skipped
+  int64_t pulses, padded, width, rows, columns;
+  double cells_per_metre;
+  double radians_per_cell;    // carrier phase over one cell
+  double tolerance_rad;       // largest phase error of the geometry that the fast forms may make
+  int32_t degree;             // of the polynomials: 1 or 2
+  int32_t phase_form;         // index into phase.hpp
+  int32_t wide_sum;           // 1: sums over pulses in float64
+  float phase[9];             // cosine (4), sine (4), half turns per cell
+};
+
+// Range profiles to be turned into tables.
+struct TableJob {
+  const float* samples;    // (pulse, length, 2)
+  const float* taps;       // (up, degree + 1, 16): real filters, see tables.py
+  const int32_t* lead;     // (up): sample at which the first tap of phase 0 lies
+  const float* carrier;    // (up, 2, steps): re, im of exp(j carrier) at each cell relative to cell `margin`
+  const float* turn;       // (pulse, 2): exp(j carrier) of cell `margin`
+  float* cells;            // (pulse, 2 (degree + 1), width), zero on entry
+  int64_t pulses, length, width, up, down, steps, margin, used;
+  int32_t degree;
+};

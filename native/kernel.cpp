@@ -1,0 +1,59 @@
+// Compiled once per instruction set; APERTURA_FORM names the copy.
+#include "exact.hpp"
+#include "expand.hpp"
+
+#define APERTURA_JOIN2(a, b) a##b
+#define APERTURA_JOIN(a, b) APERTURA_JOIN2(a, b)
+
+namespace {
+
+template <class Phase, int kDegree, bool kTerrain>
+void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
+  Batch batch;
+  Positions at;
+  bool gathered = false;
+  for (int64_t pulse = begin; pulse < end; pulse += kBatch) {
+    const int pulses = int(end - pulse < kBatch ? end - pulse : kBatch);
+    sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
+    add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
+    if constexpr (kLanes == 8) add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
+    add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
+    if (batch.count[kExact] && !gathered) gather(job, patch, at), gathered = true;
+    for (int n = 0; n < batch.count[kExact]; n++)
+      add_exact<Phase, kDegree>(job, patch, at, pulse + batch.order[kExact][n], sum);
+    job.counts[0] += batch.count[kShared] + batch.count[kSharedWide];
+    job.counts[1] += batch.count[kOwn];
+    job.counts[2] += batch.count[kExact];
+    job.counts[3] += batch.count[kSkip];
+  }
+}
+
+template <class Phase, int kDegree>
+void add(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
+  if (patch.terrain)
+    add_patch<Phase, kDegree, true>(job, patch, begin, end, sum);
+  else
+    add_patch<Phase, kDegree, false>(job, patch, begin, end, sum);
+}
+
+template <class Phase>
+void add(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
+  job.degree == 2 ? add<Phase, 2>(job, patch, begin, end, sum) : add<Phase, 1>(job, patch, begin, end, sum);
+}
+
+}  // namespace
+
+// Adds pulses begin..end of the job to `sum`: (2, 256) float, re then im, block by block.
+extern "C" void APERTURA_JOIN(apertura_add_, APERTURA_FORM)(const ApertureJob* job, const apertura::Patch* patch,
+                                                            int64_t begin, int64_t end, float* sum) {
+  switch (job->phase_form) {
+    case 0: return add<Phase0>(*job, *patch, begin, end, sum);
+    case 1: return add<Phase1>(*job, *patch, begin, end, sum);
+    case 2: return add<Phase2>(*job, *patch, begin, end, sum);
+    default: return add<Phase3>(*job, *patch, begin, end, sum);
+  }
+}
+
+extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_FORM)(const TableJob* job, float* scratch) {
+  expand(*job, scratch);
+}
