@@ -62,6 +62,66 @@ class Campaign:
         """Flights that become images."""
         return tuple(flight for flight in self.flights if flight.kind == "image")
 
+    @property
+    def results(self) -> Path:
+        """The folder of everything the pipeline writes."""
+        return self.root / "results"
+
+    def stage(self, stage: str, *where: str) -> Path:
+        """Return the folder of a stage: results/<where…>/<stage>.zarr.
+
+        Examples
+        --------
+        >>> Campaign(Path("c"), None, ()).stage("echo", "f01", "uav1-uav2").as_posix()
+        'c/results/f01/uav1-uav2/echo.zarr'
+        """
+        return self.results.joinpath(*where, f"{stage}.zarr")
+
+    def manifest(self, stage: str, *where: str) -> str:
+        """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
+        return "/".join(["results", *where, f"{stage}.manifest.json"])
+
+    def echo_sources(self, flight: str, pair: str) -> list[str]:
+        """Return what the echo of a pair is made from: stages of its nodes, or recorded phase history."""
+        tx, rx = pair.split("-")
+        if isinstance(self.settings.waveform, OfdmWaveform):
+            stages = [self.manifest(stage, flight, node) for node in dict.fromkeys((tx, rx)) for stage in ("raw", "track")]
+            return [self.settings.waveform.codes, *stages]
+        return [path.relative_to(self.root).as_posix() for path in self.raw_files(flight, rx).values()]
+
+    def scene_sources(self) -> list[str]:
+        """Return what the grid is settled from: nothing, or the first image flight where something is `auto`."""
+        scene, first = self.settings.scene, self.image_flights[0]
+        if "auto" not in {scene.crs, scene.spacing_m, scene.bounds_m}:
+            return []
+        return [self.manifest("echo", first.name, pair) for pair in first.pairs]
+
+    def check_files(self) -> None:
+        """Raise CampaignError unless every file that flights.tsv promises is there."""
+        for flight in self.flights:
+            for node in flight.nodes:
+                self.raw_files(flight.name, node)
+        waveform = self.settings.waveform
+        if isinstance(waveform, OfdmWaveform) and not (self.root / waveform.codes).is_file():
+            raise CampaignError(
+                "no such file",
+                where=self.root / waveform.codes,
+                expected="the transmitted code symbols, as config/config.yaml: waveform.codes",
+                remedy="Copy the file there.",
+            )
+
+    def relevant(self, stage: str, pair: str = "") -> dict[str, Any]:
+        """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
+        settings = self.settings.model_dump(mode="json")
+        processing, nodes = settings["processing"], {name: settings["nodes"][name] for name in pair.split("-") if name}
+        chosen: dict[str, dict[str, Any]] = {
+            "echo": {"waveform": settings["waveform"], "nodes": nodes, "sidelink": processing["sidelink"]},
+            "scene": {"scene": settings["scene"]},
+            "profile": {"window": processing["window"]},
+            "image": {name: processing[name] for name in ("accuracy_db", "engine", "tile_px")},
+        }
+        return chosen.get(stage, {})
+
     def flight(self, name: str) -> Flight:
         """Return the flight called `name`."""
         return next(flight for flight in self.flights if flight.name == name)

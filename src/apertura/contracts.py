@@ -71,6 +71,7 @@ STAGES: Mapping[str, Stage] = {
             "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
             "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
             "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
+            "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
         },
         _FRAME,
     ),
@@ -91,11 +92,15 @@ STAGES: Mapping[str, Stage] = {
         },
     ),
     "image": Stage(
-        {"image": Variable(("y", "x"), "complex64", "1", "focused scene, carrier kept")},
-        {**_FRAME, "numerical_error_db": "RMS error on random pixels against `reference`, dB"},
+        {"image": Variable(("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude")},
+        {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
     ),
     "cube": Stage(
-        {"image": Variable(("flight", "pair", "y", "x"), "complex64", "1", "every image on the campaign grid")},
+        {
+            "image": Variable(("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN where a pair did not fly"),
+            "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
+            "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),
+        },
         {},
     ),
 }

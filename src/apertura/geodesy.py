@@ -139,3 +139,16 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     flat = np.reshape(attitude_rad, (-1, 3))
     matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()
     return np.asarray(matrices.reshape(*np.shape(attitude_rad)[:-1], 3, 3))
+
+
+def local_crs(name: str) -> str:
+    """Return an engineering CRS for a frame without a place on Earth.
+
+    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth (DESIGN section 6).
+
+    Examples
+    --------
+    >>> local_crs("gotcha")
+    'LOCAL_CS["gotcha",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    """
+    return f'LOCAL_CS["{name}",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'

@@ -8,7 +8,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,11 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from apertura.contracts import check
+from apertura.contracts import canonical_json, check
 from apertura.errors import CampaignError
-from apertura.provenance import sha256_file, sha256_tree
+from apertura.provenance import sha256_tree
+
+Window = tuple[slice, slice]
 
 # An all-zero chunk must exist on disk: a missing chunk means "not computed yet".
 zarr.config.set({"array.write_empty_chunks": True})
@@ -100,7 +102,8 @@ def writing(folder: Path) -> Iterator[Path]:
     """Hold the right to write `folder` and yield where work in progress goes.
 
     A kernel lock that dies with its process keeps a second writer out: a step that outlived its
-    snakemake finishes its work, and the new one waits for it.
+    snakemake finishes its work, and the new one waits for it. A finished folder that is still as it was sealed
+    becomes work in progress again, so that what the other finished is not computed twice.
 
     Yields
     ------
@@ -108,22 +111,71 @@ def writing(folder: Path) -> Iterator[Path]:
         ``<folder>.wip``; kept if the body fails, so that finished chunks are picked up again.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder.with_name(f".{folder.name}.lock").open("a") as lock:
+    wip = folder.with_name(f"{folder.name}.wip")
+    with _seal_of(folder).open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         manifest_of(folder).unlink(missing_ok=True)
-        yield folder.with_name(f"{folder.name}.wip")
+        if folder.is_dir() and not wip.exists():
+            lock.seek(0)
+            if lock.read() == canonical_json(sha256_tree(folder)):
+                folder.rename(wip)
+        yield wip
+
+
+def _seal_of(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.seal")
+
+
+def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Window]) -> list[Window]:
+    """Return the windows of array `name` that `wip` does not hold yet, starting `wip` afresh if it is other work.
+
+    Parameters
+    ----------
+    wip
+        Work in progress, from `writing`.
+    empty
+        The stamped stage with `name` as a lazy array, one chunk per window: metadata and coordinates.
+    name
+        The array that is written tile by tile.
+    windows
+        Every tile, aligned with the chunks.
+
+    Notes
+    -----
+    A chunk file is written beside and renamed, so one that exists is whole. Work in progress is other work
+    when its settings, inputs or code differ.
+    """
+    identity = {key: empty.attrs[key] for key in ("runspec", "inputs", "code_sha256")}
+    if _attributes(wip) != identity:
+        shutil.rmtree(wip, ignore_errors=True)
+        chunks = empty[name].data.chunksize
+        encoding: dict[str, Any] = {name: {"chunks": chunks, "grid_mapping": "spatial_ref"}}
+        empty.to_zarr(wip, mode="w", compute=False, consolidated=False, zarr_format=3, encoding=encoding)
+    side = zarr.open_array(wip / name, mode="r").chunks
+    return [
+        window
+        for window in windows
+        if not (wip / name / "c" / str(window[0].start // side[0]) / str(window[1].start // side[1])).is_file()
+    ]
+
+
+def _attributes(wip: Path) -> dict[str, Any] | None:
+    try:
+        attributes = zarr.open_group(wip, mode="r").attrs
+        return {key: attributes[key] for key in ("runspec", "inputs", "code_sha256")}
+    except (FileNotFoundError, KeyError, ValueError):
+        return None
 
 
 def finish(wip: Path, folder: Path) -> None:
     """Turn work in progress into the finished stage and write its manifest."""
+    for partial in wip.rglob("*.partial"):  # what a killed writer left
+        partial.unlink()
     shutil.rmtree(folder, ignore_errors=True)
     wip.rename(folder)
-    write_json(manifest_of(folder), {"folder": folder.name, "files": sha256_tree(folder)})
-
-
-def manifest_sha256(folder: Path) -> str:
-    """Return the one hash that stands for every byte of a finished stage."""
-    return sha256_file(manifest_of(folder))
+    files = sha256_tree(folder)
+    _seal_of(folder).write_text(canonical_json(files), encoding="utf-8")
+    write_json(manifest_of(folder), {"folder": folder.name, "files": files})
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -126,19 +126,6 @@ class SceneGrid:
         return np.stack([x, y, height], -1) if self.crs == LOCAL else ecef_from_projected(self.crs, x, y, height)
 
 
-def local_crs(name: str) -> str:
-    """Return an engineering CRS for a frame without a place on Earth.
-
-    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth (DESIGN section 6).
-
-    Examples
-    --------
-    >>> local_crs("gotcha")
-    'LOCAL_CS["gotcha",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
-    """
-    return f'LOCAL_CS["{name}",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
-
-
 def _check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     where = "config/config.yaml: scene"
     try:

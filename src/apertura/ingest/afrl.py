@@ -61,6 +61,7 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
             "transfer": (("pulse", "subcarrier"), transfer),
             "frequency": ("subcarrier", _even(first, sorted(paths)[0])),
             "reference_delay": ("pulse", reference),
+            "path_limit": ("pulse", np.full(len(pulses), np.inf)),
         },
         attrs={"frame": "local", "pair": pair, "flags": {}},
     )

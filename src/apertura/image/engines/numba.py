@@ -96,32 +96,6 @@ def form(tables: Tables, pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
     return image.reshape(pixels.shape[:-1]).astype(np.complex64)
 
 
-def contributions(tables: Tables, pixel: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return what each pulse adds at one pixel, (pulse,) complex128: the terms of the sum of `form`.
-
-    Parameters
-    ----------
-    tables
-        From `prepare`.
-    pixel
-        (3,) float64, metres.
-    """
-    terms = np.zeros((len(tables.samples), 1), np.complex128)
-    for pulse, term in enumerate(terms):
-        one = slice(pulse, pulse + 1)
-        _accumulate(
-            tables.samples[one],
-            tables.start_m[one],
-            tables.step_m,
-            tables.wavenumber_rad_m,
-            tables.tx_position_m[one],
-            tables.rx_position_m[one],
-            pixel[None],
-            term,
-        )
-    return terms[:, 0]
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, image):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     pulses, length = samples.shape

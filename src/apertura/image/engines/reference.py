@@ -15,7 +15,7 @@ def prepare(spectra: Spectra) -> Spectra:
 
 
 def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the matched filter ΣΣ w_n H_n exp(+j2πf_n(τ-τ_ref)) at each pixel.
+    """Return the matched filter ΣΣ w_n H_n exp(+j2πf_n(τ-τ_ref)) over pulses and subcarriers at each pixel.
 
     Parameters
     ----------
@@ -31,8 +31,7 @@ def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128
 
     Notes
     -----
-    Source: docs/theory.md, eq. 5. The sum over subcarriers is a polynomial in exp(j2πΔfτ), evaluated by
-    Horner's rule: one rounding per term, 1e-12 for thousands of them, and no table or interpolation.
+    Source: docs/theory.md, eq. 5.
 
     Examples
     --------
@@ -45,23 +44,44 @@ def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128
     """
     flat = pixels.reshape(-1, 3)
     image = np.zeros(len(flat), np.complex128)
-    weighted = spectra.transfer * spectra.weight
-    lowest, step = spectra.frequency_hz[0], _spacing(spectra.frequency_hz)
-    for first in range(0, len(weighted), _PULSES_AT_ONCE):
-        block = slice(first, first + _PULSES_AT_ONCE)
-        path = sum(
-            np.linalg.norm(flat - centre[block, None], axis=-1)
-            for centre in (spectra.tx_position_m, spectra.rx_position_m)
-        )
-        delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[block, None]
-        turn = np.exp(2j * np.pi * (step * delay % 1.0))
-        total = np.zeros_like(turn)
-        for subcarrier in range(weighted.shape[1] - 1, -1, -1):
-            total *= turn
-            total += weighted[block, subcarrier, None]
-        image += (total * np.exp(2j * np.pi * (lowest * delay % 1.0))).sum(axis=0)
+    for first in range(0, len(spectra.transfer), _PULSES_AT_ONCE):
+        image += terms(spectra, flat, pulses=slice(first, first + _PULSES_AT_ONCE)).sum(axis=0)
     return image.reshape(pixels.shape[:-1])
 
 
-def _spacing(frequency_hz: NDArray[np.float64]) -> float:
-    return float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
+def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slice(None)) -> NDArray[np.complex128]:
+    """Return what each pulse adds at each pixel: the sum over subcarriers alone.
+
+    Parameters
+    ----------
+    spectra
+        As `form`.
+    pixels
+        (pixel, 3) float64, metres.
+    pulses
+        Which pulses; all by default.
+
+    Returns
+    -------
+    ndarray
+        (pulse, pixel) complex128.
+
+    Notes
+    -----
+    The sum is a polynomial in exp(j2πΔfτ), evaluated by Horner's rule: one rounding per term, 1e-12 for
+    thousands of them, and no table or interpolation.
+    """
+    frequency = spectra.frequency_hz
+    step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)
+    weighted = spectra.transfer[pulses] * spectra.weight
+    path = sum(
+        np.linalg.norm(pixels - centre[pulses, None], axis=-1)
+        for centre in (spectra.tx_position_m, spectra.rx_position_m)
+    )
+    delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[pulses, None]
+    turn = np.exp(2j * np.pi * (step * delay % 1.0))
+    total = np.zeros_like(turn)
+    for subcarrier in range(weighted.shape[1] - 1, -1, -1):
+        total *= turn
+        total += weighted[:, subcarrier, None]
+    return np.asarray(total * np.exp(2j * np.pi * (frequency[0] * delay % 1.0)))

@@ -1,0 +1,54 @@
+# The front door: `make demo` sets everything up and runs the main job, `make test` passes the tests.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SETUP := $(VENV)/.installed
+TESTS ?= tests src
+export UV_PYTHON_DOWNLOADS := never
+
+.PHONY: setup demo run test test-slow lint format lock clean
+
+setup: $(SETUP)
+
+# uv comes first, by hash; it then installs everything else by hash, and the package from this folder.
+$(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMakeLists.txt native/*)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt
+	$(BIN)/uv pip sync --quiet --python $(BIN)/python --require-hashes requirements/all.txt
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+	touch $@
+
+demo: $(SETUP)
+	$(BIN)/apertura demo demo
+
+run: $(SETUP)
+	$(BIN)/apertura run $(CAMPAIGN)
+
+test: $(SETUP)
+	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
+
+test-slow: $(SETUP)
+	$(BIN)/python -m pytest -q -n 2 -m slow $(TESTS)
+
+lint: $(SETUP)
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/mypy
+	$(BIN)/snakefmt --check --quiet Snakefile workflow
+	$(BIN)/lint-imports
+	$(BIN)/python -m apertura.cli lint-workflow
+
+format: $(SETUP)
+	$(BIN)/ruff check --fix src tests benchmarks
+	$(BIN)/ruff format src tests benchmarks
+	$(BIN)/snakefmt --quiet Snakefile workflow
+
+# Needs a registry; the files name none.
+lock: $(SETUP)
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
+	    pyproject.toml --group dev --output-file requirements/all.txt
+	echo uv | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
+	    --no-annotate - --output-file requirements/uv.txt
+
+clean:
+	rm -rf $(VENV) demo build

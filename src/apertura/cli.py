@@ -1,0 +1,134 @@
+"""The command line: one subcommand per step, and whole campaigns."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from apertura import __version__
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="SAR images from campaign folders.")
+step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
+app.add_typer(step, name="step")
+
+Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
+Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
+HERE = Path()
+
+
+def main() -> None:
+    """Run the command line; what a person has to mend is said in one message, without a traceback."""
+    try:
+        app()
+    except CampaignError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    print(__version__)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def run(
+    context: typer.Context,
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    cores: Annotated[int, typer.Option(help="cores to use")] = os.cpu_count() or 1,
+) -> None:
+    """Run the workflow on a campaign folder; further options go to snakemake."""
+    Campaign.load(campaign).check_files()
+    root = _workflow_folder()
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
+    command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *context.args]
+    raise SystemExit(subprocess.run(command, check=False).returncode)
+
+
+def _workflow_folder() -> Path:
+    """Return where the root Snakefile lies: inside the installed package, or beside its sources."""
+    package = Path(__file__).parent
+    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())
+
+
+@app.command()
+def verify(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
+) -> None:
+    """Compare where point targets are found with where they were put, and print the products' paths."""
+    from apertura.steps.verify import print_findings
+
+    print_findings(Campaign.load(campaign), paths=paths)
+
+
+@step.command()
+def raw(flight: str, node: str, campaign: Directory = HERE) -> None:
+    """Read a node's recording into raw.zarr."""
+    from apertura.steps import ingest
+
+    print(ingest.raw(Campaign.load(campaign), flight, node))
+
+
+@step.command()
+def track(flight: str, node: str, campaign: Directory = HERE) -> None:
+    """Read a node's flight log into track.zarr."""
+    from apertura.steps import ingest
+
+    print(ingest.track(Campaign.load(campaign), flight, node))
+
+
+@step.command()
+def echo(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Turn recordings of a pair into calibrated transfer functions, echo.zarr."""
+    from apertura.steps import echo as steps
+
+    print(steps.echo(Campaign.load(campaign), flight, pair))
+
+
+@step.command()
+def scene(campaign: Directory = HERE) -> None:
+    """Settle the campaign's grid, scene.json."""
+    from apertura.steps import scene as steps
+
+    print(steps.scene(Campaign.load(campaign)))
+
+
+@step.command()
+def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Compress a pair in range over the scene, profile.zarr."""
+    from apertura.steps import profile as steps
+
+    print(steps.profile(Campaign.load(campaign), flight, pair))
+
+
+@step.command()
+def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Focus a pair's image, image.zarr and image.json."""
+    from apertura.steps import image as steps
+
+    print(steps.image(Campaign.load(campaign), flight, pair, threads=threads))
+
+
+@step.command()
+def cube(campaign: Directory = HERE) -> None:
+    """Stack and add up every image, cube.zarr."""
+    from apertura.steps import cube as steps
+
+    print(steps.cube(Campaign.load(campaign)))
+
+
+@step.command()
+def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
+    from apertura.steps import export as steps
+
+    loaded = Campaign.load(campaign)
+    written = steps.export_fused(loaded, flight) if pair == "fused" else steps.export(loaded, flight, pair)
+    print(*written, sep="\n")
+
+

@@ -1,0 +1,41 @@
+"""Rules of the ingest wing: what a node recorded, as `raw` and `track`."""
+
+from pathlib import Path
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.ingest import TRACKS, read_sigmf
+from apertura.provenance import sha256_file
+from apertura.steps.stamping import stamped
+from apertura.store import save_stage
+
+
+def raw(campaign: Campaign, flight: str, node: str) -> Path:
+    """Write results/<flight>/<node>/raw.zarr from the node's SigMF recording."""
+    meta, data = (campaign.raw_file(flight, node, suffix) for suffix in (".sigmf-meta", ".sigmf-data"))
+    dataset = stamped(
+        read_sigmf(meta, data, node=node), "raw", module=__name__, inputs=_hashes(campaign.root, meta, data)
+    )
+    folder = campaign.stage("raw", flight, node)
+    save_stage(dataset, folder, chunks={"channel": 1, "pulse": 256})
+    return folder
+
+
+def track(campaign: Campaign, flight: str, node: str) -> Path:
+    """Write results/<flight>/<node>/track.zarr from the node's flight log."""
+    log = campaign.track_file(flight, node)
+    if log.suffix not in TRACKS:
+        raise CampaignError(
+            f"a flight log of kind {log.suffix!r}",
+            where=log,
+            expected=f"one of {sorted(TRACKS)}",
+            remedy="Convert the log, or write a reader for it.",
+        )
+    dataset = TRACKS[log.suffix](log, node=node)
+    folder = campaign.stage("track", flight, node)
+    save_stage(stamped(dataset, "track", module=__name__, inputs=_hashes(campaign.root, log)), folder)
+    return folder
+
+
+def _hashes(root: Path, *files: Path) -> dict[str, str]:
+    return {path.relative_to(root).as_posix(): sha256_file(path) for path in files}

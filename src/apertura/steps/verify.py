@@ -1,0 +1,97 @@
+"""Found against put: every point target of truth.json, in the GeoTIFFs a user would open."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign, Flight
+from apertura.errors import CampaignError
+from apertura.geodesy import projected_from_ecef
+from apertura.image.grid import LOCAL
+from apertura.image.peaks import cut_through, find_peak
+from apertura.steps.scene import scene_grid
+from apertura.store import open_stage
+
+REACH_M = 1.0
+"""How far from its true place a target is looked for and its cuts go, metres."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One target in one image; lengths in metres."""
+
+    flight: str
+    image: str
+    target: int
+    error_east_m: float
+    error_north_m: float
+    cross_range_m: float
+    ground_range_m: float
+
+    @property
+    def error_m(self) -> float:
+        """Distance between where the target was found and where it was put."""
+        return float(np.hypot(self.error_east_m, self.error_north_m))
+
+
+def verify(campaign: Campaign) -> list[Finding]:
+    """Return where each target of truth.json is found in each SLC of the campaign, and its −3 dB widths.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign has no truth.json or no results.
+    """
+    path = campaign.root / "truth.json"
+    if not path.is_file():
+        raise CampaignError(
+            "no such file", where=path, expected="true target places", remedy="Only simulated campaigns have them."
+        )
+    targets = json.loads(path.read_text(encoding="utf-8"))["targets"]
+    return [finding for flight in campaign.image_flights for finding in _flight(campaign, flight, targets)]
+
+
+def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
+    along = _along_track(campaign, flight)
+    files = {pair: campaign.results / flight.name / pair / "slc.tif" for pair in flight.pairs}
+    files["fused"] = campaign.results / flight.name / "fused" / "coherent_slc.tif"
+    for name, file in files.items():
+        if not file.is_file():
+            raise CampaignError(
+                "no such file", where=file, expected="a finished campaign", remedy="Run the workflow first."
+            )
+        with rasterio.open(file) as raster:
+            image, inverse, spacing = raster.read(1), ~raster.transform, raster.transform.a
+        for number, target in enumerate(targets):
+            column, row = np.array(inverse * (target["x"], target["y"])) - 0.5
+            if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
+                continue
+            peak = find_peak(image, *_brightest_near(image, row, column, REACH_M / 4 / spacing))
+            across = (along[1], -along[0])
+            cuts = [
+                cut_through(image, peak, direction=direction, spacing_m=spacing, reach_m=REACH_M)
+                for direction in (along, across)
+            ]
+            east, north = (peak.column - column) * spacing, (row - peak.row) * spacing
+            yield Finding(flight.name, name, number, east, north, cuts[0].width_m, cuts[1].width_m)
+
+
+def _brightest_near(image: NDArray[np.complex64], row: float, column: float, reach: float) -> tuple[int, int]:
+    first = [max(0, int(np.floor(at - reach))) for at in (row, column)]
+    window = np.abs(image[first[0] : int(row + reach) + 2, first[1] : int(column + reach) + 2])
+    down, right = np.unravel_index(int(np.nanargmax(window)), window.shape)
+    return first[0] + int(down), first[1] + int(right)
+
+
+def _along_track(campaign: Campaign, flight: Flight) -> tuple[float, float]:
+    """Return the transmitter's direction over ground as (east, north)."""
+    echo = open_stage(campaign.stage("echo", flight.name, flight.pairs[0]), "echo")
+    ends = echo.tx_position.values[[0, -1]]
+    crs = scene_grid(campaign).crs
+    east, north, _ = np.diff(ends if crs == LOCAL else projected_from_ecef(crs, ends), axis=0)[0]
+    return float(east), float(north)

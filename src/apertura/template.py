@@ -1,0 +1,76 @@
+"""The commented config every campaign starts from, and its JSON schema, both generated from `Settings`."""
+
+import json
+import types
+from typing import Any, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from apertura.settings import Node, OfdmWaveform, Settings
+
+_EXAMPLES: dict[str, Any] = {"waveform": OfdmWaveform, "nodes": {"uav1": Node, "uav2": Node}}
+_FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1,uav2\n"
+
+
+def config_template() -> str:
+    """Return config/config.yaml with every key, its meaning as a comment, and its default or an example.
+
+    Examples
+    --------
+    >>> print(config_template().splitlines()[2])
+    # name of the campaign
+    """
+    header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
+    return header + "\n".join(_section(Settings, 0)) + "\n"
+
+
+def flights_template() -> str:
+    """Return config/flights.tsv with one flight."""
+    return _FLIGHTS
+
+
+def config_schema() -> str:
+    """Return the JSON schema of config/config.yaml."""
+    return json.dumps(Settings.model_json_schema(), indent=1) + "\n"
+
+
+def _section(model: type[BaseModel], depth: int) -> list[str]:
+    lines: list[str] = []
+    for name, field in model.model_fields.items():
+        indent = "  " * depth
+        lines.append(f"{indent}# {field.description}{_choices(field)}")
+        value = _EXAMPLES.get(name) if depth == 0 and name in _EXAMPLES else _value(field)
+        if isinstance(value, type) and issubclass(value, BaseModel):
+            lines += [f"{indent}{name}:", *_section(value, depth + 1)]
+        elif isinstance(value, dict):
+            lines.append(f"{indent}{name}:")
+            for key, inner in value.items():
+                lines += [f"{indent}  {key}:", *_section(inner, depth + 2)]
+        else:
+            lines.append(f"{indent}{name}: {_scalar(value)}")
+    return lines
+
+
+def _value(field: FieldInfo) -> Any:
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+        return field.annotation
+    if field.examples:
+        return field.examples[0]
+    if field.default is not PydanticUndefined:
+        return field.default
+    return get_args(field.annotation)[0]  # a Literal without default: its first choice
+
+
+def _choices(field: FieldInfo) -> str:
+    kinds = get_args(field.annotation) if get_origin(field.annotation) is types.UnionType else (field.annotation,)
+    words = [word for kind in kinds if str(kind).startswith("typing.Literal") for word in get_args(kind)]
+    listed = [word for word in words if word not in (field.description or "")]
+    return f" ({' | '.join(words)})" if listed else ""
+
+
+def _scalar(value: Any) -> str:
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True).removesuffix("\n").removesuffix("\n...")

@@ -1,0 +1,45 @@
+rule echo:
+    input:
+        lambda wildcards: campaign.echo_sources(wildcards.flight, wildcards.pair),
+    output:
+        "results/{flight}/{pair}/echo.manifest.json",
+    log:
+        "results/logs/{flight}/{pair}.echo.log",
+    benchmark:
+        "results/benchmarks/{flight}/{pair}.echo.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+    params:
+        settings=lambda wildcards: campaign.relevant("echo", wildcards.pair),
+        code=code_sha256("apertura.steps.echo"),
+    message:
+        "{wildcards.flight}: calibrating {wildcards.pair}"
+    shell:
+        "apertura step echo {wildcards.flight} {wildcards.pair} > {log} 2>&1"
+
+
+rule profile:
+    input:
+        "results/{flight}/{pair}/echo.manifest.json",
+        "results/scene.json",
+    output:
+        "results/{flight}/{pair}/profile.manifest.json",
+    log:
+        "results/logs/{flight}/{pair}.profile.log",
+    benchmark:
+        "results/benchmarks/{flight}/{pair}.profile.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+    params:
+        settings=campaign.relevant("profile"),
+        code=code_sha256("apertura.steps.profile"),
+    message:
+        "{wildcards.flight}: compressing {wildcards.pair} in range"
+    shell:
+        "apertura step profile {wildcards.flight} {wildcards.pair} > {log} 2>&1"
