@@ -1,4 +1,5 @@
 // The entry points that Python binds, and the choice of the instruction set.
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
@@ -49,35 +50,53 @@ const Entry* find(const char* name) {
   return nullptr;
 }
 
-// Pulses in one pass over the tile, so that their tables stay in the second-level cache. A property of the
-// tables alone: the order of summation must not depend on the tile.
-int64_t block_length(const ApertureJob& job) {
-  const int64_t bytes = 8 * (job.degree + 1) * job.width, fits = (768 << 10) / bytes / 8 * 8;
-  return fits < 16 ? 16 : fits > 64 ? 64 : fits;
+constexpr int64_t kPulses = 64;      // in one pass: with kRegion, what the second-level cache holds
+constexpr int64_t kRegion = 128;     // pixels on a side of what is finished before going on
+
+// Writes the sums of one patch to its pixels.
+template <class Real>
+void write(const ApertureJob& job, const Patch& patch, const Real* total) {
+  for (int i = 0; i < patch.rows; i++)
+    for (int j = 0; j < patch.columns; j++) {
+      const int block = i / 8 * 8 + j / 8 * 4 + i / 4 % 2 * 2 + j / 4 % 2, slot = block * 16 + i % 4 * 4 + j % 4;
+      const int64_t pixel = (patch.row + i) * job.columns + patch.column + j;
+      const double* at = job.pixels + 3 * pixel;
+      const bool placed = std::isfinite(at[0] + at[1] + at[2]);
+      job.image[2 * pixel] = placed ? float(total[slot]) : std::nanf("");
+      job.image[2 * pixel + 1] = placed ? float(total[kPixels + slot]) : std::nanf("");
+    }
 }
 
+// Forms the patches of one region, blocks of pulses in the outer loop. The order of summation of a patch does not
+// depend on the region or the tile.
 template <class Real>
-void form_tile(const ApertureJob& job, const Entry& entry, const Patch* patches, int64_t count, Real* totals) {
-  const int64_t block = block_length(job);
-  for (int64_t begin = 0; begin < job.pulses; begin += block) {
-    const int64_t end = begin + block < job.pulses ? begin + block : job.pulses;
-    for (int64_t n = 0; n < count; n++) {
+void form_region(const ApertureJob& job, const Entry& entry, int64_t top, int64_t left, std::vector<Patch>& patches,
+                 std::vector<Real>& totals) {
+  // A quarter of the tolerance, seen by both legs.
+  const double bend = 0.125 * job.tolerance_rad / job.radians_per_cell;
+  size_t count = 0;
+  for (int64_t row = top; row < top + kRegion && row < job.rows; row += kSide)
+    for (int64_t column = left; column < left + kRegion && column < job.columns; column += kSide)
+      apertura::fit(job, row, column, bend, patches[count++]);
+  std::fill(totals.begin(), totals.end(), Real(0));
+  for (int64_t begin = 0; begin < job.pulses; begin += kPulses) {
+    const int64_t end = begin + kPulses < job.pulses ? begin + kPulses : job.pulses;
+    for (size_t n = 0; n < count; n++) {
       alignas(64) float sum[2 * kPixels] = {};
       entry.add(&job, &patches[n], begin, end, sum);
       for (int slot = 0; slot < 2 * kPixels; slot++) totals[n * 2 * kPixels + slot] += Real(sum[slot]);
     }
   }
-  for (int64_t n = 0; n < count; n++)
-    for (int i = 0; i < patches[n].rows; i++)
-      for (int j = 0; j < patches[n].columns; j++) {
-        const int slot = (i / 4 * 4 + j / 4) * 16 + i % 4 * 4 + j % 4;
-        const int64_t pixel = (patches[n].row + i) * job.columns + patches[n].column + j;
-        const double* at = job.pixels + 3 * pixel;
-        const bool placed = std::isfinite(at[0] + at[1] + at[2]);
-        for (int part = 0; part < 2; part++)
-          job.image[2 * pixel + part] =
-              placed ? float(totals[(n * 2 + part) * kPixels + slot]) : std::nanf("");
-      }
+  for (size_t n = 0; n < count; n++) write(job, patches[n], &totals[n * 2 * kPixels]);
+}
+
+template <class Real>
+void form_tile(const ApertureJob& job, const Entry& entry) {
+  constexpr size_t count = (kRegion / kSide) * (kRegion / kSide);
+  std::vector<Patch> patches(count);
+  std::vector<Real> totals(count * 2 * kPixels);
+  for (int64_t top = 0; top < job.rows; top += kRegion)
+    for (int64_t left = 0; left < job.columns; left += kRegion) form_region(job, entry, top, left, patches, totals);
 }
 
 }  // namespace
@@ -85,13 +104,13 @@ void form_tile(const ApertureJob& job, const Entry& entry, const Patch* patches,
 extern "C" {
 
 // The instruction set that `name` ("" for the best) selects here, or null if this machine has none of that name.
-const char* apertura_form(const char* name) {
+__attribute__((visibility("default"))) const char* apertura_form(const char* name) {
   const Entry* entry = find(name);
   return entry ? entry->name : nullptr;
 }
 
 // 0, or 1 if memory ran out, or 2 if this machine lacks the instruction set.
-int apertura_expand(const char* name, const TableJob* job) {
+__attribute__((visibility("default"))) int apertura_expand(const char* name, const TableJob* job) {
   const Entry* entry = find(name);
   if (!entry) return 2;
   try {
@@ -103,24 +122,11 @@ int apertura_expand(const char* name, const TableJob* job) {
   return 0;
 }
 
-int apertura_image(const char* name, const ApertureJob* job) {
+__attribute__((visibility("default"))) int apertura_image(const char* name, const ApertureJob* job) {
   const Entry* entry = find(name);
   if (!entry) return 2;
   try {
-    // A quarter of the tolerance, seen by both legs.
-    const double bend = 0.125 * job->tolerance_rad / job->radians_per_cell;
-    std::vector<Patch> patches(size_t((job->rows + kSide - 1) / kSide * ((job->columns + kSide - 1) / kSide)));
-    size_t next = 0;
-    for (int64_t row = 0; row < job->rows; row += kSide)
-      for (int64_t column = 0; column < job->columns; column += kSide)
-        apertura::fit(*job, row, column, bend, patches[next++]);
-    if (job->wide_sum) {
-      std::vector<double> totals(patches.size() * 2 * kPixels);
-      form_tile(*job, *entry, patches.data(), int64_t(patches.size()), totals.data());
-    } else {
-      std::vector<float> totals(patches.size() * 2 * kPixels);
-      form_tile(*job, *entry, patches.data(), int64_t(patches.size()), totals.data());
-    }
+    job->wide_sum ? form_tile<double>(*job, *entry) : form_tile<float>(*job, *entry);
   } catch (const std::bad_alloc&) {
     return 1;
   }

@@ -6,78 +6,84 @@
 
 namespace {
 
+// Fast forms: one look-up window for a group of four blocks (one block with 8 lanes), or a wide one for each block; all
+// blocks bend alike, or each its own way.
+constexpr bool kGrouped = kLanes == 16;
 enum Form { kShared, kSharedWide, kOwn, kFast, kExact = kFast, kSkip, kForms };
 
 struct Batch {
-  Slopes slopes[kBatch];
-  alignas(64) const float* window[kBatch][kBlocks];
-  alignas(64) float bend[kBatch][16];   // shared curvature over the pixels of any block
-  alignas(64) float tilt[kBatch][16];   // shared change of the height slope over them
-  float lift[kBatch];                   // shared second derivative along the height
+  alignas(64) float path[kBatch][kBlocks];  // at the centre, from the window's first cell
+  alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks], h[kBatch][kBlocks];  // its derivatives
+  alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks], yy[kBatch][kBlocks];
+  alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
+  alignas(64) int32_t window[kBatch][kBlocks];  // first cell, from `row`
+  alignas(64) float bend[kBatch][16];           // shared curvature over the pixels of any block
+  alignas(64) float tilt[kBatch][16];           // shared change of the height slope over them
+  float lift[kBatch];                           // shared second derivative along the height
+  const float* row[kBatch];
   int order[kForms][kBatch];
   int count[kForms];
 };
 
-constexpr float kOffset[4] = {-1.5f, -0.5f, 0.5f, 1.5f};
-
-inline float magnitude(float value) { return __builtin_fabsf(value); }
-
-template <bool kTerrain>
-inline void slopes_of(const Patch& patch, const Aim& aim, int q, bool own, Slopes& out) {
-  const float start = float(aim.path[q] - __builtin_floor(aim.path[q]));
-  for (int b = 0; b < kBlocks; b++) out.path[b] = out.x[b] = out.y[b] = out.h[b] = 0;
-  for (const Leg& leg : aim.leg) add_leg<kTerrain>(patch, leg.x[q], leg.y[q], leg.h[q], leg.inverse[q], out);
-  for (int b = 0; b < kBlocks; b++) out.path[b] += start;
-  if (!own) return;
-  for (int b = 0; b < kBlocks; b++) out.xx[b] = out.xy[b] = out.yy[b] = out.xh[b] = out.yh[b] = out.hh[b] = 0;
-  for (const Leg& leg : aim.leg) add_curvature<kTerrain>(patch, leg.x[q], leg.y[q], leg.h[q], leg.inverse[q], out);
-}
+// Pixels of a block from its centre.
+alignas(64) constexpr float kLaneX[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f,
+                                          -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f};
+alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
+                                          .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
 // Places the look-up windows of one pulse. Returns the form it may take: every index stays inside its window and
 // every window inside the table, or the pulse goes the exact way.
-template <bool kTerrain>
-inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, int64_t pulse, int q, bool own,
-                  Batch& batch) {
-  Slopes& s = batch.slopes[q];
-  slopes_of<kTerrain>(patch, aim, q, own, s);
-  const Curvature c = shared_curvature(patch, aim, q);
-  const float rough = patch.roughest;
-  // Curvature inside a block is small beside its slope: twice the value at the origin bounds it where fast forms hold.
-  float margin = 4.5f * (magnitude(c.xx) + magnitude(c.xy) + magnitude(c.yy)) + 1e-3f;
-  if constexpr (kTerrain) margin += rough * (3.0f * (magnitude(c.xh) + magnitude(c.yh)) + 2 * rough * c.hh);
-  alignas(64) float low[kBlocks];
-  float widest = 0, lowest = 1e30f, highest = -1e30f;
-  for (int b = 0; b < kBlocks; b++) {
-    float span = 1.5f * (magnitude(s.x[b]) + magnitude(s.y[b])) + margin;
-    if constexpr (kTerrain) span += rough * magnitude(s.h[b]);
-    low[b] = __builtin_floorf(s.path[b] - span);
-    const float end = s.path[b] + span - low[b], top = s.path[b] + span;
-    s.path[b] -= low[b];
-    widest = widest < end ? end : widest;
-    lowest = lowest > low[b] ? low[b] : lowest;
-    highest = highest < top ? top : highest;
+template <bool kTerrain, bool kOwnCurvature>
+inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, int64_t pulse, int q, Batch& batch) {
+  constexpr int kParts = kBlocks / kLanes;
+  const float rough = patch.roughest, first = aim.first[q], last = aim.last[q];
+  Whole inside = ~Whole{}, narrow = ~Whole{}, before = ~Whole{}, behind = ~Whole{};
+  Lanes path[kParts], low[kParts], lowest[kParts];
+  for (int part = 0; part < kParts; part++) {
+    const int b = part * kLanes;
+    Slope s;
+    add_leg<kTerrain, kOwnCurvature>(patch, aim.leg[0], q, b, s);
+    add_leg<kTerrain, kOwnCurvature>(patch, aim.leg[1], q, b, s);
+    path[part] = s.path + aim.rest[q];
+    Lanes span = 1.5f * (magnitude(s.x) + magnitude(s.y)) + aim.margin[q];
+    if constexpr (kTerrain) span += rough * magnitude(s.h);
+    const Lanes top = path[part] + span;
+    low[part] = floor(path[part] - span);
+    lowest[part] = kGrouped ? least_of_four(low[part]) : low[part];
+    inside &= (low[part] >= first) & (low[part] <= last) & (top - low[part] <= kWindow - 0.51f);
+    narrow &= top - lowest[part] <= kNarrow - 0.51f;
+    before &= top < first - 1;
+    behind &= low[part] > last + kWindow;
+    store(batch.x[q] + b, s.x), store(batch.y[q] + b, s.y);
+    if constexpr (kTerrain) store(batch.h[q] + b, s.h);
+    if constexpr (kOwnCurvature)
+      store(batch.xx[q] + b, s.xx), store(batch.xy[q] + b, s.xy), store(batch.yy[q] + b, s.yy);
+    if constexpr (kOwnCurvature && kTerrain)
+      store(batch.xh[q] + b, s.xh), store(batch.yh[q] + b, s.yh), store(batch.hh[q] + b, s.hh);
   }
-  const double start = __builtin_floor(aim.path[q]);
-  if (start + highest < -1 || start + lowest > double(job.width)) return kSkip;
-  if (!(start + lowest >= 0 && start + highest + kWindow <= double(job.width) && widest <= kWindow - 0.51f))
-    return kExact;
-  const float* row = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(start);
-  for (int b = 0; b < kBlocks; b++) batch.window[q][b] = row + int64_t(low[b]);
-  if (own) return kOwn;
-  for (int lane = 0; lane < 16; lane++) {
-    const float x = kOffset[lane % 4], y = kOffset[lane / 4];
-    batch.bend[q][lane] = x * (x * c.xx + y * c.xy) + y * y * c.yy;
-    if constexpr (kTerrain) batch.tilt[q][lane] = x * c.xh + y * c.yh;
+  if (!all(inside)) return all(before) || all(behind) ? kSkip : kExact;
+  const bool shared = !kOwnCurvature && kLanes != 4 && all(narrow);
+  for (int part = 0; part < kParts; part++) {
+    const Lanes begin = shared ? lowest[part] : low[part];
+    store(batch.path[q] + part * kLanes, path[part] - begin);
+    *reinterpret_cast<Whole*>(batch.window[q] + part * kLanes) = __builtin_convertvector(begin, Whole);
   }
-  batch.lift[q] = c.hh;
-  return widest <= kNarrow - 0.51f ? kShared : kSharedWide;
+  batch.row[q] = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(aim.start[q]);
+  if constexpr (kOwnCurvature) return kOwn;
+  for (int lane = 0; lane < 16; lane += kLanes) {
+    const Lanes x = load(kLaneX + lane), y = load(kLaneY + lane);
+    store(batch.bend[q] + lane, x * (x * aim.xx[q] + y * aim.xy[q]) + y * y * aim.yy[q]);
+    if constexpr (kTerrain) store(batch.tilt[q] + lane, x * aim.xh[q] + y * aim.yh[q]);
+  }
+  batch.lift[q] = aim.hh[q];
+  return shared ? kShared : kSharedWide;
 }
 
 // Sorts eight pulses into forms.
 template <bool kTerrain>
 inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
   Aim aim;
-  aim_at(job, patch, pulse, aim);
+  aim_at<kTerrain>(job, patch, pulse, aim);
   const float tolerance = float(job.tolerance_rad / job.radians_per_cell);
   for (int form = 0; form < kForms; form++) batch.count[form] = 0;
   for (int q = 0; q < pulses; q++) {
@@ -85,67 +91,66 @@ inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t puls
     const bool own = !(aim.shared[q] <= tolerance);
     const bool far = !(magnitude(float(aim.path[q])) < 1e7f);
     if (!patch.crooked && !far && aim.own[q] <= tolerance)
-      form = place<kTerrain>(job, patch, aim, pulse, q, own, batch);
+      form = own ? place<kTerrain, true>(job, patch, aim, pulse, q, batch)
+                 : place<kTerrain, false>(job, patch, aim, pulse, q, batch);
     batch.order[form][batch.count[form]++] = q;
   }
 }
 
-// The pixel loop: for each block, all pulses of one form. `sum` is re then im, block by block.
+// Path of a block's pixels, in cells from its window.
+template <bool kTerrain, Form kForm>
+inline Lanes place_pixels(const Patch& patch, const Batch& batch, int q, int b, int part) {
+  const Lanes x = load(kLaneX + part), y = load(kLaneY + part);
+  Lanes t;
+  if constexpr (kForm == kOwn)
+    t = batch.path[q][b] + x * (batch.x[q][b] + x * batch.xx[q][b] + y * batch.xy[q][b]) +
+        y * (batch.y[q][b] + y * batch.yy[q][b]);
+  else
+    t = (load(batch.bend[q] + part) + batch.path[q][b]) + x * batch.x[q][b] + y * batch.y[q][b];
+  if constexpr (kTerrain) {
+    const Lanes rise = load(patch.rise + b * 16 + part);
+    if constexpr (kForm == kOwn)
+      t += rise * (batch.h[q][b] + x * batch.xh[q][b] + y * batch.yh[q][b] + rise * batch.hh[q][b]);
+    else
+      t += rise * (load(batch.tilt[q] + part) + batch.h[q][b] + rise * batch.lift[q]);
+  }
+  return t;
+}
+
+// The pixel loop: for each window's blocks, all pulses of one form. `sum` is re then im, block by block.
 template <class Phase, int kDegree, bool kTerrain, Form kForm>
 inline void add_form(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
   constexpr bool kWide = kForm != kShared;
+  constexpr int kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
   const int count = batch.count[kForm];
   if (count == 0) return;
   const Phase phase(job.phase);
   const int64_t width = job.width;
-  alignas(64) float lane_x[16], lane_y[16];
-  for (int lane = 0; lane < 16; lane++) lane_x[lane] = kOffset[lane % 4], lane_y[lane] = kOffset[lane / 4];
-  for (int n = 0; n < patch.blocks; n++) {
-    const int b = patch.block[n];
-    constexpr int kParts = 16 / kLanes;
-    Lanes re[kParts], im[kParts];
-    for (int part = 0; part < kParts; part++) {
-      re[part] = load(sum + b * 16 + part * kLanes);
-      im[part] = load(sum + kPixels + b * 16 + part * kLanes);
-    }
-    for (int n_q = 0; n_q < count; n_q++) {
-      const int q = batch.order[kForm][n_q];
-      const Slopes& s = batch.slopes[q];
-      const float* window = batch.window[q][b];
+  for (int group = 0; group < kBlocks; group += kBundle) {
+    if (!patch.present[group]) continue;
+    Lanes re[kVectors], im[kVectors];
+    float* here = sum + group * 16;
+    for (int v = 0; v < kVectors; v++) re[v] = load(here + v * kLanes), im[v] = load(here + kPixels + v * kLanes);
+    for (int n = 0; n < count; n++) {
+      const int q = batch.order[kForm][n];
+      const float* window = batch.row[q] + batch.window[q][group];
+      const Stretch<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
+      const Stretch<kWide> re2(kDegree == 2 ? window + 4 * width : window), im2(kDegree == 2 ? window + 5 * width : window);
 #pragma GCC unroll 4
-      for (int part = 0; part < kParts; part++) {
-        const Lanes x = load(lane_x + part * kLanes), y = load(lane_y + part * kLanes);
-        Lanes t;
-        if constexpr (kForm == kOwn)
-          t = s.path[b] + x * (s.x[b] + x * s.xx[b] + y * s.xy[b]) + y * (s.y[b] + y * s.yy[b]);
-        else
-          t = (load(batch.bend[q] + part * kLanes) + s.path[b]) + x * s.x[b] + y * s.y[b];
-        if constexpr (kTerrain) {
-          const Lanes rise = load(patch.rise + b * 16 + part * kLanes);
-          if constexpr (kForm == kOwn)
-            t += rise * (s.h[b] + x * s.xh[b] + y * s.yh[b] + rise * s.hh[b]);
-          else
-            t += rise * (load(batch.tilt[q] + part * kLanes) + s.h[b] + rise * batch.lift[q]);
-        }
+      for (int v = 0; v < kVectors; v++) {
+        const int b = group + v / kParts, part = v % kParts * kLanes;
+        const Lanes t = place_pixels<kTerrain, kForm>(patch, batch, q, b, part);
         const Lanes moved = t + kMagic, u = t - (moved - kMagic);
         const Whole index = (Whole)moved;
-        Lanes vr = look_up<kWide>(window + 2 * width, index), vi = look_up<kWide>(window + 3 * width, index);
-        if constexpr (kDegree == 2) {
-          vr += u * look_up<kWide>(window + 4 * width, index);
-          vi += u * look_up<kWide>(window + 5 * width, index);
-        }
-        vr = look_up<kWide>(window, index) + u * vr;
-        vi = look_up<kWide>(window + width, index) + u * vi;
-        Lanes cosine, sine;
+        Lanes vr = re1[index], vi = im1[index], cosine, sine;
+        if constexpr (kDegree == 2) vr += u * re2[index], vi += u * im2[index];
+        vr = re0[index] + u * vr, vi = im0[index] + u * vi;
         phase(u, cosine, sine);
-        re[part] += vr * cosine - vi * sine;
-        im[part] += vr * sine + vi * cosine;
+        re[v] += vr * cosine, im[v] += vr * sine;
+        re[v] -= vi * sine, im[v] += vi * cosine;
       }
     }
-    for (int part = 0; part < kParts; part++) {
-      store(sum + b * 16 + part * kLanes, re[part]);
-      store(sum + kPixels + b * 16 + part * kLanes, im[part]);
-    }
+    for (int v = 0; v < kVectors; v++) store(here + v * kLanes, re[v]), store(here + kPixels + v * kLanes, im[v]);
   }
 }
 

@@ -11,7 +11,7 @@ struct Positions {
 
 inline void gather(const ApertureJob& job, const Patch& patch, Positions& out) {
   for (int slot = 0; slot < kPixels; slot++) {
-    const int i = slot / 64 * 4 + slot % 16 / 4, j = slot / 16 % 4 * 4 + slot % 4;
+    const int i = apertura::top(slot / 16) + slot % 16 / 4, j = apertura::left(slot / 16) + slot % 4;
     const bool present = i < patch.rows && j < patch.columns;
     const int64_t row = patch.row + (present ? i : 0), column = patch.column + (present ? j : 0);
     const double* pixel = job.pixels + 3 * (row * job.columns + column);
@@ -36,8 +36,8 @@ inline void add_exact(const ApertureJob& job, const Patch& patch, const Position
   const float* row = job.cells + pulse * 2 * (kDegree + 1) * job.width;
   alignas(64) double cell[kPixels];
   path_of(job, at, pulse, cell);
-  for (int n = 0; n < patch.blocks; n++)
-    for (int slot = patch.block[n] * 16; slot < patch.block[n] * 16 + 16; slot += kLanes) {
+  for (int b = 0; b < kBlocks; b++)
+    for (int slot = b * 16; patch.present[b] && slot < b * 16 + 16; slot += kLanes) {
       alignas(64) float taken[2 * (kDegree + 1)][kLanes], rest[kLanes];
       for (int lane = 0; lane < kLanes; lane++) {
         const double middle = __builtin_floor(cell[slot + lane] + 0.5);

@@ -15,8 +15,8 @@ void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_
   for (int64_t pulse = begin; pulse < end; pulse += kBatch) {
     const int pulses = int(end - pulse < kBatch ? end - pulse : kBatch);
     sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
-    add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
-    if constexpr (kLanes == 8) add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
+    if constexpr (kLanes != 4) add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
+    add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
     add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
     if (batch.count[kExact] && !gathered) gather(job, patch, at), gathered = true;
     for (int n = 0; n < batch.count[kExact]; n++)

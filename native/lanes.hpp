@@ -37,21 +37,68 @@ inline Lanes splat(float value) {
 #endif
 }
 
-// table[index] per lane; only the low bits of the index count, so no lane can read beside the window.
-template <bool kWide>
-inline Lanes look_up(const float* table, Whole index) {
+inline Lanes magnitude(Lanes value) { return (Lanes)((Whole)value & 0x7fffffff); }
+inline Lanes floor(Lanes value) {
 #if defined(__AVX512F__)
-  return (Lanes)_mm512_permutexvar_ps((__m512i)index, _mm512_loadu_ps(table));
+  return (Lanes)_mm512_roundscale_ps((__m512)value, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
 #elif defined(__AVX2__)
-  const __m256 low = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table), (__m256i)index);
-  if constexpr (!kWide) return (Lanes)low;
-  const __m256 high = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table + 8), (__m256i)index);
-  return (Lanes)_mm256_blendv_ps(low, high, _mm256_castsi256_ps(_mm256_slli_epi32((__m256i)index, 28)));
+  return (Lanes)_mm256_floor_ps((__m256)value);
 #else
-  Lanes found;
-  for (int lane = 0; lane < kLanes; lane++) found[lane] = table[index[lane] & (kWindow - 1)];
-  return found;
+  for (int lane = 0; lane < kLanes; lane++) value[lane] = __builtin_floorf(value[lane]);
+  return value;
 #endif
 }
+// Of a comparison: whether it holds in every lane.
+inline bool all(Whole truth) {
+#if defined(__AVX512F__)
+  return _mm512_movepi32_mask((__m512i)truth) == 0xffff;
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps((__m256)truth) == 0xff;
+#else
+  return truth[0] & truth[1] & truth[2] & truth[3];
+#endif
+}
+
+// Smallest of each four neighbouring lanes, in all four.
+inline Lanes least_of_four(Lanes value) {
+#if defined(__AVX512F__)
+  const __m512 swapped = _mm512_min_ps((__m512)value, _mm512_permute_ps((__m512)value, 0xb1));
+  return (Lanes)_mm512_min_ps(swapped, _mm512_permute_ps(swapped, 0x4e));
+#elif defined(__AVX2__)
+  const __m256 swapped = _mm256_min_ps((__m256)value, _mm256_permute_ps((__m256)value, 0xb1));
+  return (Lanes)_mm256_min_ps(swapped, _mm256_permute_ps(swapped, 0x4e));
+#else
+  const Lanes swapped{value[1], value[0], value[3], value[2]}, pair = value < swapped ? value : swapped;
+  const Lanes other{pair[2], pair[3], pair[0], pair[1]};
+  return pair < other ? pair : other;
+#endif
+}
+
+// A stretch of table to look up in, held in registers: 16 cells, or only 8 where that is what one register holds and
+// !kWide. Only the low bits of an index count, so no lane can read beside it.
+template <bool kWide>
+struct Stretch {
+#if defined(__AVX512F__)
+  __m512 cells;
+  explicit Stretch(const float* from) : cells(_mm512_loadu_ps(from)) {}
+  Lanes operator[](Whole index) const { return (Lanes)_mm512_permutexvar_ps((__m512i)index, cells); }
+#elif defined(__AVX2__)
+  __m256 low, high;
+  explicit Stretch(const float* from) : low(_mm256_loadu_ps(from)), high(kWide ? _mm256_loadu_ps(from + 8) : low) {}
+  Lanes operator[](Whole index) const {
+    const __m256 first = _mm256_permutevar8x32_ps(low, (__m256i)index);
+    if constexpr (!kWide) return (Lanes)first;
+    const __m256 second = _mm256_permutevar8x32_ps(high, (__m256i)index);
+    return (Lanes)_mm256_blendv_ps(first, second, _mm256_castsi256_ps(_mm256_slli_epi32((__m256i)index, 28)));
+  }
+#else
+  const float* cells;
+  explicit Stretch(const float* from) : cells(from) {}
+  Lanes operator[](Whole index) const {
+    const Whole i = index & (kWindow - 1);
+    return Lanes{cells[i[0]], cells[i[1]], cells[i[2]], cells[i[3]]};
+  }
+#endif
+};
 
 }  // namespace

@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <cstring>
+#include <initializer_list>
 
 namespace apertura {
 namespace {
@@ -78,17 +79,17 @@ void fit_height(Patch& patch, double bend_cells, const double rest[kPixels][3], 
 
 // Centre and height of a block, and how far its pixels lie from them.
 void describe_block(Patch& patch, int block, const double height[kPixels]) {
-  const int top = block / 4 * 4, left = block % 4 * 4;
+  const int above = top(block), before = left(block);
   double sum = 0;
   int count = 0;
   for (int lane = 0; lane < 16; lane++) {
-    const int i = top + lane / 4, j = left + lane % 4;
+    const int i = above + lane / 4, j = before + lane % 4;
     if (i >= patch.rows || j >= patch.columns) continue;
     sum += height[i * kSide + j];
     count++;
   }
   const double level = sum / count;
-  const double x = left + 1.5 - 0.5 * (patch.columns - 1), y = top + 1.5 - 0.5 * (patch.rows - 1);
+  const double x = before + 1.5 - 0.5 * (patch.columns - 1), y = above + 1.5 - 0.5 * (patch.rows - 1);
   double centre[3];
   for (int axis = 0; axis < 3; axis++)
     centre[axis] = x * patch.step_x[axis] + y * patch.step_y[axis] + level * patch.up[axis];
@@ -99,7 +100,7 @@ void describe_block(Patch& patch, int block, const double height[kPixels]) {
   patch.dot_h[block] = float(dot(centre, patch.up));
   patch.reach = std::fmax(patch.reach, std::sqrt(patch.square[block]));
   for (int lane = 0; lane < 16; lane++) {
-    const int i = top + lane / 4, j = left + lane % 4;
+    const int i = above + lane / 4, j = before + lane % 4;
     if (i >= patch.rows || j >= patch.columns) continue;
     const double rise = height[i * kSide + j] - level;
     patch.rise[block * 16 + lane] = float(rise);
@@ -127,10 +128,16 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double bend_cells,
   patch.yy = float(dot(patch.step_y, patch.step_y));
   patch.xh = float(dot(patch.step_x, patch.up));
   patch.yh = float(dot(patch.step_y, patch.up));
+  for (int block = 0; block < kBlocks; block++) {
+    patch.present[block] = top(block) < patch.rows && left(block) < patch.columns;
+    if (patch.present[block]) describe_block(patch, block, height);
+  }
+  // A block without pixels stands where one with pixels is, so that it never decides about its group.
   for (int block = 0; block < kBlocks; block++)
-    if (block / 4 * 4 < patch.rows && block % 4 * 4 < patch.columns) {
-      describe_block(patch, block, height);
-      patch.block[patch.blocks++] = block;
+    if (!patch.present[block]) {
+      const int like = patch.present[block / 4 * 4] ? block / 4 * 4 : 0;
+      for (float* array : {patch.along_x, patch.along_y, patch.height, patch.square, patch.dot_x, patch.dot_y, patch.dot_h})
+        array[block] = array[like];
     }
 }
 

@@ -8,7 +8,11 @@ constexpr int kSide = 16;    // pixels along a patch
 constexpr int kBlocks = 16;  // blocks of 4 x 4 pixels in it
 constexpr int kPixels = kSide * kSide;
 
-// Lengths in cells but for `origin`. Blocks are counted row by row of the full patch, lanes row by row of a block.
+// First row and column of a block in its patch: four blocks are a group of 8 x 8 pixels, four groups a patch.
+constexpr int top(int block) { return block / 8 * 8 + block / 2 % 2 * 4; }
+constexpr int left(int block) { return block / 4 % 2 * 8 + block % 2 * 4; }
+
+// Lengths in cells but for `origin`. Lanes are counted row by row of a block.
 struct alignas(64) Patch {
   float along_x[kBlocks], along_y[kBlocks], height[kBlocks];  // centre of each block: pixels, pixels, cells
   float square[kBlocks];                                      // squared distance of that centre from the origin
@@ -18,8 +22,8 @@ struct alignas(64) Patch {
   float xx, xy, yy, xh, yh;                                   // products of step_x, step_y and up
   float reach, inner, roughest;                               // largest centre distance, pixel offset in a block, |rise|
   int64_t row, column;                                        // of the first pixel
-  int rows, columns, blocks;                                  // pixels present; blocks that hold any
-  int block[kBlocks];                                         // which those are
+  int rows, columns;                                          // pixels present
+  bool present[kBlocks];                                      // which blocks hold any
   bool terrain;                                               // heights matter
   bool crooked;                                               // no plane with heights describes it: exact only
 };
