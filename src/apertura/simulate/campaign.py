@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.geodesy import geodetic_from_ecef
+from apertura.simulate.continuous import continuous_blocks, recording_start_s
 from apertura.simulate.flight import phase_centre
-from apertura.simulate.impairments import independent_streams
+from apertura.simulate.hidden import independent_streams
+from apertura.simulate.impairments import Adc
 from apertura.simulate.logs import write_csv_log, write_pos_log
 from apertura.simulate.plan import Flight, Node, Recorded, Simulation, fly, pulse_times
 from apertura.simulate.recorder import Segment, write_recording
@@ -124,6 +127,8 @@ def _write_flights(root: Path, simulation: Simulation, generator: Generator) -> 
     truth: dict[str, Any] = targets_truth(simulation.scene, simulation.grid) | {"flights": {}}
     for flight, drawing, noise in zip(simulation.flights, streams[::2], streams[1::2], strict=True):
         (root / "raw" / flight.name).mkdir()
+        if flight.framing:
+            np.save(root / "raw" / flight.name / "preamble.npy", flight.framing.preamble())
         there = scatterers
         if flight.targets is not None:
             there = Scene(simulation.scene.origin, flight.targets).scatterers(ground)
@@ -137,26 +142,35 @@ def _write_flights(root: Path, simulation: Simulation, generator: Generator) -> 
 
 
 def _write_samples(stem: Path, simulation: Simulation, flight: Flight, record: Recorded, generator: Generator) -> None:
-    waveform, hidden = simulation.waveform, record.hidden
-    kept = np.flatnonzero(hidden.kept)
-    tags = _utc(flight, pulse_times(simulation, flight) + hidden.start_s + hidden.tag_error_s)
+    waveform, adc = simulation.waveform, simulation.node(stem.name).impairments.adc
+    time_s = pulse_times(simulation, flight)
+    if flight.continuous:
+        blocks = continuous_blocks(
+            record.channels, time_s, adc, generator, framing=flight.framing, first_frame=flight.first_frame
+        )
+        begun = np.array([recording_start_s(record.channels["radar"]) + record.hidden.tag_error_s[0]])
+        segments = [Segment(0, _utc(flight, begun)[0])]
+    else:
+        kept = np.flatnonzero(record.hidden.kept)
+        tags = _utc(flight, time_s + record.hidden.start_s + record.hidden.tag_error_s)
+        blocks = _captures(record, adc, kept, generator)
+        segments = [
+            Segment(order * waveform.capture_samples, tags[pulse], _frame_number(flight, int(pulse)))
+            for order, pulse in enumerate(kept)
+        ]
     write_recording(
         stem,
-        _blocks(record, simulation.node(stem.name), kept, generator),
-        [
-            Segment(order * waveform.capture_samples, tags[pulse], _frame(flight, int(pulse)))
-            for order, pulse in enumerate(kept)
-        ],
+        blocks,
+        segments,
         channels=list(record.channels),
         sample_rate_hz=waveform.sample_rate_hz,
         frequency_hz=waveform.carrier_hz,
-        extra={},
+        extra=_framing_section(simulation, flight),
     )
 
 
-def _blocks(record: Recorded, node: Node, kept: NDArray[np.intp], generator: Generator) -> Iterator[NDArray[np.int16]]:
+def _captures(record: Recorded, adc: Adc, kept: NDArray[np.intp], generator: Generator) -> Iterator[NDArray[np.int16]]:
     """Yield (sample, channel, 2) counts of a few captures at a time."""
-    adc = node.impairments.adc
     scales = {name: full_scale(channel, adc) for name, channel in record.channels.items()}
     noise = dict(zip(record.channels, independent_streams(generator, len(record.channels)), strict=True))
     for start in range(0, len(kept), _PULSES_AT_ONCE):
@@ -168,8 +182,19 @@ def _blocks(record: Recorded, node: Node, kept: NDArray[np.intp], generator: Gen
         yield np.stack(counts, axis=2).reshape(-1, len(counts), 2)
 
 
-def _frame(flight: Flight, pulse: int) -> int | None:
-    return None if flight.frame_bits is None else (flight.first_frame + pulse) % 2**flight.frame_bits
+def _frame_number(flight: Flight, pulse: int) -> int | None:
+    return flight.framing.counted(flight.first_frame + pulse) if flight.framing else None
+
+
+def _framing_section(simulation: Simulation, flight: Flight) -> dict[str, Any]:
+    """Say what a trigger must know, in the metadata of the recording itself."""
+    if not flight.framing:
+        return {}
+    described = asdict(flight.framing) | {
+        "preamble": f"raw/{flight.name}/preamble.npy",
+        "centre_hz": flight.framing.centre_hz(simulation.waveform),
+    }
+    return {"apertura:framing": described}
 
 
 def _write_log(stem: Path, simulation: Simulation, flight: Flight, node: Node) -> None:

@@ -1,7 +1,7 @@
 """What is flown: nodes, flights and the grid of a campaign, and the channels that come of one flight."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,9 @@ from numpy.random import Generator
 
 from apertura.geodesy import projected_from_ecef
 from apertura.simulate.flight import Trajectory, phase_centre, phase_centre_velocity
-from apertura.simulate.impairments import Hidden, Impairments, draw, independent_streams
+from apertura.simulate.frame import Framing
+from apertura.simulate.hidden import Hidden, draw, independent_streams
+from apertura.simulate.impairments import Impairments
 from apertura.simulate.radar import Floats, Waveform
 from apertura.simulate.recording import Geometry, receive
 from apertura.simulate.scene import Origin, Scatterers, Scene, Target, Vector
@@ -62,8 +64,10 @@ class Flight:
         Number of pulses sent.
     start_utc
         Time of the first pulse, ISO 8601.
-    frame_bits, first_frame
-        Width of the counter sent in the payload, and its first value; None: no frame numbers.
+    framing, first_frame
+        Preamble and payload before each symbol, and the number of the first frame; None: no frame numbers.
+    continuous
+        The recorders run through instead of being triggered: one capture segment with everything in it.
     targets
         What stands there in this flight only, instead of the scene's targets.
     """
@@ -74,8 +78,9 @@ class Flight:
     pulses: int
     start_utc: str = "2025-05-14T09:30:00"
     kind: Literal["image", "calibration"] = "image"
-    frame_bits: int | None = None
+    framing: Framing | None = None
     first_frame: int = 0
+    continuous: bool = False
     targets: tuple[Target, ...] | None = None
 
 
@@ -179,6 +184,13 @@ def fly(simulation: Simulation, flight: Flight, scatterers: Scatterers, generato
         )
         recorded[name] = Recorded(channels, hidden[name], geometry)
     return recorded
+
+
+def _drawable(impairments: Impairments, flight: Flight) -> Impairments:
+    """Leave out what a recorder that runs through cannot suffer: missed triggers, and phase counted per trigger."""
+    if not flight.continuous:
+        return impairments
+    return replace(impairments, missed_fraction=0.0, clock=replace(impairments.clock, continuous_phase=False))
 
 
 def _geometry(simulation: Simulation, flight: Flight, receiver: str, hidden: Mapping[str, Hidden]) -> Geometry:

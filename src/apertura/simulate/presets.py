@@ -7,7 +7,8 @@ from numpy.random import Generator
 
 from apertura.simulate.campaign import write_campaign
 from apertura.simulate.flight import Sampled, Straight, wobble
-from apertura.simulate.impairments import Impairments, TimeTag, Timing, UniformPhase, independent_streams
+from apertura.simulate.hidden import independent_streams
+from apertura.simulate.impairments import Impairments, TimeTag, Timing, UniformPhase
 from apertura.simulate.plan import Flight, Node, Simulation, grid_around
 from apertura.simulate.radar import Waveform, newman_codes, qpsk_codes
 from apertura.simulate.recording import Geometry

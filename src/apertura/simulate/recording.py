@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.simulate.impairments import Adc, Hidden, Impairments
+from apertura.simulate.hidden import Hidden
+from apertura.simulate.impairments import Adc, Impairments
 from apertura.simulate.radar import Floats, Paths, Waveform, direct_path, echo_paths
 from apertura.simulate.scene import Scatterers
 from apertura.simulate.synthesis import Channel, Complex, path_spectrum

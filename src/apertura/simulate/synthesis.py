@@ -89,7 +89,7 @@ def transfer_functions(
     transfer = path_spectrum(waveform, early, paths.amplitude) * channel.response
     transfer *= np.exp(1j * channel.phase_rad[pulses, None])
     if generator is not None and channel.noise_variance:
-        transfer += _noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
+        transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
     return np.asarray(transfer)
 
 
@@ -128,16 +128,16 @@ def samples(
     numbers = np.arange(len(channel.phase_rad))[pulses]
     clean = np.stack([_capture(channel, pulse, count) for pulse in numbers])
     if channel.cfo_hz:
-        clean *= np.exp(-2j * np.pi * channel.cfo_hz / _rate(channel) * np.arange(count))
+        clean *= np.exp(-2j * np.pi * channel.cfo_hz / sampling_rate(channel) * np.arange(count))
     clean *= np.exp(1j * channel.phase_rad[pulses, None])
     if generator is not None and channel.noise_variance:
-        clean += _noise(generator, clean.shape, channel.noise_variance)
+        clean += noise(generator, clean.shape, channel.noise_variance)
     return np.asarray(clean)
 
 
 def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     """One capture without noise: stretches of constant set of paths, each from its own spectrum."""
-    waveform, rate = channel.waveform, _rate(channel)
+    waveform, rate = channel.waveform, sampling_rate(channel)
     order = np.argsort(channel.paths.delay_s[pulse])
     arrival = (channel.paths.delay_s[pulse, order] - channel.start_s[pulse]) * rate
     # a path is present from its first sample up to, not including, its end; a millionth of a sample is rounding
@@ -178,9 +178,9 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
 def _stretch(channel: Channel, pulse: int, spectra: Complex, start: int, stop: int, count: int) -> Complex:
     """Σ_q t^q Σ_n S_qn exp(j2πnΔf·m/f_s') for start ≤ m < stop, t counted from the middle of the pulse."""
     waveform = channel.waveform
-    turns = waveform.subcarrier_spacing_hz / _rate(channel)
+    turns = waveform.subcarrier_spacing_hz / sampling_rate(channel)
     index = np.arange(start, stop)
-    time_s = index / _rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
+    time_s = index / sampling_rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
     numbers = waveform.first_subcarrier + np.arange(spectra.shape[1])
     total = np.zeros(stop - start, np.complex128)
     for term, spectrum in enumerate(spectra):
@@ -208,10 +208,12 @@ def _zoom(size: int, count: int, turns: float) -> CZT:
     return CZT(size, count, w=np.exp(2j * np.pi * turns))
 
 
-def _rate(channel: Channel) -> float:
+def sampling_rate(channel: Channel) -> float:
+    """Return the rate at which the receiver truly samples, Hz."""
     return channel.waveform.sample_rate_hz + channel.sfo_hz
 
 
-def _noise(generator: Generator, shape: tuple[int, ...], variance: float) -> Complex:
+def noise(generator: Generator, shape: tuple[int, ...], variance: float) -> Complex:
+    """Return circular Gaussian samples of E|n|² = variance, complex128."""
     parts = generator.standard_normal((*shape, 2)) * np.sqrt(variance / 2)
     return np.asarray(parts.view(np.complex128)[..., 0])

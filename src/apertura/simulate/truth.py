@@ -8,7 +8,8 @@ import numpy as np
 from numpy.random import default_rng
 
 from apertura.geodesy import projected_from_ecef
-from apertura.simulate.plan import Flight, Grid, Recorded, Simulation
+from apertura.simulate.continuous import pulse_samples
+from apertura.simulate.plan import Flight, Grid, Recorded, Simulation, pulse_times
 from apertura.simulate.recording import full_scale
 from apertura.simulate.scene import PointTarget, Scene
 
@@ -59,6 +60,9 @@ def flight_truth(simulation: Simulation, flight: Flight, recorded: dict[str, Rec
             },
             "impairments": repr(node.impairments),
         }
+        if flight.continuous:
+            place = pulse_samples(radar, pulse_times(simulation, flight))
+            truth["nodes"][name]["pulse_start_sample"] = place.tolist()
     return truth
 
 
