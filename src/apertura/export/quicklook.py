@@ -1,0 +1,161 @@
+"""One picture of an image for people: power in dB on metric axes, north up, its origin in the footer."""
+
+from collections.abc import Iterable, Mapping
+from math import ceil
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+from rasterio import Affine
+from rasterio.transform import array_bounds
+
+from apertura.export.cog import READ, Raster, placed, power
+from apertura.export.db import decibels
+from apertura.export.draft import whole
+from apertura.export.sheet import DPI, PICTURE_DOTS, Marker, Sheet
+
+
+def write_quicklook(
+    path: Path,
+    image: Raster,
+    *,
+    transform: Affine,
+    crs: str,
+    tags: Mapping[str, str],
+    title: str = "",
+    subtitle: str = "",
+    markers: Iterable[Marker] = (),
+    dynamic_range_db: float = 40.0,
+) -> None:
+    """Draw power in dB relative to the peak as a PNG that a person can read without a GIS.
+
+    An image of more pixels than the paper has dots is shrunk by averaging power, so that no target
+    falls between the samples. The colours span `dynamic_range_db` downwards from the peak, or, where
+    no more than three dots lie within 20 dB of the peak, from the fourth rounded up to 5 dB, so that
+    a glitch does not blacken the scene.
+
+    Parameters
+    ----------
+    path
+        ``….png``; whole or absent.
+    image
+        (y, x) complex64, north-up, NaN (left white) where nothing was formed; read block by block.
+    transform, crs
+        As `apertura.export.cog.write_slc`.
+    tags
+        Provenance: version, numerical error and code hash are drawn, all of them lie in the file.
+    title, subtitle
+        Flight and pair; whatever else a reader should know at a glance.
+    markers
+        (x, y, label) in metres of `crs`, drawn as rings.
+    dynamic_range_db
+        dB between the ends of the colour bar.
+
+    Raises
+    ------
+    ContractError, CampaignError
+        As `apertura.export.cog.write_slc`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "quicklook.png"
+    ...     write_quicklook(path, np.eye(9, dtype="c8"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
+    ...     path.read_bytes()[1:4]
+    b'PNG'
+    """
+    placed(image, transform, crs)
+    mean, factor = shrink(image, PICTURE_DOTS)
+    decibel, top_db = _below_peak(mean)
+    rows, columns = (factor * size for size in mean.shape)  # the last groups may reach beyond the image
+    north, west = transform.f, transform.c
+    with matplotlib.style.context("default"):
+        sheet = Sheet.for_bounds(array_bounds(*image.shape, transform))
+        picture = sheet.axes.imshow(
+            np.ma.masked_invalid(decibel),
+            extent=(west, west + columns * transform.a, north + rows * transform.e, north),
+            cmap="inferno",
+            vmin=top_db - dynamic_range_db,
+            vmax=top_db,
+            interpolation="nearest",
+        )
+        sheet.draw_frame(_crs_name(crs))
+        averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
+        sheet.draw_colour_bar(picture, f"power re peak, dB{averaged}")
+        sheet.draw_scale_and_north()
+        sheet.draw_markers(markers)
+        if not np.isfinite(decibel).any():
+            sheet.axes.text(0.5, 0.5, "no power in any pixel", transform=sheet.axes.transAxes, ha="center", va="center")
+        sheet.write_words(title, subtitle, _footer(tags))
+        with whole(path) as draft:
+            sheet.figure.savefig(draft, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+
+
+def _crs_name(crs: str) -> str:
+    known = CRS.from_user_input(crs)
+    return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")
+
+
+def _footer(tags: Mapping[str, str]) -> str:
+    known = (
+        ("APERTURA_VERSION", "apertura {}"),
+        ("APERTURA_ERROR_DB", "numerical error {} dB"),
+        ("APERTURA_CODE_SHA256", "code {:.12}"),
+    )
+    return " · ".join(words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags)
+
+
+def shrink(image: Raster, most: int) -> tuple[NDArray[np.float64], int]:
+    """Return the mean power of square groups of pixels, so few that neither side exceeds `most`.
+
+    Parameters
+    ----------
+    image
+        (y, x) complex64; NaN pixels do not count.
+    most
+        Groups along the longer side.
+
+    Returns
+    -------
+    mean
+        (rows, columns) float64 power, NaN where a group holds no valid pixel.
+    factor
+        Pixels along a side of a group.
+
+    Examples
+    --------
+    >>> shrink(np.array([[2, 0, 1], [0, 0, np.nan]], "c8"), 2)
+    (array([[1., 1.]]), 2)
+    """
+    height, width = image.shape
+    factor = ceil(max(height, width) / most)
+    mean = np.full((ceil(height / factor), ceil(width / factor)), np.nan)
+    step = max(1, READ // factor)  # groups along a side of what is held in memory
+    for row in range(0, mean.shape[0], step):
+        for column in range(0, mean.shape[1], step):
+            groups = slice(row, row + step), slice(column, column + step)
+            rows, columns = (slice(part.start * factor, part.stop * factor) for part in groups)
+            mean[groups] = _mean_of_groups(power(np.asarray(image[rows, columns])), factor)
+    return mean, factor
+
+
+def _mean_of_groups(linear: NDArray[np.float32], factor: int) -> NDArray[np.float64]:
+    missing = [(0, -size % factor) for size in linear.shape]
+    padded = np.pad(linear.astype(np.float64), missing, constant_values=np.nan)
+    groups = padded.reshape(padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
+    valid = np.isfinite(groups).sum(axis=(1, 3))
+    return np.where(valid, np.nansum(groups, axis=(1, 3)) / np.maximum(valid, 1), np.nan)
+
+
+def _below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return dB relative to the peak, and the level at which the colours end."""
+    decibel = decibels(mean)
+    brightest = np.sort(decibel[np.isfinite(decibel)])[-4:]
+    if not brightest.size:
+        return decibel, 0.0
+    decibel -= brightest[-1]
+    fourth = float(brightest[0] - brightest[-1])  # a target is no single dot; a glitch may be
+    return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

@@ -1,0 +1,158 @@
+"""The paper a quicklook is drawn on: metric axes, scale bar, north arrow, colour bar and words around a picture."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from math import ceil, floor, log10
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+DPI = 150
+LONGER_SIDE = 6.4  # of the picture on paper, inch
+PICTURE_DOTS = floor(LONGER_SIDE * DPI)
+LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the picture, inch
+LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # room kept for words and colour bar beside a narrow or flat picture, inch
+
+Marker = tuple[float, float, str]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A figure with a picture in true proportions; lengths on paper in inches from the lower left corner.
+
+    Attributes
+    ----------
+    figure, axes
+        Of matplotlib; `axes` are in metres of the scene.
+    bounds
+        West, south, east, north of the scene, metres.
+    inch_per_m
+        Scale of the picture.
+    """
+
+    figure: Figure
+    axes: Axes
+    bounds: tuple[float, float, float, float]
+    inch_per_m: float
+
+    @classmethod
+    def for_bounds(cls, bounds: tuple[float, float, float, float]) -> "Sheet":
+        """Return an empty sheet on which the longer side of `bounds` is `LONGER_SIDE`."""
+        west, south, east, north = bounds
+        scale = LONGER_SIDE / max(east - west, north - south)
+        wide, high = (east - west) * scale, (north - south) * scale
+        width = LEFT + max(wide, LEAST_WIDTH) + RIGHT
+        height = BOTTOM + max(high, LEAST_HEIGHT) + TOP
+        figure = Figure(figsize=(width, height))
+        FigureCanvasAgg(figure)
+        bottom = height - TOP - high
+        axes = figure.add_axes((LEFT / width, bottom / height, wide / width, high / height))
+        return cls(figure, axes, bounds, scale)
+
+    def draw_frame(self, crs_name: str) -> None:
+        """Label the axes in metres from a round number, so that UTM coordinates stay readable."""
+        west, south, east, north = self.bounds
+        self.axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
+        for name, axis, low, high in (
+            ("Easting", self.axes.xaxis, west, east),
+            ("Northing", self.axes.yaxis, south, north),
+        ):
+            origin = round_origin(low, high)
+            length = (high - low) * self.inch_per_m
+            axis.set_major_locator(MaxNLocator(max(1, floor(1.2 * length)), steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(FuncFormatter(partial(_from_origin, origin)))
+            separator = " " if length > 2.2 else "\n"
+            axis.set_label_text(f"{name}{separator}− {_number(origin)}, m" if origin else f"{name}, m")
+        self._write(LEFT, 0.58, crs_name, size=8)
+
+    def draw_colour_bar(self, picture: AxesImage, label: str) -> None:
+        """Draw the colour bar at the right of the picture."""
+        width, height = self.figure.get_size_inches()
+        wide, high = ((self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1))
+        high = max(high, LEAST_HEIGHT)
+        place = ((LEFT + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
+        beyond = "both" if picture.norm.vmax else "min"  # 0 dB is the peak: nothing lies above it
+        bar = self.figure.colorbar(picture, cax=self.figure.add_axes(place), extend=beyond)
+        bar.set_label(label)
+
+    def draw_scale_and_north(self) -> None:
+        """Draw a bar of a round length and an arrow to grid north below the picture, where they hide nothing."""
+        metres = round_length(2.0 / self.inch_per_m)
+        length = metres * self.inch_per_m
+        for part, colour in enumerate(("black", "white")):
+            corner = LEFT + part * length / 2, 0.86
+            bar = Rectangle(corner, length / 2, 0.06, facecolor=colour, edgecolor="black", linewidth=0.8)
+            bar.set_transform(self.figure.dpi_scale_trans)
+            self.figure.add_artist(bar)
+        self._write(LEFT + length + 0.1, 0.85, f"{_number(metres)} m", size=9)
+        x = self.figure.get_size_inches()[0] - 0.4
+        arrow = Polygon(
+            [(x, 0.98), (x - 0.09, 0.62), (x, 0.7), (x + 0.09, 0.62)],
+            facecolor="black",
+            transform=self.figure.dpi_scale_trans,
+        )
+        self.figure.add_artist(arrow)
+        self._write(x, 1.02, "N", size=10, weight="bold", ha="center")
+
+    def draw_markers(self, markers: Iterable[Marker]) -> None:
+        """Ring and label places of the scene."""
+        outline = [withStroke(linewidth=2.5, foreground="black")]
+        for x, y, label in markers:
+            self.axes.plot(
+                x, y, "o", markersize=13, markerfacecolor="none", markeredgecolor="white", path_effects=outline
+            )
+            self.axes.annotate(
+                label, (x, y), (9, 5), textcoords="offset points", color="white", size=8, path_effects=outline
+            )
+
+    def write_words(self, title: str, subtitle: str, footer: str) -> None:
+        """Write what the picture shows above it, and where it comes from below."""
+        height = self.figure.get_size_inches()[1]
+        self._write(LEFT, height - 0.4, title, size=13, weight="bold")
+        self._write(LEFT, height - 0.65, subtitle, size=9)
+        self._write(LEFT, 0.2, footer, size=7, color="0.3")
+
+    def _write(self, x: float, y: float, words: str, **style: Any) -> None:
+        self.figure.text(x, y, words, transform=self.figure.dpi_scale_trans, parse_math=False, **style)
+
+
+def round_origin(low_m: float, high_m: float) -> float:
+    """Return a round number at or below `low_m` to count coordinates from; 0 where they are short as they are.
+
+    Examples
+    --------
+    >>> round_origin(691523.4, 691583.4), round_origin(5333040.1, 5333100.1), round_origin(-60.0, 60.0)
+    (691500.0, 5333000.0, 0.0)
+    """
+    if max(abs(low_m), abs(high_m)) < 10_000:
+        return 0.0
+    step = 10.0 ** ceil(log10(high_m - low_m))
+    return floor(low_m / step) * step
+
+
+def round_length(most_m: float) -> float:
+    """Return the longest of 1, 2, 5 × a power of ten that is no longer than `most_m`.
+
+    Examples
+    --------
+    >>> round_length(7.3), round_length(0.21), round_length(1.0)
+    (5.0, 0.2, 1.0)
+    """
+    decade = 10.0 ** floor(log10(most_m))
+    return float(max(digit * decade for digit in (1, 2, 5) if digit * decade <= most_m))
+
+
+def _from_origin(origin: float, value: float, _position: int | None) -> str:
+    return _number(value - origin)
+
+
+def _number(value: float) -> str:
+    """Return a number with thin spaces between thousands and a true minus."""
+    return f"{round(value, 6) + 0.0:,.10g}".replace(",", "\u2009").replace("-", "−")

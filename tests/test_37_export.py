@@ -1,0 +1,344 @@
+"""Rasters and quicklooks: exact places, whole files, and overviews that tell the truth."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import zarr
+from rasterio import Affine
+
+from apertura.errors import CampaignError, ContractError
+from apertura.export import EXPORTS, LAYERS
+from apertura.export.cog import READ, write_power, write_slc
+from apertura.export.db import write_db
+from apertura.export.draft import whole
+from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
+from apertura.export.quicklook import _below_peak, shrink, write_quicklook
+from apertura.export.sheet import DPI, LEFT, TOP
+from apertura.geodesy import local_crs
+
+UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
+TAGS = {
+    "APERTURA_RUNSPEC": '{"processing":{"window":"hann"}}',
+    "APERTURA_INPUTS": '{"raw":"' + 64 * "0" + '"}',
+    "APERTURA_CODE_SHA256": 64 * "a",
+    "APERTURA_VERSION": "0.1.0",
+    "APERTURA_ERROR_DB": "-61.2",
+}
+RASTERS = {name: write for name, write in EXPORTS.items() if name.endswith(".tif")}
+
+
+def speckle(*shape: int) -> np.ndarray:
+    rng = np.random.default_rng(37)
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
+
+
+def overviews(path: Path) -> list[np.ndarray]:
+    with rasterio.open(path) as raster:
+        count = len(raster.overviews(1))
+    levels = []
+    for level in range(count):
+        with rasterio.open(path, OVERVIEW_LEVEL=level) as raster:
+            levels.append(raster.read(1))
+    return levels
+
+
+@pytest.mark.parametrize("name", RASTERS)
+def test_a_raster_lies_where_the_grid_says_and_carries_its_origin(tmp_path, name):
+    RASTERS[name](tmp_path / name, speckle(30, 50), **UTM, tags=TAGS, title="f01 · uav1–uav2")
+    with rasterio.open(tmp_path / name) as raster:
+        assert np.allclose(raster.bounds, (691523.4, 5332997.1, 691528.4, 5333000.1), rtol=0, atol=1e-6)
+        assert raster.transform == UTM["transform"]
+        assert raster.crs.to_epsg() == 32632
+        assert np.isnan(raster.nodata)
+        tags = raster.tags()
+    assert {tag: tags[tag] for tag in TAGS} == TAGS
+    assert tags["TIFFTAG_IMAGEDESCRIPTION"] == "f01 · uav1–uav2"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_pixels_are_the_image_its_power_and_its_decibels(tmp_path):
+    image = speckle(600, 40)
+    found = {}
+    for name, write in RASTERS.items():
+        write(tmp_path / name, image, **UTM, tags={})
+        with rasterio.open(tmp_path / name) as raster:
+            found[name] = raster.read(1)
+    assert found["slc.tif"].dtype == np.complex64
+    assert np.array_equal(found["slc.tif"], image)
+    assert np.allclose(found["power.tif"], np.abs(image.astype(complex)) ** 2, rtol=1e-6)
+    assert np.allclose(found["db.tif"], 20 * np.log10(np.abs(image.astype(complex))), rtol=0, atol=1e-5)
+
+
+def test_local_axes_survive_the_file(tmp_path):
+    crs = local_crs("gotcha pass 1")
+    write_slc(tmp_path / "slc.tif", speckle(5, 5), crs=crs, transform=Affine(0.2, 0, -50, 0, -0.2, 50), tags={})
+    with rasterio.open(tmp_path / "slc.tif") as raster:
+        assert raster.crs == rasterio.crs.CRS.from_wkt(crs)
+        written = raster.crs.to_wkt()
+    assert written.startswith('LOCAL_CS["gotcha pass 1",UNIT["metre",1')
+    assert written.endswith('AXIS["Easting",EAST],AXIS["Northing",NORTH]]')
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (512, 512), (513, 40), (700, 1300)])
+@pytest.mark.parametrize("name", RASTERS)
+def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
+    cogeo = pytest.importorskip("rio_cogeo.cogeo", reason="rio-cogeo is a tool of the developers")
+    RASTERS[name](tmp_path / name, speckle(*shape), **UTM, tags=TAGS)
+    valid, errors, warnings = cogeo.cog_validate(tmp_path / name, strict=True)
+    assert (valid, errors, warnings) == (True, [], [])
+    with rasterio.open(tmp_path / name) as raster:
+        assert raster.block_shapes == [(512, 512)]
+        assert raster.overviews(1) == [factor for factor in (2, 4) if max(shape) > 256 * factor]
+
+
+def test_slc_overviews_keep_a_target_that_a_plain_average_loses(tmp_path):
+    y, x = np.mgrid[:700, :1300]
+    magnitude = np.exp(-((x - 640.5) ** 2 + (y - 300.5) ** 2) / (2 * 3.0**2))
+    image = (magnitude * np.exp(1j * np.radians(141) * x)).astype(np.complex64)
+    write_slc(tmp_path / "slc.tif", image, **UTM, tags={})
+    half = overviews(tmp_path / "slc.tif")[0]
+    plain = np.abs(image.reshape(350, 2, 650, 2).mean(axis=(1, 3))).max()
+    assert plain < 0.35 * magnitude.max()
+    assert np.abs(half).max() > 0.95 * magnitude.max()
+    assert np.unravel_index(np.argmax(np.abs(half)), half.shape) == (150, 320)
+
+
+def test_db_overviews_hold_the_mean_power_of_speckle(tmp_path):
+    image = speckle(700, 1300)
+    write_db(tmp_path / "db.tif", image, **UTM, tags={})
+    coarsest = overviews(tmp_path / "db.tif")[-1]
+    power = np.abs(image[:, :1300].astype(complex)) ** 2
+    exact = 10 * np.log10(power.reshape(175, 4, 325, 4).mean(axis=(1, 3)))
+    assert coarsest.shape == exact.shape
+    assert np.allclose(coarsest, exact, rtol=0, atol=1e-4)
+    bias = np.mean(10 * np.log10(power)) - 10 * np.log10(power.mean())
+    assert bias == pytest.approx(-10 * np.euler_gamma / np.log(10), abs=0.05)
+
+
+def test_a_pixel_without_power_is_nodata_in_db_but_counts_in_the_mean(tmp_path):
+    image = np.zeros((600, 600), np.complex64)
+    image[::2, ::2] = 2
+    image[:100] = np.nan
+    write_db(tmp_path / "db.tif", image, **UTM, tags={})
+    with rasterio.open(tmp_path / "db.tif") as raster:
+        full = raster.read(1)
+    assert np.array_equal(np.isnan(full), ~(np.abs(image) > 0))
+    half = overviews(tmp_path / "db.tif")[0]
+    assert np.isnan(half[:50]).all()
+    assert np.allclose(half[50:], 0.0, atol=1e-6)
+
+
+BY_ANOTHER_PROCESS = """
+import sys
+from pathlib import Path
+import numpy as np
+from rasterio import Affine
+from apertura.export import EXPORTS
+folder, image = Path(sys.argv[1]), np.load(sys.argv[2])
+for name, write in EXPORTS.items():
+    tags = {"B": "2", "A": "1"}
+    write(folder / name, image, transform=Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1), crs="EPSG:32632", tags=tags)
+"""
+
+
+def test_the_same_image_gives_the_same_bytes_in_any_process_and_from_any_store(tmp_path):
+    image = speckle(600, 520)
+    np.save(tmp_path / "image.npy", image)
+    tiled = zarr.create_array(tmp_path / "image.zarr", shape=image.shape, chunks=(128, 200), dtype=image.dtype)
+    tiled[:] = image
+    (tmp_path / "there").mkdir()
+    subprocess.run(
+        [sys.executable, "-c", BY_ANOTHER_PROCESS, tmp_path / "there", tmp_path / "image.npy"],
+        check=True,
+        env=os.environ | {"TZ": "Asia/Tokyo", "GDAL_NUM_THREADS": "2"},
+    )
+    for name, write in EXPORTS.items():
+        write(tmp_path / name, tiled, **UTM, tags={"A": "1", "B": "2"})
+        here, there = (hashlib.sha256((folder / name).read_bytes()) for folder in (tmp_path, tmp_path / "there"))
+        assert here.hexdigest() == there.hexdigest(), name
+
+
+class Blocks:
+    """An image that exists only block by block."""
+
+    dtype = np.dtype(np.complex64)
+
+    def __init__(self, *shape):
+        self.shape = shape
+        self.largest = 0
+
+    def __getitem__(self, key):
+        rows, columns = (range(*part.indices(size)) for part, size in zip(key, self.shape, strict=True))
+        self.largest = max(self.largest, len(rows) * len(columns))
+        return np.ones((len(rows), len(columns)), np.complex64)
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_image_is_never_held_whole(tmp_path, name):
+    image = Blocks(READ + 300, READ + 500)
+    EXPORTS[name](tmp_path / name, image, **UTM, tags={})
+    assert 0 < image.largest <= READ**2
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import numpy as np
+from rasterio import Affine
+from apertura.export import EXPORTS
+class Deadly:
+    shape, reads = (2100, 2100), 0
+    def __getitem__(self, key):
+        self.reads += 1
+        if self.reads > 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.ones((2100, 2100), np.complex64)[key]
+path = Path(sys.argv[1])
+EXPORTS[path.name](path, Deadly(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:32632", tags={})
+"""
+
+
+@pytest.mark.parametrize("name", ["slc.tif", "db.tif"])
+def test_a_killed_writer_leaves_no_half_file_and_the_next_one_clears_its_work(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"of the last run")
+    killed = subprocess.run([sys.executable, "-c", KILLED, path], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert path.read_bytes() == b"of the last run"
+    assert (tmp_path / f".{name}.wip").is_dir()
+    EXPORTS[name](path, speckle(8, 8), **UTM, tags={})
+    assert [left.name for left in tmp_path.iterdir()] == [name]
+
+
+def test_a_full_disk_ends_in_an_error_and_leaves_nothing(tmp_path):
+    limited = """
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20))
+"""
+    np.save(tmp_path / "image.npy", speckle(600, 600))
+    arguments = [sys.executable, "-c", limited + BY_ANOTHER_PROCESS, tmp_path, tmp_path / "image.npy"]
+    assert subprocess.run(arguments, check=False, capture_output=True).returncode != 0
+    assert [left.name for left in tmp_path.iterdir()] == ["image.npy"]
+
+
+def test_a_second_writer_of_the_same_file_waits(tmp_path):
+    path = tmp_path / "note.txt"
+
+    def write_second():
+        with whole(path) as draft:
+            draft.write_text("second")
+
+    second = threading.Thread(target=write_second)
+    with whole(path) as draft:
+        second.start()
+        draft.write_text("first")
+        second.join(timeout=0.2)
+        assert second.is_alive()
+        assert draft.read_text() == "first"
+    second.join()
+    assert path.read_text() == "second"
+    assert [left.name for left in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_what_is_no_image_on_a_north_up_grid_is_refused_before_anything_is_written(tmp_path):
+    path = tmp_path / "slc.tif"
+    image, south_up = speckle(4, 4), Affine(1, 0, 0, 0, 1, 0)
+    with pytest.raises(ContractError, match="not complex64"):
+        write_power(path, image.real, **UTM, tags={})
+    with pytest.raises(ContractError, match=r"not \(y, x\)"):
+        write_slc(path, image[0], **UTM, tags={})
+    with pytest.raises(ContractError, match="north-up"):
+        write_slc(path, image, crs="EPSG:32632", transform=south_up, tags={})
+    with pytest.raises(CampaignError, match=r"crs 'EPSG:99999'.*scene\.crs"):
+        write_slc(path, image, crs="EPSG:99999", transform=UTM["transform"], tags={})
+    assert not any(tmp_path.iterdir())
+
+
+def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
+    angle = np.full((600, 600), 30, np.float32)
+    angle[:10] = np.nan
+    bits = np.full((600, 600), SHADOW, np.uint8)
+    bits[300:, :300], bits[300:, 300:], bits[:10] = LAYOVER, SHADOW | LAYOVER, UNKNOWN
+    for name, write in LAYERS.items():
+        layer = bits if name == "mask.tif" else angle
+        write(tmp_path / name, layer, **UTM, tags=TAGS)
+        with rasterio.open(tmp_path / name) as raster:
+            assert np.array_equal(raster.read(1), layer, equal_nan=name != "mask.tif")
+            assert np.array_equal(raster.dataset_mask() == 0, np.arange(600)[:, None] + np.zeros(600) < 10)
+            assert raster.units == (("bits",) if name == "mask.tif" else ("deg",))
+        assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
+    with pytest.raises(ContractError, match="float64, not uint8"):
+        write_mask(tmp_path / "mask.tif", bits.astype(float), **UTM, tags={})
+
+
+@pytest.mark.parametrize("at", [(0, 0), (1, 2), (1999, 1499), (1024, 700)])
+def test_shrinking_loses_no_pixel(at):
+    image = np.zeros((2000, 1500), np.complex64)
+    image[at] = 3j
+    mean, factor = shrink(image, 960)
+    assert factor == 3
+    assert np.count_nonzero(mean) == 1
+    pixels_in_group = (2 if at[0] >= 1998 else 3) * 3
+    assert mean[at[0] // 3, at[1] // 3] == pytest.approx(9 / pixels_in_group)
+
+
+def test_a_glitch_does_not_blacken_the_quicklook():
+    y, x = np.mgrid[:100, :100]
+    target = np.sinc((x - 30) / 2.0) ** 2 * np.sinc((y - 40) / 2.0) ** 2
+    assert _below_peak(target)[1] == 0
+    target[80, 80] = 1e5
+    decibel, top = _below_peak(target)
+    assert top == -50
+    assert decibel.max() == 0
+
+
+def picture_of(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Return brightness of the dots inside the frame, which is `LEFT` and `TOP` inches from the upper left."""
+    with rasterio.open(path) as png:
+        dots = png.read([1, 2, 3]).sum(axis=0)
+    scale = 6.4 * DPI / max(shape)
+    left, top = round(LEFT * DPI), round(TOP * DPI)
+    return dots[top : top + round(shape[0] * scale), left : left + round(shape[1] * scale)]
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_the_quicklook_has_north_up_and_east_right_and_leaves_the_unknown_white(tmp_path):
+    image = np.full((120, 160), 1e-4, np.complex64)
+    image[20:24, 120:124] = 1
+    image[80:, :40] = np.nan
+    write_quicklook(tmp_path / "q.png", image, **UTM, tags=TAGS, title="f01", subtitle="uav1–uav2")
+    dots = picture_of(tmp_path / "q.png", image.shape)
+    rows, columns = (np.add(np.indices(dots.shape), 0.5) * 160 / dots.shape[1]).astype(int)
+    inside = (rows > 0) & (rows < 119) & (columns > 0) & (columns < 159)
+    bright = (rows >= 21) & (rows < 23) & (columns >= 121) & (columns < 123)
+    white = (rows > 81) & (columns < 38)
+    dark = ((rows < 78) | (columns > 42)) & ~((rows >= 18) & (rows < 26) & (columns >= 118) & (columns < 126))
+    assert dots[bright].min() > 550
+    assert (dots[white & inside] == 765).all()
+    assert dots[dark & inside].max() < 100
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_an_image_without_power_still_gets_a_picture_that_says_so(tmp_path):
+    for image in (np.zeros((30, 40), np.complex64), np.full((30, 40), np.nan, np.complex64)):
+        write_quicklook(tmp_path / "q.png", image, **UTM, tags={})
+        words = picture_of(tmp_path / "q.png", image.shape)[5:-5, 5:-5]
+        assert 0 < np.count_nonzero(words < 300) < 0.02 * words.size
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_the_quicklook_carries_its_origin_in_the_file(tmp_path):
+    write_quicklook(
+        tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS, title="f01", markers=[(691525, 5332999, "T")]
+    )
+    with rasterio.open(tmp_path / "q.png") as png:
+        assert TAGS.items() <= png.tags().items()
