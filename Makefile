@@ -19,7 +19,10 @@ $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMa
 	touch $@
 
 demo: $(SETUP)
-	$(BIN)/apertura demo demo
+	rm -rf demo
+	$(BIN)/apertura simulate demo
+	$(BIN)/apertura run demo
+	$(BIN)/apertura verify demo
 
 run: $(SETUP)
 	$(BIN)/apertura run $(CAMPAIGN)

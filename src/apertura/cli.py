@@ -66,6 +66,33 @@ def verify(
     print_findings(Campaign.load(campaign), paths=paths)
 
 
+@app.command()
+def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> None:
+    """Write the commented config of a new campaign folder."""
+    from apertura.template import config_template, flights_template
+
+    folder = directory / "config"
+    for path, text in ((folder / "config.yaml", config_template()), (folder / "flights.tsv", flights_template())):
+        if path.exists():
+            raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        print(path)
+
+
+@app.command()
+def simulate(
+    directory: Annotated[Path, typer.Argument(help="campaign folder to make")],
+    seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
+) -> None:
+    """Write a small tandem flight as a campaign folder of raw IQ, with truth.json."""
+    import numpy as np
+
+    from apertura.simulate.presets import tandem_demo
+
+    print(tandem_demo(directory, np.random.default_rng(seed)))
+
+
 @step.command()
 def raw(flight: str, node: str, campaign: Directory = HERE) -> None:
     """Read a node's recording into raw.zarr."""

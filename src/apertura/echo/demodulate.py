@@ -55,7 +55,7 @@ def demodulate(
     Examples
     --------
     >>> phase = 2 * np.pi * 3 * np.arange(16) / 16
-    >>> tone = np.stack([1000 * np.cos(phase), 1000 * np.sin(phase)], -1).astype(np.int16)
+    >>> tone = np.stack([1000 * np.cos(phase), 1000 * np.sin(phase)], -1).round().astype(np.int16)
     >>> symbols = demodulate(tone[None], numbers=np.arange(8), prefix_samples=0, dft_samples=16)
     >>> abs(symbols[0]).round().astype(int).tolist()
     [0, 0, 0, 1000, 0, 0, 0, 0]

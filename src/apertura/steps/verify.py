@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
 from apertura.campaign import Campaign, Flight
 from apertura.errors import CampaignError
@@ -95,3 +97,43 @@ def _along_track(campaign: Campaign, flight: Flight) -> tuple[float, float]:
     crs = scene_grid(campaign).crs
     east, north, _ = np.diff(ends if crs == LOCAL else projected_from_ecef(crs, ends), axis=0)[0]
     return float(east), float(north)
+
+
+def print_findings(campaign: Campaign, *, paths: bool) -> None:
+    """Print a short table of what `verify` finds, and where the products lie."""
+    console = Console(width=120)
+    table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
+    for heading in ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range"):
+        table.add_column(heading, justify="right" if heading not in {"flight", "image"} else "left")
+    for finding in verify(campaign):
+        numbers = (finding.error_east_m, finding.error_north_m, finding.error_m)
+        widths = (finding.cross_range_m, finding.ground_range_m)
+        row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]
+        table.add_row(
+            finding.flight, finding.image, str(finding.target), *row, *(f"{100 * width:.1f} cm" for width in widths)
+        )
+    console.print(table)
+    console.print(_quality(campaign))
+    if paths:
+        for path in sorted(campaign.results.rglob("*.tif")) + sorted(campaign.results.rglob("quicklook.png")):
+            print(path)
+
+
+def _quality(campaign: Campaign) -> Table:
+    table = Table(title="coherence at the brightest target, numerical error against the reference", title_justify="left")
+    for heading in ("flight", "image", "coherence factor", "numerical error", "pulses used", "dropped", "flags"):
+        table.add_column(heading)
+    for flight in campaign.image_flights:
+        for name in (*flight.pairs, "fused"):
+            report = json.loads((campaign.results / flight.name / name / "image.json").read_text(encoding="utf-8"))
+            coherence, pulses = report["brightest"].get("coherence_factor"), report.get("pulses", {})
+            table.add_row(
+                flight.name,
+                name,
+                "" if coherence is None else f"{coherence:.4f}",
+                f"{report['numerical_error_db']:.1f} dB",
+                str(pulses.get("used", "")),
+                str(pulses.get("dropped", "")),
+                ", ".join(report["flags"]) or "none",
+            )
+    return table

@@ -1,0 +1,278 @@
+"""Each way a campaign folder can be wrong ends with one message: what, where, what was expected, what to do."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.steps import echo, ingest, profile, scene
+
+
+def edit_config(root, change):
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    change(document)
+    path.write_text(yaml.safe_dump(document))
+
+
+def edit_meta(root, node, change):
+    path = root / "raw" / "f01" / f"{node}.sigmf-meta"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def edit_data(root, node, change):
+    """Rewrite the samples and their hash: damage that only the content shows."""
+    path = root / "raw" / "f01" / f"{node}.sigmf-data"
+    samples = np.fromfile(path, "<i2")
+    change(samples)
+    samples.tofile(path)
+    digest = hashlib.sha512(path.read_bytes()).hexdigest()
+    edit_meta(root, node, lambda meta: meta["global"].__setitem__("core:sha512", digest))
+
+
+def edit_track(root, node, change):
+    path = next((root / "raw" / "f01").glob(f"{node}.track.*"))
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+
+def complaint(work):
+    with pytest.raises(CampaignError) as caught:
+        work()
+    return str(caught.value)
+
+
+def nothing_half_written(root):
+    """No stage but raw and track looks finished, and no product stands."""
+    results = root / "results"
+    manifests = {path.name for path in results.rglob("*.manifest.json")}
+    return manifests <= {"raw.manifest.json", "track.manifest.json"} and not list(results.rglob("*.tif"))
+
+
+def ingest_all(campaign):
+    for node in ("uav1", "uav2"):
+        ingest.raw(campaign, "f01", node)
+        ingest.track(campaign, "f01", node)
+
+
+def test_a_misspelt_key_is_named_with_the_nearest_valid_one(tiny):
+    edit_config(tiny, lambda document: document["scene"].update(spacing=0.1))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "config.yaml" in message
+    assert "scene.spacing: unknown key (did you mean 'spacing_m'?)" in message
+
+
+def test_a_value_of_the_wrong_kind_is_named(tiny):
+    edit_config(tiny, lambda document: document["waveform"].update(prf_hz="fast"))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "waveform.prf_hz" in message
+    assert "'fast'" in message
+
+
+def test_a_missing_node_file_is_named(tiny):
+    (tiny / "raw" / "f01" / "uav2.sigmf-data").unlink()
+    message = complaint(Campaign.load(tiny).check_files)
+    assert "raw/f01/uav2.sigmf-data" in message
+    assert "node uav2" in message
+
+
+def test_truncated_samples_are_found_by_their_captures(tiny):
+    path = tiny / "raw" / "f01" / "uav1.sigmf-data"
+    path.write_bytes(path.read_bytes()[:-4000])
+    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    assert "holds 3000 samples" in message
+    assert "expected 4000" in message
+    assert nothing_half_written(tiny)
+
+
+def test_a_file_cut_inside_a_sample_is_truncated(tiny):
+    path = tiny / "raw" / "f01" / "uav2.sigmf-data"
+    path.write_bytes(path.read_bytes()[:-3])
+    assert "truncated" in complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav2"))
+
+
+def test_a_wrong_hash_is_shown_beside_the_promised_one(tiny):
+    path = tiny / "raw" / "f01" / "uav1.sigmf-data"
+    samples = bytearray(path.read_bytes())
+    samples[1000] ^= 1
+    path.write_bytes(samples)
+    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    assert "uav1.sigmf-data" in message
+    assert hashlib.sha512(samples).hexdigest()[:12] in message
+
+
+def test_a_capture_past_the_end_is_named(tiny):
+    edit_meta(tiny, "uav1", lambda meta: meta["captures"][-1].update({"core:sample_start": 10**9}))
+    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    assert "starts at sample 1000000000" in message
+    assert "uav1.sigmf-meta" in message
+
+
+def test_a_track_that_ends_early_says_by_how_many_seconds(tiny):
+    edit_track(tiny, "uav1", lambda lines: lines[:25])
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+    last = np.datetime64(next((tiny / "raw/f01").glob("uav1.track.csv")).read_text().splitlines()[-1][:23])
+    meta = json.loads((tiny / "raw/f01/uav1.sigmf-meta").read_text())
+    missing = np.datetime64(meta["captures"][-1]["core:datetime"][:23]) - last
+    assert f"ends {missing / np.timedelta64(1, 's'):.3f} s before the last" in message
+    assert nothing_half_written(tiny)
+
+
+def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
+    edit_track(tiny, "uav2", lambda lines: [line.replace("GPST", "UTC ") for line in lines])
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
+    assert "begins 1" in message
+    assert "GPST is 18 s ahead" in message
+
+
+def test_a_doubled_epoch_is_named(tiny):
+    edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
+    message = complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+    assert "epoch 9" in message
+    assert "the same time" in message
+
+
+def test_an_unsorted_log_is_named(tiny):
+    edit_track(tiny, "uav1", lambda lines: [*lines[:10], *lines[12:14], *lines[10:12]])
+    assert "an earlier time" in complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+
+
+def test_a_lever_arm_without_attitude_is_refused(tiny):
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(attitude="none"))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "nodes.uav1" in message
+    assert "attitude is none" in message
+
+
+def test_a_lever_arm_with_a_log_that_holds_no_attitude_is_refused(tiny):
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(attitude="log"))
+    edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+    assert "no attitude" in message
+    assert "uav1.track" in message
+
+
+def test_bounds_outside_the_area_of_use_are_refused(tiny):
+    edit_config(tiny, lambda document: document["scene"].update(bounds_m=[5e6, 0.0, 5e6 + 6.0, 6.0]))
+    message = complaint(lambda: scene.scene(Campaign.load(tiny)))
+    assert "area of use of WGS 84 / UTM zone 32N" in message
+    assert "longitude" in message
+
+
+def test_bounds_that_are_no_multiple_of_the_spacing_propose_the_nearest(tiny):
+    edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570658.3, 5363704.2, 570664.34, 5363710.2]))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "[570658.3, 5363704.2, 570664.3, 5363710.2]" in message
+
+
+def test_a_silent_capture_is_named(tiny):
+    edit_data(tiny, "uav1", lambda samples: samples.reshape(-1, 8000)[5].fill(0))
+    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    assert "first capture 5" in message
+    assert "only zeros" in message
+
+
+def test_nan_in_phase_history_is_named(shared, tmp_path):
+    from scipy.io import loadmat, savemat
+
+    from apertura.ingest import PHASE_HISTORIES
+
+    source = loadmat(shared / "gotcha_afrl" / "data_3dsar_pass1_az001_HH.mat")
+    source["data"]["fp"][0, 0][3, 7] = np.nan
+    savemat(tmp_path / "a.mat", {"data": source["data"]})
+    message = complaint(lambda: PHASE_HISTORIES["afrl_mat"]([tmp_path / "a.mat"], pair="a-a"))
+    assert "fp is not a number at index [3, 7]" in message
+    assert "a.mat" in message
+
+
+def test_a_position_that_is_not_a_number_is_named(tiny):
+    edit_track(tiny, "uav1", lambda lines: [*lines[:6], lines[6].replace("48.4", "nan", 1), *lines[7:]])
+    message = complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+    assert "uav1.track.csv" in message
+
+
+def test_echoes_beyond_the_cyclic_prefix_are_refused_with_the_worst_pulse(tiny):
+    edit_config(tiny, lambda document: document["waveform"].update(cyclic_prefix_s=20 / 1.024e9))
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    echo.echo(campaign, "f01", "uav1-uav1")
+    scene.scene(campaign)
+    message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
+    assert "after the cyclic prefix, worst at pulse" in message
+    assert not (tiny / "results/f01/uav1-uav1/profile.manifest.json").exists()
+
+
+def test_path_offsets_alone_can_push_echoes_out_of_the_prefix(tiny):
+    edit_config(tiny, lambda document: document["nodes"]["uav1"]["path_offset_m"].update(radar=230.0))
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    echo.echo(campaign, "f01", "uav1-uav1")
+    scene.scene(campaign)
+    assert "cyclic prefix" in complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
+
+
+def test_codes_of_the_wrong_length_are_refused(tiny):
+    np.save(tiny / "raw" / "codes.npy", np.ones(1000, np.complex64))
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+    assert "raw/codes.npy" in message
+    assert "(1000,)" in message
+    assert "(1024,)" in message
+
+
+def test_nodes_that_never_recorded_together_are_refused(tiny):
+    def an_hour_later(meta):
+        for capture in meta["captures"]:
+            capture["core:datetime"] = capture["core:datetime"].replace("T09", "T10")
+
+    edit_meta(tiny, "uav2", an_hour_later)
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
+    assert "half a repetition interval" in message
+    assert "uav2" in message
+
+
+def test_a_secondary_without_its_sidelink_is_refused(tiny):
+    edit_meta(tiny, "uav2", lambda meta: meta["global"].update({"apertura:channels": ["radar", "spare"]}))
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
+    assert "a channel named 'sidelink'" in message
+
+
+def test_a_node_with_another_sample_rate_is_refused(tiny):
+    edit_config(tiny, lambda document: document["waveform"].update(sample_rate_hz=512e6))
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    assert "sample_rate_hz" in complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("f-1\timage\tuav1\tuav1", "only letters, digits"),
+        ("fused\timage\tuav1\tuav1", "taken by the results folder"),
+        ("f02\tphoto\tuav1\tuav1", "neither image nor calibration"),
+        ("f02\timage\tuav9\tuav1", "'uav9' is not in"),
+        ("f01\timage\tuav1\tuav1", "a second time"),
+    ],
+)
+def test_a_wrong_line_of_flights_is_named(tiny, line, expected):
+    path = tiny / "config" / "flights.tsv"
+    path.write_text(path.read_text().rstrip("\n") + "\n" + line + "\n")
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "flights.tsv: line 3" in message
+    assert expected in message

@@ -1,0 +1,172 @@
+"""The whole road in one process: real and independent recordings in, images that are where and what they should be."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+import xarray as xr
+from conftest import run_steps
+
+from apertura.campaign import Campaign
+from apertura.echo.compression import compress, range_step, window_weights
+from apertura.image.engines import ENGINES, reference
+from apertura.image.history import Profiles, Spectra
+from apertura.image.peaks import find_peak, ground_position
+from apertura.image.quality import numerical_error, random_pixels
+from apertura.steps import echo
+from apertura.steps.scene import scene_grid
+from apertura.steps.verify import verify
+from apertura.store import open_stage
+
+
+def findings(campaign, image):
+    return [finding for finding in verify(campaign) if finding.image == image]
+
+
+@pytest.mark.parametrize("image", ["uav1-uav1", "uav1-uav2", "fused"])
+def test_every_target_of_the_sample_is_found_within_3_cm(finished_sample, image):
+    found = findings(finished_sample, image)
+    assert len(found) == 4
+    assert max(finding.error_m for finding in found) < 0.03
+
+
+def test_coherent_fusion_is_narrower_than_either_pair(finished_sample):
+    widths = {
+        image: np.mean([finding.cross_range_m for finding in findings(finished_sample, image)])
+        for image in ("uav1-uav1", "uav1-uav2", "fused")
+    }
+    assert widths["uav1-uav1"] == pytest.approx(0.34, abs=0.02)
+    assert widths["uav1-uav2"] == pytest.approx(0.34, abs=0.02)
+    assert widths["fused"] == pytest.approx(0.22, abs=0.02)
+
+
+def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
+    """What lets the pairs add coherently; the sample's own model agrees within 0.06 rad."""
+    cube = open_stage(finished_sample.stage("cube"), "cube").image.values[0]
+    grid = scene_grid(finished_sample)
+    truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]
+    for target in truth:
+        row = (grid.north_m - target["y"]) / grid.spacing_m - 0.5
+        column = (target["x"] - grid.west_m) / grid.spacing_m - 0.5
+        mono, bistatic = (find_peak(image, round(row), round(column)).value for image in cube)
+        assert abs(np.angle(mono * np.conj(bistatic))) < 0.25
+
+
+def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, monkeypatch):
+    """Both phase histories scaled to equal RMS; the peak drops by at least 15 dB."""
+    pair = ("f01", "uav1-uav2")
+    grid = scene_grid(finished_sample)
+    with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
+    monkeypatch.setattr(echo, "correct", lambda radar, direct, **_: (radar, np.arange(len(radar)), {}))
+    monkeypatch.setattr(echo, "save_stage", lambda dataset, folder: uncorrected.append(dataset))
+    uncorrected: list[xr.Dataset] = []
+    echo.echo(finished_sample, *pair)
+    peaks = []
+    for dataset in (with_division, uncorrected[0]):
+        transfer = dataset.transfer.values / np.sqrt((np.abs(dataset.transfer.values) ** 2).mean())
+        places = dataset.tx_position.values, dataset.rx_position.values
+        frequency = dataset.frequency.values
+        start = np.linalg.norm(places[0] - grid.positions()[0, 0], axis=-1) * 2 - 40
+        profiles = Profiles(
+            compress(
+                transfer,
+                frequency,
+                weight=window_weights("hann", 1024),
+                reference_delay_s=np.zeros(len(transfer)),
+                start_m=start,
+                count=400,
+            ),
+            start,
+            range_step(frequency, oversampling=2)[0],
+            frequency[512],
+            2.0,
+            *places,
+        )
+        engine = ENGINES["numba"]
+        peaks.append(np.abs(engine.form(engine.prepare(profiles), grid.positions())).max())
+    assert 20 * np.log10(peaks[0] / peaks[1]) > 15
+
+
+def test_gotcha_trihedrals_are_found_within_30_cm(shared, tmp_path):
+    """Two degrees of aperture of the airborne X-band circle, by the same steps, in a frame without a place on Earth."""
+    root = tmp_path / "gotcha"
+    (root / "config").mkdir(parents=True)
+    (root / "raw" / "pass1").mkdir(parents=True)
+    for number, file in enumerate(sorted((shared / "gotcha_afrl").glob("*.mat")), 1):
+        (root / "raw" / "pass1" / f"radar.az{number:03d}.mat").write_bytes(file.read_bytes())
+    (root / "config" / "config.yaml").write_text(
+        "campaign: gotcha\nwaveform: {kind: phase_history, format: afrl_mat}\nnodes: {radar: {}}\n"
+        "scene: {crs: local, bounds_m: [-40.0, 10.0, 0.0, 50.0], spacing_m: 0.2}\n"
+    )
+    (root / "config" / "flights.tsv").write_text(
+        "flight\tkind\ttransmitter\tnodes\npass1\timage\tradar\tradar\n"
+    )
+    campaign = run_steps(root)
+    with rasterio.open(root / "results/pass1/radar-radar/slc.tif") as raster:
+        image, inverse, crs = raster.read(1), ~raster.transform, raster.crs
+    assert crs.to_wkt().startswith('LOCAL_CS["gotcha"')
+    for x, y in ((-15.61, 21.61), (-27.79, 38.82)):
+        column, row = (int(at) for at in inverse * (x, y))
+        window = np.abs(image[row - 8 : row + 9, column - 8 : column + 9])
+        down, right = np.unravel_index(window.argmax(), window.shape)
+        found = ground_position(scene_grid(campaign), find_peak(image, row - 8 + down, column - 8 + right))
+        assert np.hypot(found[0] - x, found[1] - y) < 0.3
+
+
+@pytest.mark.parametrize("window", ["hann", "none"])
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_table_engine_meets_its_error(finished_sample, window, pair):
+    dataset = open_stage(finished_sample.stage("echo", "f01", pair), "echo")
+    grid = scene_grid(finished_sample)
+    frequency, weight = dataset.frequency.values, window_weights(window, 1024)
+    places = dataset.tx_position.values, dataset.rx_position.values
+    zeros = np.zeros(len(places[0]))
+    spectra = Spectra(dataset.transfer.values, frequency, weight, zeros, *places)
+    start = np.full(len(zeros), 5.0)
+    samples = compress(
+        spectra.transfer, frequency, weight=weight, reference_delay_s=zeros, start_m=start, count=500
+    )
+    profiles = Profiles(samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, *places)
+    pixels = grid.positions_at(*random_pixels(grid.shape, 256, np.random.default_rng(3)).T)
+    engine = ENGINES["numba"]
+    computed = engine.form(engine.prepare(profiles), pixels[None])[0]
+    assert numerical_error(computed, reference.form(spectra, pixels)).rms_db < -50
+
+
+def test_what_the_product_says_of_its_error_is_true(finished_tiny):
+    """Recomputed here at other pixels than those it was certified on."""
+    pair = ("f01", "uav1-uav2")
+    said = json.loads((finished_tiny.results / "f01" / "uav1-uav2" / "image.json").read_text())
+    dataset = open_stage(finished_tiny.stage("echo", *pair), "echo")
+    formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
+    frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
+    spectra = Spectra(
+        dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), *places
+    )
+    rows, columns = random_pixels(formed.shape, 200, np.random.default_rng(99)).T
+    exact = reference.form(spectra, scene_grid(finished_tiny).positions_at(rows, columns))
+    found = numerical_error(formed[rows, columns], exact).rms_db
+    assert said["numerical_error_db"] == pytest.approx(found, abs=3)
+
+
+def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
+    run_steps(tiny)
+    for product in sorted(finished_tiny.results.rglob("*.tif")) + sorted(finished_tiny.results.rglob("*.png")):
+        other = tiny / "results" / product.relative_to(finished_tiny.results)
+        assert other.read_bytes() == product.read_bytes(), product.name
+    manifests = sorted(finished_tiny.results.rglob("*.manifest.json"))
+    assert len(manifests) == 11
+    for manifest in manifests:
+        assert (tiny / "results" / manifest.relative_to(finished_tiny.results)).read_bytes() == manifest.read_bytes()
+
+
+def test_a_threefold_thread_count_changes_nothing(tiny, finished_tiny):
+    campaign = Campaign.load(tiny)
+    run_steps(tiny, exports=False)
+    from apertura.steps import image
+
+    image.image(campaign, "f01", "uav1-uav1", threads=6)
+    one = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
+    two = open_stage(finished_tiny.stage("image", "f01", "uav1-uav1"), "image").image.values
+    np.testing.assert_array_equal(one, two)
