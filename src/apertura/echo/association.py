@@ -1,0 +1,248 @@
+"""Which capture of the receiver belongs to which pulse of the transmitter, and when that answer is suspect."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from apertura.echo.frame_counter import ABSENT, pairs_by_frame
+from apertura.echo.time_tags import Floats, Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
+from apertura.errors import CampaignError
+
+LARGEST_JITTER = 1 / 6
+"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
+
+NEAR_HALF = 0.4
+"""Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
+
+
+@dataclass(frozen=True)
+class Association:
+    """Pulses that two nodes have in common.
+
+    Attributes
+    ----------
+    tx_index, rx_index
+        (pair,) int64, positions in the two recordings, both strictly ascending.
+    offset_s
+        Receiver's time tag minus transmitter's at the first pair, seconds.
+    drift_ppm
+        Growth of that offset, parts per million.
+    residual_s
+        RMS of the tags about that line, seconds.
+    method
+        What the pairs rest on.
+    tx_dropped, rx_dropped
+        Pulses of each recording without a partner.
+    flags
+        Edge crossed → what was measured, in one line.
+    """
+
+    tx_index: Integers
+    rx_index: Integers
+    offset_s: float
+    drift_ppm: float
+    residual_s: float
+    method: Literal["frame counter", "time tags"]
+    tx_dropped: int
+    rx_dropped: int
+    flags: Mapping[str, str]
+
+
+def associate(
+    tx_time_ns: Integers,
+    rx_time_ns: Integers,
+    *,
+    repetition_interval_s: float,
+    tx_frame: Integers | None = None,
+    rx_frame: Integers | None = None,
+    frame_modulus: int | None = None,
+    where: str = "raw",
+) -> Association:
+    """Pair the pulses of a transmitter with the captures of a receiver.
+
+    Frame numbers decide where both nodes have them. Without, the receiver's tags are taken to run ahead or
+    behind by less than half a repetition interval at its first pulse, drifting by up to 100 ppm afterwards.
+
+    Parameters
+    ----------
+    tx_time_ns, rx_time_ns
+        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any origin common to both.
+    repetition_interval_s
+        Nominal time between pulses, seconds.
+    tx_frame, rx_frame
+        (pulse,) int64 frame numbers, -1 where the payload was not read; None without a counter.
+    frame_modulus
+        Count at which the counter returns to zero. None: the power of two above the largest number seen, if
+        a counter ever steps back.
+    where
+        What to call the recordings in errors.
+
+    Returns
+    -------
+    Association
+
+    Raises
+    ------
+    CampaignError
+        If tags do not ascend, the counters share no frame, or no pair lies within half a repetition interval.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association".
+
+    Examples
+    --------
+    >>> transmitter = np.arange(5) * 50_000_000
+    >>> receiver = np.delete(transmitter, 2) + 2_000_000
+    >>> found = associate(transmitter, receiver, repetition_interval_s=0.05)
+    >>> found.tx_index, found.rx_index, found.offset_s
+    (array([0, 1, 3, 4]), array([0, 1, 2, 3]), 0.002)
+    """
+    interval_ns = repetition_interval_s * 1e9
+    for node, time_ns in (("transmitter", tx_time_ns), ("receiver", rx_time_ns)):
+        _require_ascending(time_ns, node, where)
+    tags = np.asarray(tx_time_ns, np.int64), np.asarray(rx_time_ns, np.int64)
+    frames = (tx_frame, rx_frame)
+    by_frame = pairs_by_frame(tags, frames, interval_ns, frame_modulus)
+    conflicts = 0
+    if by_frame is None:
+        pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
+        if pairs[0].size:
+            pairs = nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns)
+    else:
+        pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
+    if pairs[0].size == 0:
+        raise _nothing_in_common(tags, repetition_interval_s, where)
+    line = fit_pairs(tags, pairs, interval_ns)
+    found = Association(
+        tx_index=pairs[0],
+        rx_index=pairs[1],
+        offset_s=line.offset_ns * 1e-9,
+        drift_ppm=line.drift * 1e6,
+        residual_s=float(np.sqrt(np.mean(residual_ns(tags, pairs, line) ** 2))) * 1e-9,
+        method="time tags" if by_frame is None else "frame counter",
+        tx_dropped=tags[0].size - pairs[0].size,
+        rx_dropped=tags[1].size - pairs[0].size,
+        flags={},
+    )
+    return replace(found, flags=_flags(found, repetition_interval_s, conflicts))
+
+
+def detect_wrong_association(
+    sidelink_path_m: Floats, predicted_path_m: Floats, *, tolerance_m: float = 0.05, window: int = 15
+) -> str | None:
+    """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
+
+    A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
+    `tolerance_m` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
+    somebody else's positions.
+
+    Parameters
+    ----------
+    sidelink_path_m
+        (pulse,) float64, measured delay of the sidelink times c, metres; NaN where it did not lock.
+    predicted_path_m
+        (pulse,) float64, distance between the antennas of the sidelink for the same pulses, metres.
+    tolerance_m
+        Largest movement that positions alone may explain, metres.
+    window
+        Pulses of the running median that tells movement from jitter.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence
+    either way: the prediction itself must move for a wrong pair to show.
+
+    Examples
+    --------
+    >>> distance = 5 + np.sin(np.arange(200) / 20)
+    >>> detect_wrong_association(distance + 3.0, distance) is None
+    True
+    >>> detect_wrong_association(np.roll(distance, 9), distance)
+    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
+    """
+    pulse = np.flatnonzero(np.isfinite(sidelink_path_m) & np.isfinite(predicted_path_m))
+    if pulse.size < 2 * window:
+        return None
+    residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
+    smooth = median_filter(residual, window, mode="nearest")
+    smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
+    jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
+    noise = 1.2533 * jitter / np.sqrt(window)  # standard deviation of a median of `window` Gaussian samples
+    worst = int(np.argmax(np.abs(smooth)))
+    if abs(smooth[worst]) <= max(tolerance_m, 5 * noise):
+        return None
+    return (
+        f"sidelink leaves its geometry by {abs(smooth[worst]):.2f} m at pulse {pulse[worst]} (noise {noise:.3f} m): "
+        "pulses or positions are wrongly associated"
+    )
+
+
+def _require_ascending(tags: Integers, node: str, where: str) -> None:
+    back = np.flatnonzero(np.diff(tags) <= 0)
+    if back.size or tags.size == 0:
+        raise CampaignError(
+            f"no pulses of the {node}"
+            if not tags.size
+            else f"time tag of pulse {back[0] + 1} of the {node} steps back",
+            where=where,
+            expected="time tags that ascend",
+            remedy="Check core:datetime of the capture segments.",
+        )
+
+
+def _nothing_in_common(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
+    gap_s = [(tags[1][0] - tags[0][0]) * 1e-9, (tags[1][-1] - tags[0][-1]) * 1e-9]
+    return CampaignError(
+        f"no pulse pairs: the receiver begins {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s from the transmitter",
+        where=where,
+        expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
+        remedy="Check that both recordings are of the same flight, and their core:datetime.",
+    )
+
+
+def _agreed_pairs(
+    tags: Pairs, by_frame: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float
+) -> tuple[Pairs, int]:
+    """Drop frame pairs that the tags contradict, add pulses whose number was not read; count the dropped."""
+    if by_frame[0].size == 0:
+        return by_frame, 0
+    line = fit_pairs(tags, by_frame, interval_ns)
+    agreed = np.abs(residual_ns(tags, by_frame, line)) < interval_ns / 2
+    tx, rx = by_frame[0][agreed], by_frame[1][agreed]
+    near = nearest_pairs(tags, line, interval_ns)
+    unread = (np.asarray(frames[0])[near[0]] == ABSENT) | (np.asarray(frames[1])[near[1]] == ABSENT)
+    free = unread & ~np.isin(near[0], tx) & ~np.isin(near[1], rx)
+    tx, rx = np.concatenate([tx, near[0][free]]), np.concatenate([rx, near[1][free]])
+    order = np.argsort(tx)
+    tx, rx = tx[order], rx[order]
+    ascending = np.concatenate([[True], rx[1:] > np.maximum.accumulate(rx)[:-1]]) if rx.size else np.zeros(0, bool)
+    return (tx[ascending], rx[ascending]), int((~agreed).sum())
+
+
+def _flags(found: Association, interval_s: float, conflicts: int) -> dict[str, str]:
+    flags = {}
+    share = abs(found.offset_s) / interval_s
+    by_tags = found.method == "time tags"
+    if by_tags and share > NEAR_HALF:
+        flags["association_ambiguous"] = (
+            f"tags are {found.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
+            "every pair may be off by one pulse"
+        )
+    if not by_tags and share > 0.5:
+        flags["time_tags_apart"] = f"frame counters agree while time tags are {found.offset_s:+.4f} s apart"
+    if conflicts:
+        flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
+    if by_tags and found.residual_s > interval_s * LARGEST_JITTER:
+        flags["time_tag_jitter"] = (
+            f"time tags scatter by {found.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
+            "single pulses may be paired with a neighbour"
+        )
+    pairs = found.tx_index.size
+    shorter = pairs + min(found.tx_dropped, found.rx_dropped)
+    if pairs < shorter / 2:
+        flags["association_sparse"] = f"{pairs} pulses paired of {shorter} in the shorter recording"
+    return flags
