@@ -37,8 +37,8 @@ template <bool kTerrain, bool kOwnCurvature>
 inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, int64_t pulse, int q, Batch& batch) {
   constexpr int kParts = kBlocks / kLanes;
   const float rough = patch.roughest, first = aim.first[q], last = aim.last[q];
-  Whole inside = ~Whole{}, narrow = ~Whole{}, before = ~Whole{}, behind = ~Whole{};
-  Lanes path[kParts], low[kParts], lowest[kParts];
+  Truth inside = kTrue, narrow = kTrue;
+  Lanes path[kParts], low[kParts], lowest[kParts], top[kParts];
   for (int part = 0; part < kParts; part++) {
     const int b = part * kLanes;
     Slope s;
@@ -47,13 +47,12 @@ inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, in
     path[part] = s.path + aim.rest[q];
     Lanes span = 1.5f * (magnitude(s.x) + magnitude(s.y)) + aim.margin[q];
     if constexpr (kTerrain) span += rough * magnitude(s.h);
-    const Lanes top = path[part] + span;
+    top[part] = path[part] + span;
     low[part] = floor(path[part] - span);
     lowest[part] = kGrouped ? least_of_four(low[part]) : low[part];
-    inside &= (low[part] >= first) & (low[part] <= last) & (top - low[part] <= kWindow - 0.51f);
-    narrow &= top - lowest[part] <= kNarrow - 0.51f;
-    before &= top < first - 1;
-    behind &= low[part] > last + kWindow;
+    inside &= at_most(splat(first), low[part]) & at_most(low[part], splat(last)) &
+              at_most(top[part] - low[part], splat(kWindow - 0.51f));
+    narrow &= at_most(top[part] - lowest[part], splat(kNarrow - 0.51f));
     store(batch.x[q] + b, s.x), store(batch.y[q] + b, s.y);
     if constexpr (kTerrain) store(batch.h[q] + b, s.h);
     if constexpr (kOwnCurvature)
@@ -61,7 +60,14 @@ inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, in
     if constexpr (kOwnCurvature && kTerrain)
       store(batch.xh[q] + b, s.xh), store(batch.yh[q] + b, s.yh), store(batch.hh[q] + b, s.hh);
   }
-  if (!all(inside)) return all(before) || all(behind) ? kSkip : kExact;
+  if (!all(inside)) {
+    Truth before = kTrue, behind = kTrue;
+    for (int part = 0; part < kParts; part++) {
+      before &= at_most(top[part], splat(first - 1));
+      behind &= at_most(splat(last + kWindow + 1), low[part]);
+    }
+    return all(before) || all(behind) ? kSkip : kExact;
+  }
   const bool shared = !kOwnCurvature && kLanes != 4 && all(narrow);
   for (int part = 0; part < kParts; part++) {
     const Lanes begin = shared ? lowest[part] : low[part];
@@ -84,17 +90,20 @@ template <bool kTerrain>
 inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
   Aim aim;
   aim_at<kTerrain>(job, patch, pulse, aim);
-  const float tolerance = float(job.tolerance_rad / job.radians_per_cell);
+  int shared = 0;  // in a register: nearly all pulses take this form
   for (int form = 0; form < kForms; form++) batch.count[form] = 0;
   for (int q = 0; q < pulses; q++) {
     Form form = kExact;
-    const bool own = !(aim.shared[q] <= tolerance);
-    const bool far = !(magnitude(float(aim.path[q])) < 1e7f);
-    if (!patch.crooked && !far && aim.own[q] <= tolerance)
-      form = own ? place<kTerrain, true>(job, patch, aim, pulse, q, batch)
-                 : place<kTerrain, false>(job, patch, aim, pulse, q, batch);
-    batch.order[form][batch.count[form]++] = q;
+    if (aim.holds[q] == 2)
+      form = place<kTerrain, false>(job, patch, aim, pulse, q, batch);
+    else if (aim.holds[q] == 1)
+      form = place<kTerrain, true>(job, patch, aim, pulse, q, batch);
+    if (form == kShared)
+      batch.order[kShared][shared++] = q;
+    else
+      batch.order[form][batch.count[form]++] = q;
   }
+  batch.count[kShared] = shared;
 }
 
 // Path of a block's pixels, in cells from its window.

@@ -48,16 +48,22 @@ inline Lanes floor(Lanes value) {
   return value;
 #endif
 }
-// Of a comparison: whether it holds in every lane.
-inline bool all(Whole truth) {
+// A truth per lane, from comparisons that a NaN never passes.
 #if defined(__AVX512F__)
-  return _mm512_movepi32_mask((__m512i)truth) == 0xffff;
-#elif defined(__AVX2__)
-  return _mm256_movemask_ps((__m256)truth) == 0xff;
+typedef __mmask16 Truth;
+constexpr Truth kTrue = 0xffff;
+inline Truth at_most(Lanes a, Lanes b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
+inline bool all(Truth truth) { return truth == kTrue; }
 #else
-  return truth[0] & truth[1] & truth[2] & truth[3];
+typedef Whole Truth;
+constexpr Truth kTrue = ~Whole{};
+inline Truth at_most(Lanes a, Lanes b) { return a <= b; }
+#if defined(__AVX2__)
+inline bool all(Truth truth) { return _mm256_movemask_ps((__m256)truth) == 0xff; }
+#else
+inline bool all(Truth truth) { return truth[0] & truth[1] & truth[2] & truth[3]; }
 #endif
-}
+#endif
 
 // Smallest of each four neighbouring lanes, in all four.
 inline Lanes least_of_four(Lanes value) {

@@ -82,13 +82,13 @@ void describe_block(Patch& patch, int block, const double height[kPixels]) {
   const int above = top(block), before = left(block);
   double sum = 0;
   int count = 0;
-  for (int lane = 0; lane < 16; lane++) {
+  for (int lane = 0; patch.terrain && lane < 16; lane++) {
     const int i = above + lane / 4, j = before + lane % 4;
     if (i >= patch.rows || j >= patch.columns) continue;
     sum += height[i * kSide + j];
     count++;
   }
-  const double level = sum / count;
+  const double level = count ? sum / count : 0;
   const double x = before + 1.5 - 0.5 * (patch.columns - 1), y = above + 1.5 - 0.5 * (patch.rows - 1);
   double centre[3];
   for (int axis = 0; axis < 3; axis++)
@@ -99,16 +99,11 @@ void describe_block(Patch& patch, int block, const double height[kPixels]) {
   patch.dot_y[block] = float(dot(centre, patch.step_y));
   patch.dot_h[block] = float(dot(centre, patch.up));
   patch.reach = std::fmax(patch.reach, std::sqrt(patch.square[block]));
-  for (int lane = 0; lane < 16; lane++) {
+  for (int lane = 0; patch.terrain && lane < 16; lane++) {
     const int i = above + lane / 4, j = before + lane % 4;
     if (i >= patch.rows || j >= patch.columns) continue;
     const double rise = height[i * kSide + j] - level;
     patch.rise[block * 16 + lane] = float(rise);
-    double offset[3];
-    for (int axis = 0; axis < 3; axis++)
-      offset[axis] = (lane % 4 - 1.5) * patch.step_x[axis] + (lane / 4 - 1.5) * patch.step_y[axis] +
-                     rise * patch.up[axis];
-    patch.inner = std::fmax(patch.inner, float(std::sqrt(dot(offset, offset))));
     patch.roughest = std::fmax(patch.roughest, float(std::fabs(rise)));
   }
 }
@@ -132,6 +127,13 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double bend_cells,
     patch.present[block] = top(block) < patch.rows && left(block) < patch.columns;
     if (patch.present[block]) describe_block(patch, block, height);
   }
+  // The corner of a block, and a pixel's height as if it lay crosswise to it or along it.
+  for (int side = -1; side <= 1; side += 2) {
+    double corner[3];
+    for (int axis = 0; axis < 3; axis++) corner[axis] = 1.5 * (patch.step_x[axis] + side * patch.step_y[axis]);
+    patch.inner = std::fmax(patch.inner, float(std::sqrt(dot(corner, corner))));
+  }
+  patch.inner += patch.roughest;
   // A block without pixels stands where one with pixels is, so that it never decides about its group.
   for (int block = 0; block < kBlocks; block++)
     if (!patch.present[block]) {

@@ -32,6 +32,7 @@ struct Aim {
   alignas(64) float first[kBatch], last[kBatch];      // of the table's windows, from `start`
   alignas(64) float shared[kBatch];                   // largest error in cells if the patch shares one curvature
   alignas(64) float own[kBatch];                      // and if each block has its own
+  alignas(64) int32_t holds[kBatch];                  // 2: shared curvature will do, 1: own curvature, 0: neither
 };
 
 template <bool kTerrain>
@@ -79,11 +80,14 @@ inline void aim_at(const ApertureJob& job, const Patch& patch, int64_t pulse, Ai
   aim_leg<kTerrain>(job.transmitter + pulse, job, patch, aim.leg[0], aim);
   aim_leg<kTerrain>(job.receiver + pulse, job, patch, aim.leg[1], aim);
   const double last = double(job.width) - kWindow;
+  const float tolerance = patch.crooked ? -1.0f : float(job.tolerance_rad / job.radians_per_cell);
   for (int q = 0; q < kBatch; q++) {
     aim.start[q] = __builtin_floor(aim.path[q]);
     aim.rest[q] = float(aim.path[q] - aim.start[q]);
     aim.first[q] = float(-aim.start[q]);
     aim.last[q] = float(last - aim.start[q]);
+    aim.holds[q] = (int(aim.shared[q] <= tolerance) + int(aim.own[q] <= tolerance)) *
+                   int(magnitude(aim.first[q]) < 1e7f);
     // Curvature inside a block is small beside its slope: twice the value at the origin bounds it where fast forms hold.
     aim.margin[q] = 1e-3f + 4.5f * (magnitude(aim.xx[q]) + magnitude(aim.xy[q]) + magnitude(aim.yy[q]));
     if constexpr (kTerrain)
