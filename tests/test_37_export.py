@@ -178,7 +178,7 @@ class Blocks:
     def __getitem__(self, key):
         rows, columns = (range(*part.indices(size)) for part, size in zip(key, self.shape, strict=True))
         self.largest = max(self.largest, len(rows) * len(columns))
-        return np.ones((len(rows), len(columns)), np.complex64)
+        return (np.add.outer(np.array(rows) * 1j, columns) + 1).astype(np.complex64)
 
 
 @pytest.mark.parametrize("name", EXPORTS)
@@ -186,6 +186,11 @@ def test_an_image_is_never_held_whole(tmp_path, name):
     image = Blocks(READ + 300, READ + 500)
     EXPORTS[name](tmp_path / name, image, **UTM, tags={})
     assert 0 < image.largest <= READ**2
+    if name == "slc.tif":
+        with rasterio.open(tmp_path / name) as raster:
+            row, column = raster.height - 1, raster.width - 1
+            corners = [raster.read(1)[place] for place in ((0, 0), (0, column), (row, 0), (row, column))]
+        assert corners == [1, column + 1, 1 + row * 1j, column + 1 + row * 1j]
 
 
 KILLED = """
@@ -276,6 +281,13 @@ def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
             assert np.array_equal(raster.dataset_mask() == 0, np.arange(600)[:, None] + np.zeros(600) < 10)
             assert raster.units == (("bits",) if name == "mask.tif" else ("deg",))
         assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
+
+
+def test_shadow_and_layover_never_mix_in_an_overview(tmp_path):
+    bits = np.full((600, 600), SHADOW, np.uint8)
+    bits[301:] = SHADOW | LAYOVER
+    write_mask(tmp_path / "mask.tif", bits, **UTM, tags={})
+    assert LAYOVER not in overviews(tmp_path / "mask.tif")[0]
     with pytest.raises(ContractError, match="float64, not uint8"):
         write_mask(tmp_path / "mask.tif", bits.astype(float), **UTM, tags={})
 

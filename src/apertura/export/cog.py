@@ -193,8 +193,8 @@ def placed(image: Raster, transform: Affine, crs: str) -> dict[str, Any]:
 
 
 def described(tags: Mapping[str, str], title: str) -> dict[str, str]:
-    """Return the tags of the file, in an order that does not depend on who made them."""
-    return dict(sorted(tags.items())) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
+    """Return the tags of the file; GDAL sorts them by name."""
+    return dict(tags) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
 
 
 def fill(
