@@ -114,8 +114,9 @@ class Sheet:
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
         """Write what the picture shows above it, and where it comes from below."""
-        height = self.figure.get_size_inches()[1]
-        self._write(LEFT, height - 0.4, title, size=13, weight="bold")
+        width, height = self.figure.get_size_inches()
+        room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
+        self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
         self._write(LEFT, height - 0.65, subtitle, size=9)
         self._write(LEFT, 0.2, footer, size=7, color="0.3")
 
