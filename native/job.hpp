@@ -9,7 +9,6 @@ struct ApertureJob {
   const double* receiver;     // (3, padded)
   const double* first_path;   // (padded): total path of the middle of cell 0
   const double* pixels;       // (rows, columns, 3)
-  const float* weight;        // (pulse, rows / 16 + 1, columns / 16 + 1) or null: gain at the corners of patches
   float* image;               // (rows, columns, 2): re, im
   int64_t* counts;            // pulses x patches handled by: shared curvature, own curvature, exact, skipped
   int64_t pulses, padded, width, rows, columns;

@@ -1,0 +1,115 @@
+"""The benchmark's job: a low, wobbling bistatic flight over a field of point scatterers, with its exact image.
+
+512 × 512 pixels of 5 cm seen from 10 m height at 5 to 30 m ground range, 1024 pulses over 30 m, 409.6 MHz at
+1.2 GHz: the geometry of the source paper, and the hardest for series about a patch: aperture, range and scene
+are of one size.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.image.history import Profiles
+
+SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
+GUARD = 16
+
+
+@dataclass(frozen=True)
+class Job:
+    """Profiles, pixels (y, x, 3), scatterers (place, amplitude)."""
+
+    profiles: Profiles
+    pixels: NDArray[np.float64]
+    scatterers: NDArray[np.float64]
+    amplitude: NDArray[np.complex128]
+
+
+def _wobble(generator: np.random.Generator, pulses: int, size_m: float) -> NDArray[np.float64]:
+    kernel = np.exp(-0.5 * (np.arange(-200, 201) / 60.0) ** 2)
+    track = np.convolve(generator.standard_normal(pulses + 400), kernel, "valid")
+    return size_m * track / track.std()
+
+
+def flight(generator: np.random.Generator, pulses: int, *, bistatic: bool) -> tuple[NDArray, NDArray]:
+    """Return transmitter and receiver positions, (pulse, 3) metres."""
+    along = np.linspace(-15, 15, pulses)
+    wobble = [_wobble(generator, pulses, size) for size in (0.05, 0.02, 0.05, 0.05, 0.02, 0.05)]
+    tx = np.stack([wobble[0], along + wobble[1], 10 + wobble[2]], 1)
+    rx = np.stack([-1.5 + along / 7.5 + wobble[3], 6 + 0.8 * along + wobble[4], 13 + along / 30 + wobble[5]], 1)
+    return tx, rx if bistatic else tx
+
+
+def grid(size: int, spacing_m: float = 0.05, *, turned_deg: float = 0.0, terrain_m: float = 0.0) -> NDArray[np.float64]:
+    """Return (y, x, 3) pixels; `terrain_m` is the RMS of heights that change from pixel to pixel and over metres."""
+    step = spacing_m * (np.arange(size) - (size - 1) / 2)
+    across, along = np.meshgrid(step, step)
+    turn = np.radians(turned_deg)
+    middle = 5 + spacing_m * size / 2
+    x, y = middle + across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    rough = np.random.default_rng(5).standard_normal(x.shape)
+    height = terrain_m * (np.sin(x / 3) + np.cos(y / 4)) + 0.1 * terrain_m * rough
+    return np.stack([x, y, height], -1)
+
+
+def total_path(tx: NDArray, rx: NDArray, place: NDArray) -> NDArray[np.float64]:
+    """Return (pulse, place) total path, metres."""
+    legs = [np.linalg.norm(place[None] - antenna[:, None], axis=-1) for antenna in (tx, rx)]
+    return legs[0] + legs[1]
+
+
+def response(path_m: NDArray) -> NDArray[np.float64]:
+    """Return Σ_n exp(j2π(f_n - f_mid)·path/c) / N in closed form."""
+    turn = np.pi * SPACING_HZ * path_m / C
+    small = np.abs(turn) < 1e-12
+    safe = np.where(small, 1.0, turn)
+    return np.where(small, 1.0, np.sin(SUBCARRIERS * safe) / (SUBCARRIERS * np.sin(safe)))
+
+
+def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, terrain_m: float = 0.0) -> Job:
+    """Return the job; profiles are exact samples of the band-limited echo."""
+    generator = np.random.default_rng(1)
+    tx, rx = flight(generator, pulses, bistatic=bistatic)
+    pixels = grid(size, terrain_m=terrain_m)
+    flat = pixels.reshape(-1, 3)
+    scatterers = flat[generator.integers(0, len(flat), 100)] + generator.uniform(-0.025, 0.025, (100, 3)) * [1, 1, 0]
+    amplitude = generator.standard_normal(100) + 1j * generator.standard_normal(100)
+    step = C / (SUBCARRIERS * SPACING_HZ) / 2
+    edge = grid(64, 0.05 * size * 1.45 / 64).reshape(-1, 3)  # a turned grid fits in too
+    paths = total_path(tx, rx, edge)
+    start = paths.min(1) - GUARD * step
+    length = int(np.ceil((paths.max(1) - start).max() / step)) + GUARD
+    samples = np.zeros((pulses, length), np.complex128)
+    at = start[:, None] + step * np.arange(length)
+    wavenumber = 2 * np.pi * CENTRE_HZ / C
+    for place, gain in zip(scatterers, amplitude, strict=True):
+        path = total_path(tx, rx, place[None])
+        samples += gain * np.exp(-1j * wavenumber * path) * response(at - path)
+    profiles = Profiles(samples.astype(np.complex64), start, step, CENTRE_HZ, 2.0, tx, rx)
+    return Job(profiles, pixels, scatterers, amplitude)
+
+
+def turned(job: Job, degrees: float) -> Job:
+    """Return the job on a grid turned about its middle."""
+    return replace(job, pixels=grid(len(job.pixels), turned_deg=degrees))
+
+
+def exact(job: Job, places: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
+    wavenumber = 2 * np.pi * CENTRE_HZ / C
+    here = total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, places)
+    image = np.zeros(len(places), np.complex128)
+    for place, gain in zip(job.scatterers, job.amplitude, strict=True):
+        apart = here - total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, place[None])
+        image += gain * (np.exp(1j * wavenumber * apart) * response(apart)).sum(0)
+    return image
+
+
+def error_db(job: Job, image: NDArray[np.complex64], count: int = 300) -> float:
+    """Return the RMS error on random pixels after one complex gain, dB."""
+    index = np.random.default_rng(7).integers(0, job.pixels.shape[0], (2, count))
+    truth, value = exact(job, job.pixels[index[0], index[1]]), image[index[0], index[1]].astype(np.complex128)
+    gain = np.vdot(value, truth) / np.vdot(value, value)
+    return float(10 * np.log10(np.sum(np.abs(gain * value - truth) ** 2) / np.sum(np.abs(truth) ** 2)))

@@ -1,0 +1,377 @@
+"""The compiled engine against the double sum over pulses and subcarriers, in each instruction set."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.image.engines import binding, native
+from apertura.image.history import Profiles
+
+pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
+
+SUBCARRIERS, BANDWIDTH_HZ = 128, 409.6e6
+GUARD = 12
+
+
+def _axes() -> NDArray[np.float64]:
+    """East, north, up of some place, as ECEF columns: nothing may depend on axes being aligned."""
+    return np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
+
+
+AXES, PLACE = _axes(), np.array([4.1e6, 0.9e6, 4.8e6])
+
+
+def ecef(local: NDArray[np.float64]) -> NDArray[np.float64]:
+    return local @ AXES.T + PLACE
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What was flown, and the calibrated spectra it gave; positions in ECEF."""
+
+    transfer: NDArray[np.complex128]
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    carrier_hz: float
+
+    @property
+    def offset_hz(self) -> NDArray[np.float64]:
+        return (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2) * BANDWIDTH_HZ / SUBCARRIERS
+
+    def path_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sum(np.linalg.norm(place - antenna[:, None], axis=-1) for antenna in (self.tx, self.rx))
+
+    def profiles(self, around: NDArray[np.float64]) -> Profiles:
+        paths = self.path_m(around.reshape(-1, 3))
+        step_m = C / BANDWIDTH_HZ / 2
+        start = paths.min(1) - GUARD * step_m
+        length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
+        at = start[:, None] + step_m * np.arange(length)
+        turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
+        samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
+        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, self.tx, self.rx)
+
+    def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
+        delay = self.path_m(places) / C
+        inner = np.einsum("pxn,pn->px", np.exp(2j * np.pi * delay[..., None] * self.offset_hz), self.transfer)
+        return (inner * np.exp(2j * np.pi * self.carrier_hz * delay)).sum(0)
+
+
+def fly(
+    targets: NDArray[np.float64],
+    *,
+    pulses: int = 70,
+    bistatic: bool = True,
+    carrier_hz: float = 1.2e9,
+    range_m: float = 12.0,
+) -> Scene:
+    """Echoes of targets (local metres, around x = range_m) seen from height range_m, aperture equal to the range."""
+    along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
+    bend = np.sin(np.linspace(0, 7, pulses))[:, None]
+    tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
+    rx = ecef(np.hstack([-1.5 + along / 7, 3 + 0.8 * along, 1.2 * range_m - 0.04 * bend])) if bistatic else tx.copy()
+    empty = Scene(np.zeros((pulses, SUBCARRIERS), complex), tx, rx, carrier_hz)
+    amplitude = np.exp(2j * np.pi * np.arange(len(targets)) * 0.618)
+    delay = empty.path_m(ecef(targets)) / C
+    waves = np.exp(-2j * np.pi * delay[..., None] * (carrier_hz + empty.offset_hz))
+    return replace(empty, transfer=np.einsum("ptn,t->pn", waves, amplitude))
+
+
+def grid(
+    rows: int, columns: int, *, spacing_m: float = 0.05, turned_deg: float = 0.0, range_m: float = 12.0
+) -> NDArray[np.float64]:
+    """(y, x, 3) local pixels around (range_m, 0)."""
+    across, along = np.meshgrid(
+        spacing_m * (np.arange(columns) - columns / 2), spacing_m * (np.arange(rows) - rows / 2)
+    )
+    turn = np.radians(turned_deg)
+    x, y = across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    return np.stack([x + range_m, y, 0 * x], -1)
+
+
+def scatter(pixels: NDArray[np.float64], count: int = 25) -> NDArray[np.float64]:
+    return pixels.reshape(-1, 3)[np.random.default_rng(2).integers(0, pixels[..., 0].size, count)]
+
+
+def error_db(scene: Scene, pixels: NDArray[np.float64], image: NDArray[np.complex64], count: int = 150) -> float:
+    """RMS error of random pixels, no gain taken out."""
+    pick = np.random.default_rng(3).integers(0, image.size, count)
+    truth = scene.exact(ecef(pixels).reshape(-1, 3)[pick])
+    return decibels(image.ravel()[pick] - truth, truth)
+
+
+def decibels(difference: NDArray[np.complexfloating], truth: NDArray[np.complexfloating]) -> float:
+    return 10 * np.log10(np.sum(np.abs(difference) ** 2) / np.sum(np.abs(truth) ** 2) + 1e-30)
+
+
+def _runs(name: str) -> bool:
+    return native.available() and binding._library().apertura_form(name.encode()) is not None
+
+
+@pytest.fixture(params=native.INSTRUCTION_SETS)
+def isa(request, monkeypatch):
+    if not _runs(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    monkeypatch.setenv("APERTURA_ISA", request.param)
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def plain():
+    pixels = grid(50, 83)
+    scene = fly(scatter(pixels))
+    return scene, pixels, scene.profiles(ecef(pixels))
+
+
+def test_every_instruction_set_agrees_with_the_double_sum(isa, plain):
+    scene, pixels, profiles = plain
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(profiles), ecef(pixels), counts=counts)
+    assert native.instruction_set() == isa
+    assert error_db(scene, pixels, image) <= -70
+    assert counts[0] == counts.sum()  # no pulse needed a slower way
+
+
+def test_a_monostatic_image_agrees_with_the_double_sum(isa):
+    pixels = grid(48, 48)
+    scene = fly(scatter(pixels), bistatic=False)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
+    assert error_db(scene, pixels, image) <= -70
+
+
+def test_instruction_sets_agree_with_each_other(plain, monkeypatch):
+    _, pixels, profiles = plain
+    images = []
+    for name in filter(_runs, native.INSTRUCTION_SETS):
+        monkeypatch.setenv("APERTURA_ISA", name)
+        images.append(native.form(native.prepare(profiles), ecef(pixels)))
+    assert all(decibels(image - images[0], images[0]) <= -95 for image in images[1:])
+
+
+@pytest.mark.parametrize(("oversampling", "degree"), [(5, 2), (6, 2), (8, 2), (8, 1), (10, 1), (16, 1)])
+def test_the_predicted_error_is_kept(isa, plain, oversampling, degree):
+    scene, pixels, profiles = plain
+    tables = native.prepare(profiles, oversampling=oversampling, degree=degree)
+    image = native.form(tables, ecef(pixels), tolerance_rad=2e-4)  # so that geometry adds nothing to the table's error
+    assert error_db(scene, pixels, image) <= tables.error_db + 1
+
+
+def test_more_oversampling_errs_less(plain):
+    profiles = plain[2]
+    errors = [native.prepare(profiles, oversampling=n).error_db for n in (4, 5, 6, 8)]
+    assert errors == sorted(errors, reverse=True)
+
+
+@pytest.mark.parametrize("carrier_hz", [0.41e9, 3e9, 10e9])
+def test_carriers_that_turn_often_within_a_cell_are_held(isa, carrier_hz):
+    pixels = grid(40, 40, spacing_m=C / carrier_hz / 4)
+    scene = fly(scatter(pixels), carrier_hz=carrier_hz)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels)), oversampling=6), ecef(pixels))
+    assert error_db(scene, pixels, image) <= -70
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 17), (33, 5), (15, 16), (17, 49)])
+def test_any_size_of_tile_will_do(isa, size):
+    pixels = grid(*size)
+    scene = fly(scatter(grid(40, 40)))
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
+    assert image.shape == size
+    assert error_db(scene, pixels, image) <= -70
+
+
+def test_splitting_into_tiles_changes_nothing_to_the_bit(isa, plain):
+    _, pixels, profiles = plain
+    tables, places = native.prepare(profiles), ecef(pixels)
+    whole = native.form(tables, places)
+    parts = np.block(
+        [
+            [native.form(tables, places[y, x]) for x in (slice(0, 32), slice(32, None))]
+            for y in (slice(0, 16), slice(16, None))
+        ]
+    )
+    np.testing.assert_array_equal(parts.view(np.uint32), whole.view(np.uint32))
+
+
+def test_threads_give_the_same_bits(plain):
+    _, pixels, profiles = plain
+    tables, places = native.prepare(profiles), ecef(pixels)
+    with ThreadPoolExecutor(2) as pool:
+        images = list(pool.map(lambda _: native.form(tables, places), range(4)))
+    assert all(np.array_equal(image, images[0]) for image in images)
+
+
+def test_a_turned_grid_takes_the_same_way_with_the_same_error(isa):
+    pixels = grid(64, 64, turned_deg=30)
+    scene = fly(scatter(pixels))
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert error_db(scene, pixels, image) <= -70
+    assert counts[0] == counts.sum()
+
+
+@pytest.mark.parametrize("rough_m", [0.002, 0.02])
+def test_heights_that_change_from_pixel_to_pixel_are_followed(isa, rough_m):
+    pixels = grid(48, 64)
+    generator = np.random.default_rng(6)
+    pixels[..., 2] = 0.3 * np.sin(pixels[..., 0]) * np.cos(pixels[..., 1]) + rough_m * generator.standard_normal(
+        (48, 64)
+    )
+    scene = fly(scatter(pixels))
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert error_db(scene, pixels, image) <= -70
+    assert counts[2] == 0  # none had to go pixel by pixel in float64
+
+
+def test_a_crooked_surface_goes_the_exact_way(isa):
+    pixels = grid(32, 32) + 0.1 * np.random.default_rng(6).standard_normal((32, 32, 3))
+    scene = fly(scatter(pixels))
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert counts[2] == counts.sum()
+    assert error_db(scene, pixels, image) <= -70
+
+
+@pytest.mark.parametrize("spacing_m", [0.12, 0.25, 0.6, 2.0])
+def test_coarse_pixels_leave_the_windows_without_leaving_the_truth(isa, spacing_m):
+    pixels = grid(20, 20, spacing_m=spacing_m, range_m=60)
+    scene = fly(scatter(pixels), range_m=60)
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert error_db(scene, pixels, image) <= -70
+    assert (counts[2] == 0) == (spacing_m < 0.5)
+
+
+@pytest.mark.parametrize(("range_m", "way"), [(12, 0), (4, 1), (0.6, 2)])
+def test_near_ranges_take_more_exact_paths(isa, range_m, way):
+    pixels = grid(32, 32, range_m=range_m)
+    scene = fly(scatter(pixels), range_m=range_m, bistatic=False)
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert error_db(scene, pixels, image) <= -70
+    assert counts[way] > counts.sum() / 2
+
+
+def test_swapping_transmitter_and_receiver_gives_the_same_image(isa, plain):
+    _, pixels, profiles = plain
+    swapped = replace(profiles, tx_position_m=profiles.rx_position_m, rx_position_m=profiles.tx_position_m)
+    image, other = (native.form(native.prepare(p), ecef(pixels)) for p in (profiles, swapped))
+    assert decibels(image - other, image) <= -100
+
+
+def test_a_constant_height_equals_a_lowered_track(isa):
+    pixels = grid(32, 48)
+    scene = fly(scatter(pixels))
+    raised = pixels + np.array([0, 0, 1.5])
+    lowered = [antenna - 1.5 * AXES[:, 2] for antenna in (scene.tx, scene.rx)]
+    profiles = scene.profiles(ecef(raised))
+    image = native.form(native.prepare(profiles), ecef(raised))
+    other = native.form(
+        native.prepare(replace(profiles, tx_position_m=lowered[0], rx_position_m=lowered[1])), ecef(pixels)
+    )
+    assert decibels(image - other, image) <= -70
+
+
+def test_a_raised_target_focuses_where_geometry_predicts(isa):
+    height_m, ground_m = 1.0, 12.0
+    scene = fly(np.array([[ground_m, 0, height_m]]), bistatic=False)
+    laid_over_m = np.sqrt(ground_m**2 + (12 - height_m) ** 2 - 12**2)
+    pixels = grid(48, 96, spacing_m=0.03, range_m=ground_m - 0.5)
+    lifted = pixels + np.array([0, 0, height_m])
+    tables = native.prepare(scene.profiles(np.concatenate([ecef(pixels), ecef(lifted)])))
+    for surface, expected_m in ((pixels, laid_over_m), (lifted, ground_m)):
+        image = np.abs(native.form(tables, ecef(surface)))
+        row, column = np.unravel_index(image.argmax(), image.shape)
+        assert surface[row, column, 0] == pytest.approx(expected_m, abs=0.08)
+        assert surface[row, column, 1] == pytest.approx(0, abs=0.05)
+
+
+def test_blocks_of_pulses_add_up(isa, plain):
+    _, pixels, profiles = plain
+    whole = native.form(native.prepare(profiles), ecef(pixels))
+    parts = [native.form(native.prepare(profiles, pulses=cut), ecef(pixels)) for cut in (slice(0, 33), slice(33, None))]
+    assert decibels(sum(parts) - whole, whole) <= -110
+
+
+def test_summing_in_float64_agrees(isa, plain):
+    _, pixels, profiles = plain
+    tables = native.prepare(profiles)
+    image, wide = (native.form(tables, ecef(pixels), accumulate=kind) for kind in ("complex64", "complex128"))
+    assert decibels(image - wide, wide) <= -115
+
+
+def test_pixels_beyond_the_profiles_are_zero_and_others_unharmed(isa, plain):
+    _, pixels, profiles = plain
+    tables = native.prepare(profiles)
+    far = pixels.copy()
+    far[:, 40:, 0] += 1000.0
+    image = native.form(tables, ecef(far))
+    assert np.all(image[:, 40:] == 0)
+    np.testing.assert_allclose(
+        image[:, :40], native.form(tables, ecef(pixels))[:, :40], atol=2e-3 * np.abs(image).max()
+    )
+
+
+def test_a_pulse_counts_only_where_its_profile_reaches(isa, plain):
+    scene, pixels, profiles = plain
+    cut = replace(profiles, samples=profiles.samples[:, : profiles.samples.shape[1] // 2])
+    image = native.form(native.prepare(cut), ecef(pixels))
+    end = cut.start_m + cut.step_m * (cut.samples.shape[1] - 1)
+    reach = scene.path_m(ecef(pixels).reshape(-1, 3)).min(0).reshape(image.shape)
+    assert np.all(image[reach > end.max() + cut.step_m] == 0)
+    assert np.all(np.isfinite(image))
+
+
+def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(isa, plain):
+    scene, pixels, profiles = plain
+    places = ecef(pixels)
+    places[20, 21] = np.nan
+    image = native.form(native.prepare(profiles), places)
+    assert np.argwhere(np.isnan(image)).tolist() == [[20, 21]]
+    image[20, 21] = scene.exact(ecef(pixels)[20, 21][None])[0]
+    assert error_db(scene, pixels, image) <= -70
+
+
+def test_an_unknown_instruction_set_is_refused(monkeypatch):
+    monkeypatch.setenv("APERTURA_ISA", "sse9")
+    with pytest.raises(ValueError, match="APERTURA_ISA='sse9': must be one of avx512, avx2, portable"):
+        native.instruction_set()
+
+
+def test_bad_input_is_refused(plain):
+    profiles = plain[2]
+    tables = native.prepare(profiles)
+    with pytest.raises(ValueError, match="degree=3"):
+        native.prepare(profiles, degree=3)
+    with pytest.raises(ValueError, match="holds no pulse"):
+        native.prepare(profiles, pulses=slice(0, 0))
+    with pytest.raises(ValueError, match="must be finite"):
+        native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
+    with pytest.raises(ValueError, match="oversampling"):
+        native.prepare(replace(profiles, oversampling=1.2))
+    with pytest.raises(ValueError, match=r"must be \(y, x, 3\)"):
+        native.form(tables, np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="accumulate"):
+        native.form(tables, np.zeros((4, 4, 3)), accumulate="float16")
+
+
+def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
+    monkeypatch.setattr(binding, "_library_path", lambda: None)
+    binding._library.cache_clear()
+    try:
+        assert not native.available()
+        with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
+            native.instruction_set()
+    finally:
+        binding._library.cache_clear()
+
+
+def test_no_environment_variable_means_the_best(monkeypatch):
+    monkeypatch.delenv("APERTURA_ISA", raising=False)
+    assert native.instruction_set() == next(filter(_runs, native.INSTRUCTION_SETS))
+    assert "APERTURA_ISA" not in os.environ
