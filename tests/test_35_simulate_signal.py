@@ -213,6 +213,18 @@ def test_too_little_backoff_clips_at_full_scale():
         adc = Adc(14, backoff_db)
         counts = digitize(clean, adc, full_scale(seen.channels["radar"], adc))
         assert ((counts == 8191) | (counts == -8192)).any() == clips
+        assert counts.max() <= 8191
+        assert counts.min() >= -8192
+
+
+def test_the_rms_lies_the_backoff_under_full_scale():
+    waveform = small_waveform()
+    noisy = Impairments(radar_snr_db=3.0, leakage=Leakage(10.0))
+    seen = observe(waveform, *two_uavs(50), np.random.default_rng(0), receiver=noisy)
+    adc = Adc(14, 14.0)
+    clean = samples(seen.channels["radar"], seen.noise["radar"])[:, 64:320]
+    counts = digitize(clean, adc, full_scale(seen.channels["radar"], adc)).astype(float)
+    assert 20 * np.log10(counts.std() / 8192) == pytest.approx(-14.0, abs=0.1)
 
 
 def profile_db(transfer):

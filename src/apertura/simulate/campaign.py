@@ -67,9 +67,12 @@ def write_campaign(directory: str | Path, simulation: Simulation, generator: Gen
     shutil.rmtree(beside, ignore_errors=True)
     (beside / "config").mkdir(parents=True)
     (beside / "raw").mkdir()
-    _write_config(beside, simulation)
-    truth = _write_flights(beside, simulation, generator)
-    write_truth(beside / "truth.json", truth)
+    try:
+        _write_config(beside, simulation)
+        write_truth(beside / "truth.json", _write_flights(beside, simulation, generator))
+    except BaseException:
+        shutil.rmtree(beside)
+        raise
     if directory.exists():
         directory.rmdir()
     return beside.rename(directory)

@@ -167,7 +167,10 @@ def fly(simulation: Simulation, flight: Flight, scatterers: Scatterers, generato
     time_s = pulse_times(simulation, flight)
     streams = dict(zip(flight.paths, independent_streams(generator, len(flight.paths)), strict=True))
     rate_hz = simulation.waveform.sample_rate_hz
-    hidden = {name: draw(simulation.node(name).impairments, time_s, rate_hz, streams[name]) for name in flight.paths}
+    hidden = {
+        name: draw(_drawable(simulation.node(name).impairments, flight), time_s, rate_hz, streams[name])
+        for name in flight.paths
+    }
     recorded = {}
     for name in flight.paths:
         node = simulation.node(name)
