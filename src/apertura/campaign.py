@@ -85,7 +85,9 @@ class Campaign:
         """Return what the echo of a pair is made from: stages of its nodes, or recorded phase history."""
         tx, rx = pair.split("-")
         if isinstance(self.settings.waveform, OfdmWaveform):
-            stages = [self.manifest(stage, flight, node) for node in dict.fromkeys((tx, rx)) for stage in ("raw", "track")]
+            stages = [
+                self.manifest(stage, flight, node) for node in dict.fromkeys((tx, rx)) for stage in ("raw", "track")
+            ]
             return [self.settings.waveform.codes, *stages]
         return [path.relative_to(self.root).as_posix() for path in self.raw_files(flight, rx).values()]
 

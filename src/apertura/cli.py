@@ -157,5 +157,3 @@ def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     loaded = Campaign.load(campaign)
     written = steps.export_fused(loaded, flight) if pair == "fused" else steps.export(loaded, flight, pair)
     print(*written, sep="\n")
-
-

@@ -97,7 +97,9 @@ STAGES: Mapping[str, Stage] = {
     ),
     "cube": Stage(
         {
-            "image": Variable(("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN where a pair did not fly"),
+            "image": Variable(
+                ("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN where a pair did not fly"
+            ),
             "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
             "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),
         },

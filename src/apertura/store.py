@@ -134,11 +134,11 @@ def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Win
     wip
         Work in progress, from `writing`.
     empty
-        The stamped stage with `name` as a lazy array, one chunk per window: metadata and coordinates.
+        The stamped stage; of array `name` only shape and dtype count, so it may be a broadcast zero.
     name
         The array that is written tile by tile.
     windows
-        Every tile, aligned with the chunks.
+        Every tile, square but at the edges; the first one's shape is the chunk's.
 
     Notes
     -----
@@ -146,15 +146,24 @@ def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Win
     when its settings, inputs or code differ.
     """
     identity = {key: empty.attrs[key] for key in ("runspec", "inputs", "code_sha256")}
+    tiles = list(windows)
+    side = tuple(part.stop - part.start for part in tiles[0])
     if _attributes(wip) != identity:
         shutil.rmtree(wip, ignore_errors=True)
-        chunks = empty[name].data.chunksize
-        encoding: dict[str, Any] = {name: {"chunks": chunks, "grid_mapping": "spatial_ref"}}
-        empty.to_zarr(wip, mode="w", compute=False, consolidated=False, zarr_format=3, encoding=encoding)
-    side = zarr.open_array(wip / name, mode="r").chunks
+        empty.drop_vars(name).to_zarr(wip, mode="w", consolidated=False, zarr_format=3)
+        array = empty[name]
+        zarr.open_group(wip, mode="r+").create_array(
+            name,
+            shape=array.shape,
+            chunks=side,
+            dtype=array.dtype,
+            fill_value=0,
+            dimension_names=[str(dim) for dim in array.dims],
+            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
+        )
     return [
         window
-        for window in windows
+        for window in tiles
         if not (wip / name / "c" / str(window[0].start // side[0]) / str(window[1].start // side[1])).is_file()
     ]
 

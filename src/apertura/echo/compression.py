@@ -1,13 +1,17 @@
 """Range compression: transfer functions to range profiles, referenced to band centre and cropped to a swath."""
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.signal import get_window
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 
 _PULSES_AT_ONCE = 64
+
+WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
+"""Name → weights of that many subcarriers."""
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:
@@ -16,7 +20,7 @@ def window_weights(name: str, count: int) -> NDArray[np.float64]:
     Parameters
     ----------
     name
-        'none' or a window of scipy.signal without parameters, such as 'hann'.
+        A key of `WINDOWS`.
     count
         Number of subcarriers.
 
@@ -25,7 +29,7 @@ def window_weights(name: str, count: int) -> NDArray[np.float64]:
     >>> window_weights("none", 4)
     array([0.25, 0.25, 0.25, 0.25])
     """
-    weights = np.ones(count) if name == "none" else get_window(name, count, fftbins=False)
+    weights = WINDOWS[name](count)
     return np.asarray(weights / weights.sum())
 
 

@@ -119,7 +119,6 @@ def _one_two_five(value: float) -> float:
     return float(max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9)))
 
 
-
 def swath(
     grid: SceneGrid, tx: NDArray[np.float64], rx: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

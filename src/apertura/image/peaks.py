@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from apertura.image.grid import SceneGrid
 
 PATCH_PX = 64
+
+_NET = np.linspace(-1, 1, 9)
+_PEAK_PX = 1e-4
 
 
 class Patch:
@@ -41,7 +43,7 @@ class Patch:
             np.exp(2j * np.pi * np.multiply.outer(np.asarray(at, np.float64) - first, turns))
             for at, first, turns in zip((row, column), self._first, self._turns, strict=True)
         )
-        return np.asarray(np.einsum("...r,rc,...c->...", down, self._spectrum, right))
+        return np.asarray(((down @ self._spectrum) * right).sum(axis=-1))
 
 
 def _span(at: int, size: int) -> slice:
@@ -95,17 +97,12 @@ def find_peak(image: NDArray[np.complex64], row: int, column: int) -> Peak:
     (30.3, 33.6)
     """
     patch = Patch(image, row, column)
-    fine = np.linspace(-1, 1, 17)
-    rows, columns = np.meshgrid(row + fine, column + fine, indexing="ij")
-    best = np.unravel_index(np.abs(patch.at(rows, columns)).argmax(), rows.shape)
-    start = np.array([rows[best], columns[best]])
-    found = optimize.minimize(
-        lambda at: -abs(patch.at(at[0], at[1])) / abs(patch.at(start[0], start[1])),
-        start,
-        method="Nelder-Mead",
-        options={"initial_simplex": start + 0.1 * np.array([[0, 0], [1, 0], [0, 1]]), "xatol": 1e-4, "fatol": 1e-12},
-    )
-    return Peak(float(found.x[0]), float(found.x[1]), complex(patch.at(found.x[0], found.x[1])))
+    at, reach = np.array([row, column], np.float64), 1.0
+    while reach > _PEAK_PX:
+        rows, columns = np.meshgrid(*(at[:, None] + reach * _NET), indexing="ij")
+        best = np.unravel_index(np.abs(patch.at(rows, columns)).argmax(), rows.shape)
+        at, reach = np.array([rows[best], columns[best]]), reach * (_NET[1] - _NET[0])
+    return Peak(float(at[0]), float(at[1]), complex(patch.at(at[0], at[1])))
 
 
 def brightest(image: NDArray[np.complex64]) -> Peak:

@@ -68,16 +68,12 @@ def _read_meta(path: Path) -> dict[str, Any]:
         validate_schema(meta)
     except Exception as error:  # the library raises jsonschema's, json's and its own errors
         reason = str(getattr(error, "message", error)).splitlines()[0]
-        raise CampaignError(
-            f"not valid SigMF: {reason}", path, "SigMF metadata", "Mend it."
-        ) from error
+        raise CampaignError(f"not valid SigMF: {reason}", path, "SigMF metadata", "Mend it.") from error
     datatype = meta["global"]["core:datatype"]
     if datatype != "ci16_le":
         raise CampaignError(f"core:datatype {datatype}", path, "ci16_le", "Convert the recording.")
     if "core:sample_rate" not in meta["global"] or not meta["captures"]:
-        raise CampaignError(
-            "no core:sample_rate or no captures", path, "both", "One capture segment per trigger."
-        )
+        raise CampaignError("no core:sample_rate or no captures", path, "both", "One capture segment per trigger.")
     return dict(meta)
 
 

@@ -64,8 +64,9 @@ class Recording:
                 expected=f"a channel named {channel!r}",
                 remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
             )
-        prefix, dft = round(waveform.cyclic_prefix_s * waveform.sample_rate_hz), round(
-            waveform.sample_rate_hz / waveform.subcarrier_spacing_hz
+        prefix, dft = (
+            round(waveform.cyclic_prefix_s * waveform.sample_rate_hz),
+            round(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz),
         )
         iq = self.raw.iq.isel(channel=channels.index(channel)).values[pulses]
         if iq.shape[1] < prefix + dft:
@@ -154,7 +155,7 @@ def _ofdm(
         length = np.linalg.norm(tx.antenna("sidelink", tx_time) - rx.antenna("sidelink", rx_time), axis=1)
         beyond_m = beyond_m - rx.settings.path_offset_m.sidelink - length
     carrier_step = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = waveform.carrier_hz + carrier_step * waveform.subcarrier_spacing_hz
+    frequency = np.asarray(waveform.carrier_hz + carrier_step * waveform.subcarrier_spacing_hz, np.float64)
     attrs["pulses"] = {"used": len(rx_time), "dropped": pulses.tx_dropped + pulses.rx_dropped}
     return xr.Dataset(
         {
@@ -163,7 +164,7 @@ def _ofdm(
             "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", rx_time)),
             "transfer": (
                 ("pulse", "subcarrier"),
-                remove_path(transfer, frequency, delay_s=beyond_m / SPEED_OF_LIGHT_M_S),
+                remove_path(transfer, frequency, delay_s=np.asarray(beyond_m / SPEED_OF_LIGHT_M_S)),
             ),
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(rx_time))),

@@ -62,9 +62,7 @@ def _write(campaign: Campaign, path: Path, image: Image, tags: dict[str, str], t
     return path
 
 
-def _fused_report(
-    campaign: Campaign, flight: str, coherent: Image, amplitude: Image, error: float
-) -> dict[str, Any]:
+def _fused_report(campaign: Campaign, flight: str, coherent: Image, amplitude: Image, error: float) -> dict[str, Any]:
     peak = brightest(coherent)
     x, y = ground_position(scene_grid(campaign), peak)
     return {
@@ -88,4 +86,3 @@ def _tags(dataset: xr.Dataset, error_db: float) -> dict[str, str]:
         "APERTURA_VERSION": __version__,
         "APERTURA_ERROR_DB": f"{error_db:.2f}",
     }
-

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import zarr
-from dask.array import zeros as lazy_zeros
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 
@@ -35,7 +34,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     chosen, reason = _engine(processing.engine)
     spectra, profiles = _spectra(echo, processing.window), _profiles(profile)
     empty = stamped(
-        _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign, processing.tile_px),
+        _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
         "image",
         module=__name__,
         parents=[echo, profile],
@@ -93,10 +92,10 @@ def _profiles(profile: xr.Dataset) -> Profiles:
     )
 
 
-def _empty(grid: SceneGrid, pair: str, flags: dict[str, str], name: str, tile_px: int) -> xr.Dataset:
+def _empty(grid: SceneGrid, pair: str, flags: dict[str, str], name: str) -> xr.Dataset:
     wkt = local_crs(name) if grid.crs == LOCAL else grid.crs
     return xr.Dataset(
-        {"image": (("y", "x"), lazy_zeros(grid.shape, chunks=(tile_px, tile_px), dtype=np.complex64))},
+        {"image": (("y", "x"), np.broadcast_to(np.complex64(0), grid.shape))},
         coords={"y": grid.y_m, "x": grid.x_m, "spatial_ref": ((), 0, spatial_reference(wkt, grid.transform))},
         attrs={"frame": "local" if grid.crs == LOCAL else "ecef", "pair": pair, "flags": flags, "quality": {}},
     )
@@ -149,4 +148,3 @@ def _measures(formed: NDArray[np.complex64], spectra: Spectra, grid: SceneGrid) 
             "coherence_factor": coherence_factor(terms[:, 0]),
         },
     }
-

@@ -11,6 +11,7 @@ from apertura.campaign import Campaign
 from apertura.contracts import canonical_json
 from apertura.image.extent import auto_bounds, auto_spacing, utm_crs
 from apertura.image.grid import SceneGrid
+from apertura.settings import Scene
 from apertura.store import open_stage, write_json
 
 PATH = Path("results/scene.json")
@@ -19,25 +20,31 @@ PATH = Path("results/scene.json")
 def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for, with every `auto` settled and why."""
     asked = campaign.settings.scene
-    spacing, bounds, crs = asked.spacing_m, asked.bounds_m, asked.crs
-    chosen: dict[str, str] = {}
-    if "auto" in {spacing, bounds, crs}:
-        tx, rx, frequency, limit = _first_flight(campaign)
-        middle = np.median(np.concatenate([tx, rx]), axis=0)
-        if crs == "auto":
-            crs = utm_crs(middle)
-            chosen["crs"] = "UTM zone of the first image flight"
-        if bounds == "auto":
-            bounds = auto_bounds(tx, rx, crs=crs, height_m=asked.height_m, path_limit_m=limit)
-            chosen["bounds_m"] = "what every pulse of the first image flight sees well (docs/theory.md, eq. 8)"
-        if spacing == "auto":
-            spacing = auto_spacing(tx, rx, frequency, crs=crs, bounds_m=bounds, height_m=asked.height_m)
-            chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
-            bounds = _whole(bounds, spacing) if "bounds_m" in chosen else bounds
-    grid = SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, height_m=asked.height_m)
+    if asked.crs == "auto" or asked.bounds_m == "auto" or asked.spacing_m == "auto":
+        grid, chosen = _settled(campaign, asked)
+    else:
+        grid = SceneGrid.from_bounds(asked.crs, asked.bounds_m, spacing_m=asked.spacing_m, height_m=asked.height_m)
+        chosen = {}
     path = campaign.root / PATH
     write_json(path, {"grid": asdict(grid), "chosen": chosen})
     return path
+
+
+def _settled(campaign: Campaign, asked: Scene) -> tuple[SceneGrid, dict[str, str]]:
+    tx, rx, frequency, limit = _first_flight(campaign)
+    chosen: dict[str, str] = {}
+    crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
+    if crs == "auto":
+        crs = utm_crs(np.median(np.concatenate([tx, rx]), axis=0))
+        chosen["crs"] = "UTM zone of the first image flight"
+    if bounds == "auto":
+        bounds = auto_bounds(tx, rx, crs=crs, height_m=asked.height_m, path_limit_m=limit)
+        chosen["bounds_m"] = "ground that the first image flight sees well (docs/theory.md, eq. 8)"
+    if spacing == "auto":
+        spacing = auto_spacing(tx, rx, frequency, crs=crs, bounds_m=bounds, height_m=asked.height_m)
+        chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
+    whole = bounds if asked.bounds_m != "auto" and asked.spacing_m != "auto" else _whole(bounds, spacing)
+    return SceneGrid.from_bounds(crs, whole, spacing_m=spacing, height_m=asked.height_m), chosen
 
 
 def scene_grid(campaign: Campaign) -> SceneGrid:
@@ -65,5 +72,3 @@ def _whole(bounds: tuple[float, float, float, float], spacing: float) -> tuple[f
     xmin, ymin, xmax, ymax = bounds
     columns, rows = (int(np.ceil(extent / spacing - 1e-9)) for extent in (xmax - xmin, ymax - ymin))
     return (xmin, ymax - rows * spacing, xmin + columns * spacing, ymax)
-
-

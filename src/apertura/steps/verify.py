@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import rasterio
@@ -68,9 +67,9 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
                 "no such file", where=file, expected="a finished campaign", remedy="Run the workflow first."
             )
         with rasterio.open(file) as raster:
-            image, inverse, spacing = raster.read(1), ~raster.transform, raster.transform.a
+            image, west, north, spacing = raster.read(1), raster.bounds.left, raster.bounds.top, raster.transform.a
         for number, target in enumerate(targets):
-            column, row = np.array(inverse * (target["x"], target["y"])) - 0.5
+            row, column = (north - target["y"]) / spacing - 0.5, (target["x"] - west) / spacing - 0.5
             if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
                 continue
             peak = find_peak(image, *_brightest_near(image, row, column, REACH_M / 4 / spacing))
@@ -79,8 +78,15 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
                 cut_through(image, peak, direction=direction, spacing_m=spacing, reach_m=REACH_M)
                 for direction in (along, across)
             ]
-            east, north = (peak.column - column) * spacing, (row - peak.row) * spacing
-            yield Finding(flight.name, name, number, east, north, cuts[0].width_m, cuts[1].width_m)
+            yield Finding(
+                flight.name,
+                name,
+                number,
+                error_east_m=(peak.column - column) * spacing,
+                error_north_m=(row - peak.row) * spacing,
+                cross_range_m=cuts[0].width_m,
+                ground_range_m=cuts[1].width_m,
+            )
 
 
 def _brightest_near(image: NDArray[np.complex64], row: float, column: float, reach: float) -> tuple[int, int]:
@@ -120,7 +126,9 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
 
 
 def _quality(campaign: Campaign) -> Table:
-    table = Table(title="coherence at the brightest target, numerical error against the reference", title_justify="left")
+    table = Table(
+        title="coherence at the brightest target, numerical error against the reference", title_justify="left"
+    )
     for heading in ("flight", "image", "coherence factor", "numerical error", "pulses used", "dropped", "flags"):
         table.add_column(heading)
     for flight in campaign.image_flights:

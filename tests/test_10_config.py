@@ -1,0 +1,92 @@
+"""The config's model, its generated files and what it refuses."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from apertura.campaign import validated
+from apertura.errors import CampaignError
+from apertura.settings import Settings
+from apertura.template import config_schema, config_template, flights_template
+
+ROOT = Path(__file__).parents[1]
+CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}
+
+
+@pytest.mark.parametrize(
+    ("file", "generate"),
+    [("config.yaml", config_template), ("schema.json", config_schema), ("flights.tsv", flights_template)],
+)
+def test_generated_files_are_in_step_with_the_model(file, generate):
+    assert (ROOT / "config" / file).read_text(encoding="utf-8") == generate()
+
+
+def test_the_template_is_a_valid_config_and_comments_every_key():
+    lines = config_template().splitlines()
+    assert validated(yaml.safe_load(config_template()), where="template").campaign == "my_campaign"
+    keys = [number for number, line in enumerate(lines) if re.match(r"\s*[a-z_]+:", line)]
+    uncommented = [lines[n] for n in keys if not lines[n - 1].lstrip().startswith("#")]
+    assert len(keys) > 30
+    assert uncommented == []
+
+
+def test_the_schema_accepts_the_template_and_refuses_a_misspelt_key():
+    import jsonschema
+
+    document = yaml.safe_load(config_template())
+    jsonschema.validate(document, json.loads(config_schema()))
+    document["scene"]["hight_m"] = 1.0
+    with pytest.raises(jsonschema.ValidationError, match="hight_m"):
+        jsonschema.validate(document, json.loads(config_schema()))
+
+
+def test_environment_yml_asks_for_what_pyproject_asks():
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = {name: bound for name, bound in (re.match(r"([\w.-]+)(.*)", d).groups() for d in project["dependencies"])}
+    asked = {CONDA_NAMES.get(name, name): bound for name, bound in asked.items()} | {
+        "python": project["requires-python"]
+    }
+    conda = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    assert {name: bound for name, bound in (re.match(r"([\w.-]+)(.*)", d).groups() for d in conda)} == asked
+
+
+def test_every_requirement_is_locked_by_hash_and_no_registry_is_named():
+    for file in ("all.txt", "uv.txt"):
+        text = (ROOT / "requirements" / file).read_text()
+        pins = re.findall(r"^[\w.-]+==", text, re.M)
+        assert pins
+        assert len(re.findall(r"^[\w.-]+==[^\n]*\\\n\s+--hash=sha256:", text, re.M)) == len(pins)
+        assert "://" not in text
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"symbol_s": 1e-6}, "shorter than the DFT window"),
+        ({"subcarriers": 20000}, "exceed the DFT length"),
+        ({"subcarrier_spacing_hz": 99e3}, "must be an integer"),
+        ({"kind": "chirp"}, "ofdm"),
+    ],
+)
+def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
+    document = yaml.safe_load(config_template())
+    document["waveform"] |= change
+    with pytest.raises(CampaignError, match=expected):
+        validated(document, where="config.yaml")
+
+
+def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
+    """A wing that saw the whole config would rerun for nothing."""
+    everything = Settings.model_json_schema()["properties"]
+    for stage in ("echo", "profile", "image", "scene"):
+        assert set(finished_tiny.relevant(stage, "uav1-uav2")) < {*everything, "window", "sidelink", "accuracy_db"} | {
+            "engine",
+            "tile_px",
+        }
+    assert set(finished_tiny.relevant("echo", "uav1-uav1")["nodes"]) == {"uav1"}
+    assert "window" not in finished_tiny.relevant("echo", "uav1-uav1")

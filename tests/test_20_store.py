@@ -1,0 +1,132 @@
+"""A stage is whole or absent, and says so when it is not what was written."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+from apertura.contracts import STAGES, check, stamp
+from apertura.errors import CampaignError, ContractError
+from apertura.store import finish, manifest_of, open_stage, save_stage, tiles_missing, writing
+
+NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
+
+
+def track():
+    dataset = xr.Dataset(
+        {
+            "time": ("epoch", np.array(["2025-01-01", "2025-01-02"], "datetime64[ns]")),
+            "position": (("epoch", "axis"), np.zeros((2, 3))),
+            "attitude": (("epoch", "axis"), np.full((2, 3), np.nan)),
+        },
+        attrs={"node": "a"},
+    )
+    return stamp(dataset, "track", **NOTHING)
+
+
+def test_a_stage_comes_back_as_it_was_saved(tmp_path):
+    save_stage(track(), tmp_path / "track.zarr")
+    back = open_stage(tmp_path / "track.zarr", "track")
+    xr.testing.assert_identical(back.load(), track())
+    assert back.time.dtype == "datetime64[ns]"
+
+
+def test_a_changed_file_is_named_with_the_manifest_to_delete(tmp_path):
+    save_stage(track(), tmp_path / "track.zarr")
+    chunk = next(path for path in (tmp_path / "track.zarr" / "position" / "c").rglob("*") if path.is_file())
+    chunk.write_bytes(b"x")
+    with pytest.raises(CampaignError, match=r"position/.*track\.manifest\.json and run the workflow again"):
+        open_stage(tmp_path / "track.zarr", "track")
+
+
+def test_a_folder_without_a_manifest_is_not_finished(tmp_path):
+    save_stage(track(), tmp_path / "track.zarr")
+    manifest_of(tmp_path / "track.zarr").unlink()
+    with pytest.raises(CampaignError, match="not finished"):
+        open_stage(tmp_path / "track.zarr", "track")
+
+
+def test_the_same_stage_gives_the_same_manifest(tmp_path):
+    for name in ("a", "b"):
+        save_stage(track(), tmp_path / name / "track.zarr")
+    first, second = ((tmp_path / name / "track.manifest.json").read_bytes() for name in ("a", "b"))
+    assert first == second
+
+
+def test_a_broken_contract_lists_everything_that_is_wrong():
+    wrong = track().drop_vars("time").assign(position=(("axis", "epoch"), np.zeros((3, 2), np.float32)))
+    with pytest.raises(ContractError, match=r"no variable 'time'.*position has dims.*position is float32"):
+        check(wrong, "track")
+
+
+def test_every_stage_says_what_each_variable_means():
+    assert all(variable.meaning for stage in STAGES.values() for variable in stage.variables.values())
+
+
+def empty_image(code="0"):
+    dataset = xr.Dataset(
+        {"image": (("y", "x"), np.broadcast_to(np.complex64(0), (64, 48)))},
+        attrs={"frame": "local", "pair": "a-a", "flags": {}, "quality": {}},
+    )
+    return stamp(dataset, "image", runspec={}, inputs={}, code_sha256=code)
+
+
+WINDOWS = [(slice(r, r + 32), slice(c, min(c + 32, 48))) for r in (0, 32) for c in (0, 32)]
+
+
+def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
+    with writing(tmp_path / "image.zarr") as wip:
+        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == WINDOWS
+        zarr.open_array(wip / "image", mode="r+")[WINDOWS[1]] = 0
+    with writing(tmp_path / "image.zarr") as wip:
+        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == [WINDOWS[0], *WINDOWS[2:]]
+        assert tiles_missing(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
+
+
+def finished_image(folder):
+    with writing(folder) as wip:
+        tiles_missing(wip, empty_image(), "image", WINDOWS)
+        zarr.open_array(wip / "image", mode="r+")[:] = 1
+        finish(wip, folder)
+
+
+def test_a_sealed_stage_whose_record_snakemake_removed_is_not_computed_again(tmp_path):
+    finished_image(tmp_path / "image.zarr")
+    manifest_of(tmp_path / "image.zarr").unlink()
+    with writing(tmp_path / "image.zarr") as wip:
+        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == []
+
+
+def test_a_damaged_stage_is_computed_again(tmp_path):
+    finished_image(tmp_path / "image.zarr")
+    (tmp_path / "image.zarr" / "image" / "c" / "0" / "0").write_bytes(b"x")
+    with writing(tmp_path / "image.zarr") as wip:
+        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == WINDOWS
+
+
+def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
+    with writing(tmp_path / "image.zarr") as wip:
+        tiles_missing(wip, empty_image(), "image", WINDOWS)
+        zarr.open_array(wip / "image", mode="r+")[:] = 1
+        (wip / "image" / "c" / "0" / "0.123.partial").write_bytes(b"half")
+        finish(wip, tmp_path / "image.zarr")
+    files = json.loads(manifest_of(tmp_path / "image.zarr").read_text())["files"]
+    assert not [name for name in files if name.endswith(".partial")]
+
+
+def test_a_second_writer_waits_for_the_first(tmp_path):
+    holder = "from apertura.store import writing\nfrom pathlib import Path\nimport sys, time\n"
+    holder += "with writing(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(1.5)\n"
+    with subprocess.Popen(
+        [sys.executable, "-c", holder, str(tmp_path / "image.zarr")], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "held\n"
+        began = time.monotonic()
+        with writing(tmp_path / "image.zarr"):
+            waited = time.monotonic() - began
+    assert waited > 0.5
