@@ -1,0 +1,238 @@
+"""What a sidelink is like: how far above the noise, with which echoes and which ripple, and in which pulses."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.echo.line_of_sight import (
+    LOCK_FALSE_ALARM,
+    Complexes,
+    Floats,
+    LineOfSight,
+    fit_line_of_sight,
+    phasor,
+)
+from apertura.errors import CampaignError
+
+GATE_CELLS = 16
+"""Half width of the gate, in cells of 1/B around the direct path."""
+
+SECOND_ARRIVAL_DB = -6.0
+"""An arrival this strong beside the direct path is another transmitter, or a reflection as good as one."""
+
+NULL_DB = -20.0
+"""Subcarriers this far below the mean are nulls: divided, they would amplify noise by more than a hundred."""
+
+
+@dataclass(frozen=True)
+class SidelinkState:
+    """What decides which correction a sidelink allows.
+
+    Attributes
+    ----------
+    subcarriers
+        N.
+    snr_db
+        Per subcarrier, median of the locked pulses.
+    echo_db
+        Strongest arrival beside the direct path, relative to it; where `echo_cells` is 0, the level below
+        which none would have been seen.
+    echo_cells
+        Delay of that arrival after the direct path, in cells of 1/B; 0 if none was seen.
+    ripple_db
+        Peak-to-peak ripple of the band that repeats in every pulse and fits into the gate, as of one sinusoid.
+    fine_ripple_db
+        The same for ripple too fine for the gate.
+    null_share
+        Share of the subcarriers below `NULL_DB`.
+    locked
+        (pulse,) bool, whether the direct path stands out of the noise.
+    delay_cells
+        (pulse,) float64, its delay in cells of 1/B; NaN where not locked.
+    flags
+        Edge crossed → what was measured, in one line.
+    """
+
+    subcarriers: int
+    snr_db: float
+    echo_db: float
+    echo_cells: int
+    ripple_db: float
+    fine_ripple_db: float
+    null_share: float
+    locked: NDArray[np.bool_]
+    delay_cells: Floats
+    flags: Mapping[str, str]
+
+
+def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
+    """Measure the sidelink of a flight.
+
+    Parameters
+    ----------
+    sidelink
+        (pulse, subcarrier) complex64, code removed.
+    where
+        What to call the recording in errors.
+
+    Returns
+    -------
+    SidelinkState
+
+    Raises
+    ------
+    CampaignError
+        If no pulse locks.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "State of a sidelink".
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
+    >>> state = measure((10 + noise[0] + 1j * noise[1]).astype(np.complex64))
+    >>> round(state.snr_db), state.echo_cells, state.locked.all()
+    (17, 0, np.True_)
+    """
+    path = fit_line_of_sight(sidelink)
+    if not path.locked.any():
+        return _measure_without_code(sidelink, where)
+    found = _average(sidelink, path)
+    snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
+    echo_db, echo_cells = _strongest_echo(found)
+    ripple_db, fine_ripple_db = _ripple(found)
+    flat = found.spectrum - found.noise * sidelink.shape[1]
+    state = SidelinkState(
+        subcarriers=sidelink.shape[1],
+        snr_db=_db(snr),
+        echo_db=echo_db,
+        echo_cells=echo_cells,
+        ripple_db=ripple_db,
+        fine_ripple_db=fine_ripple_db,
+        # a null is seen only where the noise lies well below it
+        null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
+        locked=path.locked,
+        delay_cells=np.where(path.locked, path.delay_cells, np.nan),
+        flags={},
+    )
+    return replace(state, flags=_flags(state))
+
+
+class _Average(NamedTuple):
+    """The locked pulses of a flight, aligned to a direct path of delay 0 and amplitude 1."""
+
+    pulses: int
+    noise: float  # mean power of the noise in a delay cell of one pulse
+    power: Floats  # (cell,) mean power
+    mean: NDArray[np.complex128]  # (cell,) mean
+    spectrum: Floats  # (subcarrier,) mean power
+    second_cell: int  # typical strongest arrival of a pulse beside the direct path
+    second_power: float
+
+
+def _average(sidelink: Complexes, path: LineOfSight) -> _Average:
+    locked, subcarriers = np.flatnonzero(path.locked), sidelink.shape[1]
+    power, spectrum, mean = np.zeros(subcarriers), np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
+    cells, levels = [], []
+    for first in range(0, locked.size, 64):
+        some = locked[first : first + 64]
+        aligned = sidelink[some] * phasor(path, subcarriers, some).conj() / path.amplitude[some, None]
+        profile = fft.ifft(aligned, axis=1)
+        profile_power = np.abs(profile) ** 2
+        power, mean, spectrum = (
+            power + profile_power.sum(0),
+            mean + profile.sum(0),
+            spectrum + (np.abs(aligned) ** 2).sum(0),
+        )
+        cells.append(profile_power[:, 2:-1].argmax(1) + 2)
+        levels.append(profile_power[:, 2:-1].max(1))
+    level = np.concatenate(levels)
+    typical = int(np.argsort(level)[level.size // 2])
+    noise = float(np.mean(path.noise_power[locked] / path.amplitude[locked] ** 2)) / subcarriers
+    count = locked.size
+    second_cell = int(np.concatenate(cells)[typical])
+    return _Average(count, noise, power / count, mean / count, spectrum / count, second_cell, float(level[typical]))
+
+
+def _strongest_echo(found: _Average) -> tuple[float, int]:
+    """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
+
+    Ripple answers on both sides of the direct path alike, an echo on one; only the excess of one side counts.
+    """
+    cells = np.arange(2, found.power.size - 1)
+    excess = found.power - found.noise
+    one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
+    best = int(np.argmax(one_sided))
+    level, cell = float(one_sided[best]), int(cells[best])
+    seen = 5 * found.noise / np.sqrt(found.pulses)
+    # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
+    highest_noise = found.noise * np.log(found.power.size / LOCK_FALSE_ALARM)
+    if found.second_power > max(4 * found.power[found.second_cell], highest_noise, level):
+        level, cell = found.second_power, found.second_cell
+    if level <= seen:
+        return _db(seen), 0
+    return _db(level), cell if cell < found.power.size / 2 else cell - found.power.size
+
+
+def _ripple(found: _Average) -> tuple[float, float]:
+    """Return peak-to-peak ripple (dB) inside and outside the gate, from paired echoes common to all pulses."""
+    power = np.abs(found.mean / found.mean[0]) ** 2
+    cells = np.arange(1, power.size // 2)
+    noise = found.noise / found.pulses
+    paired = np.minimum(power[cells], power[-cells]) - noise
+    paired[paired < 7 * noise] = 0.0
+    inside = cells <= GATE_CELLS
+    # cos of amplitude a makes two echoes of a/2
+    amplitude = [min(2 * float(np.sqrt(paired[some].sum())), 0.95) for some in (inside, ~inside)]
+    return _peak_to_peak_db(amplitude[0]), _peak_to_peak_db(amplitude[1])
+
+
+def _peak_to_peak_db(amplitude: float) -> float:
+    return float(20 * np.log10((1 + amplitude) / (1 - amplitude)))
+
+
+def _db(power: float) -> float:
+    return float(10 * np.log10(max(power, 1e-30)))
+
+
+def _measure_without_code(sidelink: Complexes, where: str) -> SidelinkState:
+    """Tell a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink at all."""
+    alike = fit_line_of_sight(np.asarray(sidelink[1:] * sidelink[:-1].conj(), np.complex64))
+    if alike.locked.mean() < 0.5 or not alike.locked.size:
+        raise CampaignError(
+            f"a sidelink that locks in none of {len(sidelink)} pulses",
+            where=where,
+            expected="the direct path of the transmitter above the noise",
+            remedy="Check antenna and gain of the sidelink and which channel it was recorded on.",
+        )
+    product = float(np.median((alike.amplitude**2 / np.maximum(alike.noise_power, 1e-30))[alike.locked]))
+    locked = np.zeros(len(sidelink), bool)
+    locked[1:] |= alike.locked
+    locked[:-1] |= alike.locked
+    snr_db = _db(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
+    line = f"the sidelink ({snr_db:.0f} dB) does not carry the given code: monostatic images will not focus"
+    nowhere = np.full(len(sidelink), np.nan)
+    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, 0.0, 0.0, 0.0, locked, nowhere, {"wrong_code": line})
+
+
+def _flags(state: SidelinkState) -> dict[str, str]:
+    flags = {}
+    lost = int((~state.locked).sum())
+    if lost:
+        flags["sidelink_lost"] = f"{lost} of {state.locked.size} pulses dropped: their sidelink does not lock"
+    if state.echo_cells and state.echo_db > SECOND_ARRIVAL_DB:
+        flags["second_arrival"] = (
+            f"a second arrival {state.echo_db:.1f} dB beside the direct path at {state.echo_cells:+d} cells: "
+            "two transmitters at once, or a reflection as strong as the direct path"
+        )
+    if state.null_share:
+        flags["sidelink_nulls"] = (
+            f"{100 * state.null_share:.1f} % of the subcarriers lie {-NULL_DB:.0f} dB below the mean: "
+            "they are attenuated, not divided"
+        )
+    return flags
