@@ -96,6 +96,19 @@ def turned(job: Job, degrees: float) -> Job:
     return replace(job, pixels=grid(len(job.pixels), turned_deg=degrees))
 
 
+def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
+    """Return (pulse, subcarrier) Σ a·exp(-j2πf(path - reference)/c), as other codes read it."""
+    fine, block = np.arange(64), 64 * np.arange(SUBCARRIERS // 64)
+    history = np.zeros((len(reference_path_m), SUBCARRIERS), np.complex128)
+    first_hz = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
+    for place, gain in zip(job.scatterers, job.amplitude, strict=True):
+        path = total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, place[None])
+        turn = -2j * np.pi / C * (path - reference_path_m[:, None])
+        coarse = gain * np.exp(turn * (first_hz + SPACING_HZ * block))
+        history += (coarse[:, :, None] * np.exp(turn * SPACING_HZ * fine)[:, None, :]).reshape(history.shape)
+    return history.astype(np.complex64)
+
+
 def exact(job: Job, places: NDArray[np.float64]) -> NDArray[np.complex128]:
     """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
     wavenumber = 2 * np.pi * CENTRE_HZ / C

@@ -1,0 +1,187 @@
+"""Times every engine on one job in one interleaved run: `make bench`, or `python benchmarks/engines.py`.
+
+Seconds are the median over rounds of the process's CPU time, since other work on the machine stretches the wall
+clock; rounds visit all contestants in turn, so that a slow minute hits all alike. Only the row of two threads is
+wall clock. Tables are a row of their own; fastsar compresses within its call, so its own compression is timed too
+and taken off. Prints a table and writes benchmarks/latest.json.
+"""
+
+import os
+
+os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+
+import argparse
+import importlib.util
+import json
+import statistics
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectra, turned
+
+from apertura.image.engines import native, numba
+
+
+@dataclass
+class Contestant:
+    """One row: what to run, what it makes, and how long it took."""
+
+    name: str
+    geometry: str
+    run: Callable[[], Any]
+    job: Job | None = None
+    clock: Callable[[], float] = time.process_time
+    every: int = 1  # rounds between runs, for slow ones
+    isa: str = ""
+    less: "Contestant | None" = None  # its time is taken off
+    seconds: list[float] = field(default_factory=list)
+    image: Any = None
+
+    def go(self) -> None:
+        """Run once and note the time."""
+        os.environ["APERTURA_ISA"] = self.isa
+        begin = self.clock()
+        self.image = self.run()
+        self.seconds.append(self.clock() - begin)
+
+    def median(self) -> float:
+        """Return median seconds, less those of what does not count."""
+        return statistics.median(self.seconds) - (self.less.median() if self.less else 0.0)
+
+
+def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
+    """Return the compiled engine in each instruction set and geometry."""
+    flat = jobs["bistatic"]
+    found = []
+    for isa in ("avx512", "avx2", "portable"):
+        try:
+            os.environ["APERTURA_ISA"] = isa
+            native.instruction_set()
+        except ValueError:
+            continue
+        found.append(Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable")))
+    fast, linear = found[0].isa, {"oversampling": 10, "degree": 1}
+    found += [Contestant(f"native {fast}", name, former(job), job, isa=fast) for name, job in jobs.items() if job is not flat]
+    found.append(Contestant(f"native {fast}, lines 10x", "bistatic", former(flat, **linear), flat, isa=fast))
+    found.append(Contestant("tables", "bistatic", lambda: native.prepare(flat.profiles), isa=fast))
+    found.append(Contestant(f"native {fast}, wall", "bistatic", former(flat), flat, time.perf_counter, isa=fast))
+    found.append(Contestant(f"native {fast}, two threads", "bistatic", two_threads(flat), flat, time.perf_counter, isa=fast))
+    return found
+
+
+def former(job: Job, **options: int) -> Callable[[], Any]:
+    """Return a call that forms the whole image, tables made beforehand."""
+    tables = native.prepare(job.profiles, **options)
+    return lambda: native.form(tables, job.pixels)
+
+
+def two_threads(job: Job) -> Callable[[], Any]:
+    """Return a call that forms quarters of the image in two threads."""
+    tables, pool = native.prepare(job.profiles), ThreadPoolExecutor(2)
+    tiles = np.array_split(job.pixels, 4)
+    return lambda: np.concatenate(list(pool.map(lambda tile: native.form(tables, tile), tiles)))
+
+
+def numba_contestant(job: Job) -> Contestant:
+    """Return the interpolating engine."""
+    tables = numba.prepare(job.profiles)
+    return Contestant("numba", "bistatic", lambda: numba.form(tables, job.pixels), job, every=4)
+
+
+def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
+    """Return fastsar's bistatic former of points and its exact monostatic former."""
+    import fastsar
+    from fastsar import bp
+
+    middle = job.pixels.mean((0, 1))
+    fmin = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
+    found = []
+    for one, geometry in ((job, "bistatic"), (mono, "monostatic")):
+        tx, rx = one.profiles.tx_position_m - middle, one.profiles.rx_position_m - middle
+        reference = (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2
+        history = spectra(one, 2 * reference)
+        if geometry == "bistatic":
+            compress = Contestant("fastsar compression", geometry, compression(bp, history, 8), every=4)
+            points = one.pixels - middle
+
+            def points_former(s=history, a=tx, b=rx, r=reference, x=points):
+                return fastsar.backproject(s, a, fmin, SPACING_HZ, x, rcv=b, ref=r, backend="cpu", window=False)
+
+            found += [compress, Contestant("fastsar backproject", geometry, points_former, one, every=4, less=compress)]
+        else:
+            rows, columns = one.pixels.shape[:2]
+            exact = fastsar.ExactFormer(
+                tx, fmin, SPACING_HZ, SUBCARRIERS, columns, rows, 0.05, 0.05, backend="cpu", window=False, ref=reference,
+                center=(one.pixels[rows // 2, columns // 2] - middle),
+            )  # fmt: skip
+            compress = Contestant("fastsar compression", geometry, compression(bp, history, 8), every=4)
+            found += [compress, Contestant("fastsar exact cubic", geometry, lambda: exact(history).T, one, every=2, less=compress)]
+    return found
+
+
+def compression(bp: Any, history: np.ndarray, upsample: int) -> Callable[[], None]:
+    """Return a call of fastsar's own range compression, in its own chunks."""
+    length = upsample * history.shape[1]
+
+    def run() -> None:
+        for first in range(0, len(history), 256):
+            bp.range_compress(history[first : first + 256], length)
+
+    return run
+
+
+def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
+    """Return what was measured, one dict per contestant."""
+    best = contestants[0].median()
+    found = []
+    for one in contestants:
+        seconds = one.median()
+        work = None if one.job is None else one.job.pixels[..., 0].size * len(one.job.profiles.samples)
+        found.append(
+            {
+                "name": one.name,
+                "geometry": one.geometry,
+                "seconds": round(seconds, 4),
+                "pixel_pulses_per_s_per_core": None if work is None else float(f"{work / seconds:.3g}"),
+                "error_db": None if one.job is None else round(error_db(one.job, one.image), 1),
+                "ratio_to_native": round(seconds / best, 3),
+                "rounds": len(one.seconds),
+            }
+        )
+    return found
+
+
+def main() -> None:
+    """Run all contestants in turn, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--pulses", type=int, default=1024)
+    asked = parser.parse_args()
+    flat = build(asked.size, asked.pulses)
+    mono = build(asked.size, asked.pulses, bistatic=False)
+    terrain = build(asked.size, asked.pulses, terrain_m=0.1)
+    jobs = {"bistatic": flat, "monostatic": mono, "bistatic, DEM": terrain, "bistatic, turned 30°": turned(flat, 30)}
+    contestants = native_contestants(jobs)
+    contestants.append(numba_contestant(flat))
+    if importlib.util.find_spec("fastsar"):
+        contestants += fastsar_contestants(flat, mono)
+    for turn in range(asked.rounds):
+        for one in contestants:
+            if turn % one.every == 0:
+                one.go()
+    table = rows([replace(one, seconds=one.seconds[min(1, len(one.seconds) - 1) :]) for one in contestants])  # first: warm-up
+    for row in table:
+        rate, error = row["pixel_pulses_per_s_per_core"], row["error_db"]
+        line = f"{row['name']:<28}{row['geometry']:<22}{1e3 * row['seconds']:>10.1f} ms{row['ratio_to_native']:>10.2f} x"
+        print(line + ("" if rate is None else f"{rate:>12.3g} pp/s{error:>8.1f} dB"))
+    Path(__file__).with_name("latest.json").write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()
