@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
+export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 .PHONY: setup demo run test test-slow lint format lock clean
 
@@ -39,7 +40,8 @@ lint: $(SETUP)
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check --quiet Snakefile workflow
 	$(BIN)/lint-imports
-	$(BIN)/python -m apertura.cli lint-workflow
+	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
+	$(BIN)/snakemake --lint --directory build/lint
 
 format: $(SETUP)
 	$(BIN)/ruff check --fix src tests benchmarks

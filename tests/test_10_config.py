@@ -47,12 +47,12 @@ def test_environment_yml_asks_for_what_pyproject_asks():
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = {name: bound for name, bound in (re.match(r"([\w.-]+)(.*)", d).groups() for d in project["dependencies"])}
+    asked = dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in project["dependencies"])
     asked = {CONDA_NAMES.get(name, name): bound for name, bound in asked.items()} | {
         "python": project["requires-python"]
     }
     conda = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
-    assert {name: bound for name, bound in (re.match(r"([\w.-]+)(.*)", d).groups() for d in conda)} == asked
+    assert dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in conda) == asked
 
 
 def test_every_requirement_is_locked_by_hash_and_no_registry_is_named():

@@ -155,7 +155,9 @@ class Processing(Section):
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
     engine: Literal["auto", "numba", "reference"] = Field("auto", description="backprojection engine")
-    sidelink: Literal["auto", "divide"] = Field("auto", description="correction of a secondary node by its sidelink")
+    sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
+        "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+    )
     tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
 
 

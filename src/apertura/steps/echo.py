@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.association import Association, associate
+from apertura.echo.association import Association, associate, detect_wrong_association
 from apertura.echo.demodulate import demodulate, remove_path, subcarrier_numbers
 from apertura.echo.geometry import phase_centres
-from apertura.echo.sidelink import METHODS, choose, measure
+from apertura.echo.sidelink import METHODS, choose, edges, measure
+from apertura.echo.sidelink_state import SidelinkState
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES
 from apertura.provenance import sha256_file
@@ -80,14 +81,14 @@ class Recording:
         return demodulate(iq, numbers=numbers, prefix_samples=prefix, dft_samples=dft)
 
     def antenna(
-        self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: NDArray[np.datetime64]
+        self, name: Literal["radar_tx", "radar_rx", "sidelink"], pulses: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return the ECEF position of an antenna at UTC times, (pulse, 3) float64 metres."""
+        """Return the ECEF position of an antenna at the node's own time tags, (pulse, 3) float64 metres."""
         return phase_centres(
             self.track.time.values,
             self.track.position.values,
             self.track.attitude.values,
-            at=at,
+            at=self.raw.time.values[pulses],
             lever_arm_m=getattr(self.settings.lever_arms_m, name),
             attitude_from=self.settings.attitude,
             where=f"{self.files}.track",
@@ -143,32 +144,57 @@ def _ofdm(
     tx: Recording, rx: Recording, codes: NDArray[np.complex64], waveform: OfdmWaveform, *, sidelink: str
 ) -> xr.Dataset:
     pulses = _pulses(tx, rx, waveform.prf_hz)
-    tx_time, rx_time = tx.raw.time.values[pulses.tx_index], rx.raw.time.values[pulses.rx_index]
-    transfer = rx.symbols("radar", pulses.rx_index, waveform) / codes
-    beyond_m = np.full(len(rx_time), rx.settings.path_offset_m.radar)  # path of an echo beyond tx → scene → rx
-    attrs: dict[str, object] = {"flags": dict(pulses.flags)}
+    tx_index, rx_index = pulses.tx_index, pulses.rx_index
+    flags, attrs = dict(pulses.flags), {}
+    transfer = rx.symbols("radar", rx_index, waveform) / codes
+    beyond_m = np.full(len(rx_index), rx.settings.path_offset_m.radar)  # path of an echo beyond tx → scene → rx
     if tx.name != rx.name:
-        direct = rx.symbols("sidelink", pulses.rx_index, waveform) / codes
-        method, reason = choose(measure(direct)) if sidelink == "auto" else (sidelink, "asked for in config.yaml")
-        transfer = METHODS[method](transfer, direct)
-        attrs["sidelink"] = {"method": method, "reason": reason}
-        length = np.linalg.norm(tx.antenna("sidelink", tx_time) - rx.antenna("sidelink", rx_time), axis=1)
-        beyond_m = beyond_m - rx.settings.path_offset_m.sidelink - length
-    carrier_step = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = np.asarray(waveform.carrier_hz + carrier_step * waveform.subcarrier_spacing_hz, np.float64)
-    attrs["pulses"] = {"used": len(rx_time), "dropped": pulses.tx_dropped + pulses.rx_dropped}
+        direct = rx.symbols("sidelink", rx_index, waveform) / codes
+        length_m = np.linalg.norm(tx.antenna("sidelink", tx_index) - rx.antenna("sidelink", rx_index), axis=1)
+        state = measure(direct, where=f"{rx.files}: sidelink")
+        attrs["sidelink"], crossed = _sidelink_report(state, sidelink, length_m, waveform)
+        flags |= crossed
+        locked = state.locked
+        transfer = METHODS[attrs["sidelink"]["method"]](transfer[locked], direct[locked])
+        beyond_m = (beyond_m - rx.settings.path_offset_m.sidelink - length_m)[locked]
+        tx_index, rx_index = tx_index[locked], rx_index[locked]
+    step = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
+    frequency = np.asarray(waveform.carrier_hz + step * waveform.subcarrier_spacing_hz, np.float64)
+    sent = len(tx.raw.time)
+    attrs |= {"flags": flags, "pulses": {"used": len(rx_index), "dropped": sent - len(rx_index)}}
     return xr.Dataset(
         {
-            "time": ("pulse", tx_time),
-            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", tx_time)),
-            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", rx_time)),
+            "time": ("pulse", tx.raw.time.values[tx_index]),
+            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", tx_index)),
+            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", rx_index)),
             "transfer": (
                 ("pulse", "subcarrier"),
                 remove_path(transfer, frequency, delay_s=np.asarray(beyond_m / SPEED_OF_LIGHT_M_S)),
             ),
             "frequency": ("subcarrier", frequency),
-            "reference_delay": ("pulse", np.zeros(len(rx_time))),
+            "reference_delay": ("pulse", np.zeros(len(rx_index))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
         },
         attrs={"frame": "ecef", "pair": f"{tx.name}-{rx.name}", **attrs},
     )
+
+
+def _sidelink_report(
+    state: SidelinkState, asked: str, length_m: NDArray[np.float64], waveform: OfdmWaveform
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what was chosen and measured, and the edges that were crossed."""
+    method, reason = choose(state) if asked == "auto" else (asked, "asked for in config/config.yaml")
+    cell_m = SPEED_OF_LIGHT_M_S / (waveform.subcarriers * waveform.subcarrier_spacing_hz)
+    wrong = detect_wrong_association(state.delay_cells * cell_m, length_m)
+    lock_rate = float(state.locked.mean())
+    flags = {**state.flags, **edges(method, state)}
+    if wrong:
+        flags["association_suspect"] = wrong
+    report = {
+        "method": method,
+        "reason": reason,
+        "lock_rate": round(lock_rate, 4),
+        "snr_db": round(state.snr_db, 2),
+        "echo_db": round(state.echo_db, 2),
+    }
+    return report, flags

@@ -1,0 +1,121 @@
+"""The workflow as a user runs it: nothing to do twice, nothing lost to a kill, one message for what is wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+PRODUCTS = ("*.tif", "*.png", "*.json", "c/**/*")
+
+
+def snakemake(campaign, *options, **popen):
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    command = [sys.executable, "-m", "snakemake", "--directory", str(campaign), "--cores", "2", *options]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen
+    )
+
+
+def finished(process, timeout=240):
+    output, _ = process.communicate(timeout=timeout)
+    return process.returncode, output
+
+
+def contents(root):
+    """Every product and every chunk, without logs, timings and Snakemake's own records."""
+    results = root / "results"
+    return {
+        path.relative_to(results).as_posix(): path.read_bytes()
+        for path in sorted(results.rglob("*"))
+        if path.is_file() and not path.is_relative_to(results / "logs") and path.suffix != ".tsv"
+    }
+
+
+def larger(root):
+    """Enough tiles that imaging takes a few seconds."""
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["scene"]["spacing_m"] = 0.01
+    document["processing"] = {"tile_px": 64, "engine": "numba"}
+    path.write_text(yaml.safe_dump(document))
+
+
+@pytest.mark.slow
+def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_touches(tiny):
+    code, output = finished(snakemake(tiny))
+    assert code == 0, output
+    code, output = finished(snakemake(tiny, "-n"))
+    assert code == 0
+    assert "Nothing to be done" in output
+    path = tiny / "config" / "config.yaml"
+    path.write_text(path.read_text() + "processing:\n  window: none\n")
+    code, output = finished(snakemake(tiny, "-n"))
+    assert code == 0
+    planned = {line.split()[0] for line in output.split("Job stats:")[1].split("total")[0].splitlines()[3:] if line}
+    assert planned == {"all", "cube", "export", "export_fused", "image", "profile"}
+
+
+def tiles(root):
+    return list((root / "results" / "f01").glob("*/image.zarr.wip/image/c/*/*"))
+
+
+def wait_for_tiles(root, process, count=5, timeout=120):
+    until = time.monotonic() + timeout
+    while len(tiles(root)) < count:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < until, "no tiles"
+        time.sleep(0.02)
+    return len(tiles(root))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole_group", [True, False], ids=["process group", "snakemake alone"])
+def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, tmp_path, whole_group):
+    from conftest import copy_writable
+
+    larger(tiny)
+    unbroken = copy_writable(tiny, tmp_path / "unbroken")
+    code, output = finished(snakemake(unbroken))
+    assert code == 0, output
+
+    process = snakemake(tiny, start_new_session=True)
+    made = wait_for_tiles(tiny, process)
+    if whole_group:
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()
+    process.stdout.close()
+    code, output = finished(snakemake(tiny))
+    assert code == 0, output
+    log = "".join(path.read_text() for path in (tiny / "results" / "logs" / "f01").glob("*.image.log"))
+    formed_again = sum(int(line.split(", ")[1].split()[0]) for line in log.splitlines() if "tiles to form" in line)
+    assert formed_again <= 2 * 100 - made
+    assert contents(tiny) == contents(unbroken)
+    assert not list((tiny / "results").rglob("*.wip"))
+
+
+@pytest.mark.slow
+def test_a_wrong_campaign_ends_with_its_message_and_no_traceback(tiny):
+    (tiny / "raw" / "f01" / "uav2.sigmf-data").unlink()
+    code, output = finished(snakemake(tiny))
+    assert code != 0
+    assert "raw/f01/uav2.sigmf-data: no such file; expected the recording of node uav2" in output
+    assert "Traceback" not in output
+    assert not (tiny / "results").exists()
+
+
+@pytest.mark.slow
+def test_a_failing_step_shows_its_message_in_the_run(tiny):
+    path = tiny / "raw" / "f01" / "uav1.sigmf-data"
+    path.write_bytes(path.read_bytes()[:-4000])
+    code, output = finished(snakemake(tiny))
+    assert code != 0
+    assert "error: raw/f01/uav1.sigmf-meta: capture" in output
+    assert "Traceback" not in output
