@@ -38,7 +38,7 @@ lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks
 	$(BIN)/ruff format --check src tests benchmarks
 	$(BIN)/mypy
-	$(BIN)/snakefmt --check --quiet Snakefile workflow
+	$(BIN)/snakefmt --check Snakefile workflow
 	$(BIN)/lint-imports
 	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
 	$(BIN)/snakemake --lint --directory build/lint
@@ -46,7 +46,7 @@ lint: $(SETUP)
 format: $(SETUP)
 	$(BIN)/ruff check --fix src tests benchmarks
 	$(BIN)/ruff format src tests benchmarks
-	$(BIN)/snakefmt --quiet Snakefile workflow
+	$(BIN)/snakefmt Snakefile workflow
 
 # Needs a registry; the files name none.
 lock: $(SETUP)

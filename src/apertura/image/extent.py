@@ -148,6 +148,7 @@ def swath(
     """
     rows, columns = (np.linspace(0, size - 1, min(size, 33)) for size in grid.shape)
     net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-    apart = grid.spacing_m * np.hypot(*((size - 1) / max(1, min(size, 33) - 1) for size in grid.shape))
+    down, right = ((size - 1) / max(1, min(size, 33) - 1) for size in grid.shape)
+    apart = grid.spacing_m * float(np.hypot(down, right))
     path = sum(np.linalg.norm(net - centre[:, None], axis=-1) for centre in (tx, rx))
     return np.asarray(path.min(axis=1) - apart), np.asarray(path.max(axis=1) + apart)
