@@ -1,8 +1,12 @@
 """The compiled engine against the double sum over pulses and subcarriers, in each instruction set."""
 
 import os
+import shutil
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -375,3 +379,36 @@ def test_no_environment_variable_means_the_best(monkeypatch):
     monkeypatch.delenv("APERTURA_ISA", raising=False)
     assert native.instruction_set() == next(filter(_runs, native.INSTRUCTION_SETS))
     assert "APERTURA_ISA" not in os.environ
+
+
+@pytest.mark.slow
+def test_the_kernel_is_clean_under_sanitizers(tmp_path):
+    cmake, compiler = shutil.which("cmake"), shutil.which("g++")
+    if not (cmake and compiler):
+        pytest.skip("cmake and g++ are needed")
+    root = Path(__file__).parents[1]
+    subprocess.run([cmake, "-S", root, "-B", tmp_path, "-DAPERTURA_SANITIZE=ON"], check=True, capture_output=True)
+    subprocess.run([cmake, "--build", tmp_path, "--parallel", "2"], check=True, capture_output=True)
+    runtime = subprocess.run(
+        [compiler, "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
+    ).stdout
+    environment = {
+        **os.environ,
+        "APERTURA_KERNEL": str(tmp_path / "_backprojection.so"),
+        "LD_PRELOAD": runtime.strip(),
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--noconftest",
+        "-m",
+        "not slow",
+        __file__,
+    ]
+    done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
