@@ -13,11 +13,15 @@ from apertura.echo.compression import compress, range_step, window_weights
 from apertura.image.engines import ENGINES, reference
 from apertura.image.history import Profiles, Spectra
 from apertura.image.peaks import Patch, find_peak, ground_position
-from apertura.image.quality import numerical_error, random_pixels
+from apertura.image.quality import numerical_error
 from apertura.steps import echo
 from apertura.steps.scene import scene_grid
 from apertura.steps.verify import verify
 from apertura.store import open_stage
+
+
+def random_pixels(shape, count, seed):
+    return np.random.default_rng(seed).integers(0, shape, (count, 2)).T
 
 
 def findings(campaign, image):
@@ -124,7 +128,7 @@ def test_the_table_engine_meets_its_error(finished_sample, window, pair):
     start = np.full(len(zeros), 5.0)
     samples = compress(spectra.transfer, frequency, weight=weight, reference_delay_s=zeros, start_m=start, count=500)
     profiles = Profiles(samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, *places)
-    pixels = grid.positions_at(*random_pixels(grid.shape, 256, np.random.default_rng(3)).T)
+    pixels = grid.positions_at(*random_pixels(grid.shape, 256, seed=3))
     engine = ENGINES["numba"]
     computed = engine.form(engine.prepare(profiles), pixels[None])[0]
     assert numerical_error(computed, reference.form(spectra, pixels)).rms_db < -50
@@ -140,7 +144,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     spectra = Spectra(
         dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), *places
     )
-    rows, columns = random_pixels(formed.shape, 200, np.random.default_rng(99)).T
+    rows, columns = random_pixels(formed.shape, 200, seed=99)
     exact = reference.form(spectra, scene_grid(finished_tiny).positions_at(rows, columns))
     found = numerical_error(formed[rows, columns], exact).rms_db
     assert said["numerical_error_db"] == pytest.approx(found, abs=3)

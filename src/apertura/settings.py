@@ -154,7 +154,7 @@ class Processing(Section):
 
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
-    engine: Literal["auto", "numba", "reference"] = Field("auto", description="backprojection engine")
+    engine: Literal["auto", "native", "numba", "reference"] = Field("auto", description="backprojection engine")
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )

@@ -149,23 +149,40 @@ def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Win
     tiles = list(windows)
     side = tuple(part.stop - part.start for part in tiles[0])
     if _attributes(wip) != identity:
-        shutil.rmtree(wip, ignore_errors=True)
-        empty.drop_vars(name).to_zarr(wip, mode="w", consolidated=False, zarr_format=3)
-        array = empty[name]
-        zarr.open_group(wip, mode="r+").create_array(
-            name,
-            shape=array.shape,
-            chunks=side,
-            dtype=array.dtype,
-            fill_value=0,
-            dimension_names=[str(dim) for dim in array.dims],
-            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
-        )
+        lay_out(wip, empty, {name: side})
     return [
         window
         for window in tiles
         if not (wip / name / "c" / str(window[0].start // side[0]) / str(window[1].start // side[1])).is_file()
     ]
+
+
+def lay_out(wip: Path, empty: xr.Dataset, chunks: Mapping[str, tuple[int, ...]]) -> None:
+    """Start `wip` afresh: metadata and coordinates of `empty`, and arrays to be written block by block.
+
+    Parameters
+    ----------
+    wip
+        Work in progress, from `writing`; what is there is thrown away.
+    empty
+        The stamped stage; of the arrays in `chunks` only dims, dtype and attributes count, so they may be broadcast.
+    chunks
+        Array name → shape of its chunks.
+    """
+    shutil.rmtree(wip, ignore_errors=True)
+    empty.drop_vars(list(chunks)).to_zarr(wip, mode="w", consolidated=False, zarr_format=3)
+    group = zarr.open_group(wip, mode="r+")
+    for name, side in chunks.items():
+        array = empty[name]
+        group.create_array(
+            name,
+            shape=array.shape,
+            chunks=side,
+            dtype=array.dtype,
+            fill_value=array.values.flat[0],  # what a block that nobody writes holds
+            dimension_names=[str(dim) for dim in array.dims],
+            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
+        )
 
 
 def _attributes(wip: Path) -> dict[str, Any] | None:

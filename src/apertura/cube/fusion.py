@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def coherent_sum(images: NDArray[np.complex64]) -> NDArray[np.complex64]:
+def coherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:
     """Return the complex mean of peak-normalised images.
 
     Their spectra lie side by side, so the sum resolves finer than either: mono- and bistatic images add in phase
@@ -13,46 +13,43 @@ def coherent_sum(images: NDArray[np.complex64]) -> NDArray[np.complex64]:
     Parameters
     ----------
     images
-        (pair, y, x) complex64 on one grid, carriers kept; a pair that is all NaN is left out.
+        (pair, y, x) complex64 on one grid or a block of it, carriers kept.
+    peaks
+        (pair,) float64, largest magnitude of each whole image.
 
     Returns
     -------
     ndarray
         (y, x) complex64, 1 where every image peaks in phase.
 
+    Raises
+    ------
+    ValueError
+        If an image is empty.
+
     Examples
     --------
-    >>> coherent_sum(np.array([[[2.0, 0.0]], [[4.0j, 0.0]]], np.complex64)).round(3)
+    >>> coherent_sum(np.array([[[2.0, 0.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0])).round(3)
     array([[0.5+0.5j, 0. +0.j ]], dtype=complex64)
     """
-    return np.asarray(_normalised(images).mean(axis=0), np.complex64)
+    return np.asarray(_normalised(images, peaks).mean(axis=0), np.complex64)
 
 
-def noncoherent_sum(images: NDArray[np.complex64]) -> NDArray[np.float32]:
+def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the mean power of peak-normalised images: no gain in resolution, less speckle, no phase to trust.
 
-    Parameters
-    ----------
-    images
-        (pair, y, x) complex64 on one grid.
-
-    Returns
-    -------
-    ndarray
-        (y, x) float32, linear power.
+    Parameters and errors as `coherent_sum`; returns (y, x) float32, linear power.
 
     Examples
     --------
-    >>> noncoherent_sum(np.array([[[2.0, 1.0]], [[4.0j, 0.0]]], np.complex64))
+    >>> noncoherent_sum(np.array([[[2.0, 1.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0]))
     array([[1.   , 0.125]], dtype=float32)
     """
-    power = np.abs(_normalised(images)).astype(np.float64) ** 2
+    power = np.abs(_normalised(images, peaks)).astype(np.float64) ** 2
     return np.asarray(power.mean(axis=0), np.float32)
 
 
-def _normalised(images: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    peaks = np.array([np.nanmax(np.abs(image)) if np.isfinite(image).any() else np.nan for image in images])
-    present = peaks > 0
-    if not present.any():
-        raise ValueError("every image is empty: nothing to add")
-    return np.asarray(images[present] / peaks[present, None, None], np.complex64)
+def _normalised(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:
+    if not (peaks > 0).all():
+        raise ValueError(f"{peaks=}: an empty image adds nothing; leave its pair out")
+    return np.asarray(images / peaks[:, None, None], np.complex64)

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from apertura.image.grid import SceneGrid
+from apertura.image.quality import Raster
 
 PATCH_PX = 64
 
@@ -30,14 +31,14 @@ class Patch:
     real and imaginary parts would not do: the carrier turns by more than a radian per pixel.
     """
 
-    def __init__(self, image: NDArray[np.complex64], row: int, column: int) -> None:
+    def __init__(self, image: Raster, row: int, column: int) -> None:
         rows, columns = (_span(at, size) for at, size in zip((row, column), image.shape, strict=True))
         self._first = np.array([rows.start, columns.start], np.float64)
-        square = np.nan_to_num(image[rows, columns]).astype(np.complex128)
+        square = np.nan_to_num(np.asarray(image[rows, columns])).astype(np.complex128)
         self._spectrum = np.fft.fft2(square, norm="forward")
         self._turns = [_centred(self._spectrum, axis) for axis in (0, 1)]
 
-    def at(self, row: NDArray[np.float64], column: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
         """Return the image at fractional pixels (0-based, of the whole image), complex128 in the shape of `row`."""
         down, right = (
             np.exp(2j * np.pi * np.multiply.outer(np.asarray(at, np.float64) - first, turns))
@@ -78,7 +79,7 @@ class Peak:
     value: complex
 
 
-def find_peak(image: NDArray[np.complex64], row: int, column: int) -> Peak:
+def find_peak(image: Raster, row: int, column: int) -> Peak:
     """Return the maximum of the interpolated magnitude near a pixel.
 
     Parameters
@@ -105,12 +106,6 @@ def find_peak(image: NDArray[np.complex64], row: int, column: int) -> Peak:
     return Peak(float(at[0]), float(at[1]), complex(patch.at(at[0], at[1])))
 
 
-def brightest(image: NDArray[np.complex64]) -> Peak:
-    """Return the refined peak of the brightest pixel."""
-    row, column = np.unravel_index(int(np.nanargmax(np.abs(image))), image.shape)
-    return find_peak(image, int(row), int(column))
-
-
 @dataclass(frozen=True)
 class Cut:
     """One line through a peak.
@@ -129,7 +124,7 @@ class Cut:
 
 
 def cut_through(
-    image: NDArray[np.complex64],
+    image: Raster,
     peak: Peak,
     *,
     direction: tuple[float, float],

@@ -1,9 +1,20 @@
 """How good an image is as a whole: numerical error, entropy, coherence, noise floor."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Raster(Protocol):
+    """A 2-D array that gives numpy blocks: numpy or zarr."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...  # noqa: D102
+
+    def __getitem__(self, window: tuple[slice, slice], /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -20,19 +31,6 @@ class NumericalError:
 
     rms_db: float
     peak_db: float
-
-
-def random_pixels(shape: tuple[int, int], count: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Return (count, 2) rows and columns drawn evenly over an image, without repeats where it is large enough.
-
-    Examples
-    --------
-    >>> random_pixels((2, 2), 256, np.random.default_rng(0)).shape
-    (4, 2)
-    """
-    size = shape[0] * shape[1]
-    chosen = generator.choice(size, min(count, size), replace=False)
-    return np.stack(np.unravel_index(np.sort(chosen), shape), -1)
 
 
 def numerical_error(
@@ -73,17 +71,78 @@ def _ratio_db(amplitude: float, against: float) -> float:
     return float(20 * np.log10(max(amplitude / against, floor))) if against > 0 else 0.0
 
 
-def entropy(image: NDArray[np.complex64]) -> float:
-    """Return the Shannon entropy of the image's power, nats: the lower, the better focused.
+@dataclass(frozen=True)
+class Survey:
+    """What one pass over an image's pixels tells.
+
+    Attributes
+    ----------
+    entropy
+        Shannon entropy −Σ q ln q of the shares q of power, nats: the lower, the better focused.
+    noise_floor_db
+        Median power over peak power, to 0.01 dB: what lies between the targets.
+    peak
+        Largest magnitude.
+    row, column
+        Where it is.
+    """
+
+    entropy: float
+    noise_floor_db: float
+    peak: float
+    row: int
+    column: int
+
+
+_BINS_PER_DB, _LOWEST_DB, _HIGHEST_DB = 100, -300, 300
+
+
+def survey(image: Raster, windows: Iterable[tuple[slice, slice]]) -> Survey:
+    """Return entropy, noise floor and peak of an image, one window at a time.
+
+    Parameters
+    ----------
+    image
+        (y, x) complex64, anything that gives a numpy array for a pair of slices; NaN is left out.
+    windows
+        Windows that cover it once.
+
+    Raises
+    ------
+    ValueError
+        If no pixel has power.
 
     Examples
     --------
-    >>> round(entropy(np.ones((10, 10), np.complex64)), 3)
-    4.605
+    >>> found = survey(np.ones((10, 10), np.complex64), [(slice(0, 5), slice(0, 10)), (slice(5, 10), slice(0, 10))])
+    >>> round(found.entropy, 4), found.peak, found.noise_floor_db
+    (4.6052, 1.0, 0.0)
     """
-    power = np.abs(image[np.isfinite(image)]).astype(np.float64) ** 2
-    share = power[power > 0] / power.sum()
-    return float(-(share * np.log(share)).sum())
+    total = weighted = peak = 0.0
+    place = (0, 0)
+    counts = np.zeros((_HIGHEST_DB - _LOWEST_DB) * _BINS_PER_DB, np.int64)
+    empty = 0
+    for window in windows:
+        block = np.asarray(image[window])
+        power = np.nan_to_num(np.abs(block).astype(np.float64)) ** 2
+        best = int(power.argmax())
+        if power.flat[best] > peak:
+            peak = float(power.flat[best])
+            row, column = np.unravel_index(best, power.shape)
+            place = (window[0].start + int(row), window[1].start + int(column))
+        present = power[power > 0]
+        empty += int(np.isfinite(block).sum()) - present.size
+        total += present.sum()
+        weighted += (present * np.log(present)).sum()
+        bins = np.clip((10 * np.log10(present) - _LOWEST_DB) * _BINS_PER_DB, 0, counts.size - 1)
+        counts += np.bincount(bins.astype(np.int64), minlength=counts.size)
+    if not peak:
+        raise ValueError("no pixel of the image has power")
+    median_bin = int(np.searchsorted(empty + np.cumsum(counts), (empty + counts.sum()) / 2))
+    floor = _LOWEST_DB + median_bin / _BINS_PER_DB - 10 * np.log10(peak)
+    return Survey(
+        float(np.log(total) - weighted / total), min(0.0, round(float(floor), 2)), float(np.sqrt(peak)), *place
+    )
 
 
 def coherence_factor(contributions: NDArray[np.complex128]) -> float:
@@ -100,15 +159,3 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
     """
     energy = len(contributions) * float((np.abs(contributions) ** 2).sum())
     return float(np.round(np.abs(contributions.sum()) ** 2 / energy, 12)) if energy else 0.0
-
-
-def noise_floor_db(image: NDArray[np.complex64]) -> float:
-    """Return the median power over the peak power, dB: what lies between the targets.
-
-    Examples
-    --------
-    >>> round(noise_floor_db(np.array([[1.0, 0.1], [0.1, 0.1]], np.complex64)), 1)
-    -20.0
-    """
-    power = np.abs(image[np.isfinite(image)]).astype(np.float64) ** 2
-    return float(10 * np.log10(np.median(power) / power.max()))

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+import zarr
 
 from apertura.campaign import Campaign
 from apertura.cube.fusion import coherent_sum, noncoherent_sum
+from apertura.steps.scene import scene_grid
 from apertura.steps.stamping import stamped
-from apertura.store import open_stage, save_stage
+from apertura.store import finish, lay_out, open_stage, writing
 
 
 def cube(campaign: Campaign) -> Path:
@@ -20,25 +22,36 @@ def cube(campaign: Campaign) -> Path:
         for flight in flights
         for pair in flight.pairs
     }
+    side = campaign.settings.processing.tile_px
+    folder = campaign.stage("cube")
+    with writing(folder) as wip:
+        empty = _empty(images, [flight.name for flight in flights], pairs)
+        chunks = {"image": (1, 1, side, side), "coherent": (1, side, side), "noncoherent": (1, side, side)}
+        lay_out(wip, stamped(empty, "cube", module=__name__, parents=list(images.values())), chunks)
+        arrays = {name: zarr.open_array(wip / name, mode="r+") for name in chunks}
+        for place, flight in enumerate(flights):
+            present = [images[flight.name, pair] for pair in flight.pairs]
+            peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present])
+            for window in scene_grid(campaign).tiles(side):
+                stack = np.stack([image.image[window].values for image in present])
+                for pair, block in zip(flight.pairs, stack, strict=True):
+                    arrays["image"][place, pairs.index(pair), *window] = block
+                arrays["coherent"][place, *window] = coherent_sum(stack, peaks)
+                arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
+        finish(wip, folder)
+    return folder
+
+
+def _empty(images: dict[tuple[str, str], xr.Dataset], flights: list[str], pairs: list[str]) -> xr.Dataset:
     first = next(iter(images.values()))
-    shape = (len(flights), len(pairs), *first.image.shape)
-    stack = np.full(shape, np.nan + 1j * np.nan, np.complex64)
-    for (flight_name, pair), dataset in images.items():
-        stack[[flight.name for flight in flights].index(flight_name), pairs.index(pair)] = dataset.image.values
-    dataset = xr.Dataset(
+    shape = first.image.shape
+    missing = np.complex64(np.nan + 1j * np.nan)
+    return xr.Dataset(
         {
-            "image": (("flight", "pair", "y", "x"), stack),
-            "coherent": (("flight", "y", "x"), np.stack([coherent_sum(images) for images in stack])),
-            "noncoherent": (("flight", "y", "x"), np.stack([noncoherent_sum(images) for images in stack])),
+            "image": (("flight", "pair", "y", "x"), np.broadcast_to(missing, (len(flights), len(pairs), *shape))),
+            "coherent": (("flight", "y", "x"), np.broadcast_to(np.complex64(0), (len(flights), *shape))),
+            "noncoherent": (("flight", "y", "x"), np.broadcast_to(np.float32(0), (len(flights), *shape))),
         },
         coords={"y": first.y, "x": first.x, "spatial_ref": first.spatial_ref},
-        attrs={"flights": [flight.name for flight in flights], "pairs": pairs},
+        attrs={"flights": flights, "pairs": pairs},
     )
-    folder = campaign.stage("cube")
-    tile = campaign.settings.processing.tile_px
-    save_stage(
-        stamped(dataset, "cube", module=__name__, parents=list(images.values())),
-        folder,
-        chunks={"flight": 1, "pair": 1, "y": tile, "x": tile},
-    )
-    return folder

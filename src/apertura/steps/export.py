@@ -1,5 +1,6 @@
 """Rules of the export wing: rasters and pictures of one image, or of what a flight's images add up to."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,26 @@ from apertura.contracts import canonical_json
 from apertura.export import EXPORTS
 from apertura.geodesy import local_crs
 from apertura.image.grid import LOCAL
-from apertura.image.peaks import brightest, ground_position
-from apertura.image.quality import entropy, noise_floor_db
+from apertura.image.peaks import Patch, find_peak, ground_position
+from apertura.image.quality import Raster, coherence_factor, survey
 from apertura.provenance import chained_sha256, code_sha256
 from apertura.steps.scene import scene_grid
 from apertura.store import open_stage, write_json
 
-Image = NDArray[np.complex64]
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A raster of power as complex amplitudes without phase, block by block."""
+
+    power: xr.DataArray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows, columns."""
+        return self.power.shape
+
+    def __getitem__(self, window: tuple[slice, slice]) -> NDArray[np.complex64]:
+        return np.asarray(np.sqrt(self.power[window].values), np.complex64)
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
@@ -29,32 +43,31 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     tags = _tags(dataset, dataset.attrs["quality"]["numerical_error_db"])
     title = f"{campaign.settings.campaign} · flight {flight} · {pair}"
     folder = campaign.results / flight / pair
-    return [_write(campaign, folder / name, dataset.image.values, tags, title) for name in EXPORTS]
+    return [_write(campaign, folder / name, dataset.image, tags, title) for name in EXPORTS]
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     """Write the coherent and non-coherent sums of a flight's pairs, and image.json; return their paths."""
     dataset = open_stage(campaign.stage("cube"), "cube")
     index = dataset.attrs["flights"].index(flight)
-    coherent = dataset.coherent.values[index]
-    amplitude = np.sqrt(dataset.noncoherent.values[index]).astype(np.complex64)
+    coherent, amplitude = dataset.coherent[index], Amplitude(dataset.noncoherent[index])
     pairs = campaign.flight(flight).pairs
     images = [open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs]
     error = max(image.attrs["quality"]["numerical_error_db"] for image in images)
     tags, folder = _tags(dataset, error), campaign.results / flight / "fused"
     title = f"{campaign.settings.campaign} · flight {flight} · coherent sum of {' + '.join(pairs)}"
-    sums = {"coherent": coherent, "noncoherent": amplitude}
+    sums: dict[str, Raster] = {"coherent": coherent, "noncoherent": amplitude}
     written = [
         _write(campaign, folder / f"{kind}_{name}", sums[kind], tags, title)
         for kind, names in (("coherent", ("slc.tif", "power.tif", "db.tif")), ("noncoherent", ("power.tif", "db.tif")))
         for name in names
     ]
     report = folder / "image.json"
-    write_json(report, _fused_report(campaign, flight, coherent, amplitude, error))
+    write_json(report, _fused_report(campaign, flight, sums, images, error))
     return [*written, _write(campaign, folder / "quicklook.png", coherent, tags, title), report]
 
 
-def _write(campaign: Campaign, path: Path, image: Image, tags: dict[str, str], title: str) -> Path:
+def _write(campaign: Campaign, path: Path, image: Raster, tags: dict[str, str], title: str) -> Path:
     grid = scene_grid(campaign)
     crs = local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs
     product = path.name.removeprefix("coherent_").removeprefix("noncoherent_")
@@ -62,18 +75,34 @@ def _write(campaign: Campaign, path: Path, image: Image, tags: dict[str, str], t
     return path
 
 
-def _fused_report(campaign: Campaign, flight: str, coherent: Image, amplitude: Image, error: float) -> dict[str, Any]:
-    peak = brightest(coherent)
-    x, y = ground_position(scene_grid(campaign), peak)
+def _fused_report(
+    campaign: Campaign, flight: str, sums: dict[str, Raster], images: list[xr.Dataset], error: float
+) -> dict[str, Any]:
+    grid = scene_grid(campaign)
+    windows = list(grid.tiles(campaign.settings.processing.tile_px))
+    found = {kind: survey(layer, windows) for kind, layer in sums.items()}
+    top = found["coherent"]
+    peak = find_peak(sums["coherent"], top.row, top.column)
+    x, y = ground_position(grid, peak)
+    values = [
+        complex(Patch(image.image, top.row, top.column).at(peak.row, peak.column))
+        / image.attrs["quality"]["brightest"]["amplitude"]
+        for image in images
+    ]
     return {
         "flight": flight,
         "pairs": list(campaign.flight(flight).pairs),
         "models": {"fusion": "mean of the peak-normalised images, with and without phase"},
         "numerical_error_db": error,
-        "entropy": {"coherent": round(entropy(coherent), 6), "noncoherent": round(entropy(amplitude), 6)},
-        "noise_floor_db": round(noise_floor_db(coherent), 3),
-        "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},
-        "flags": {},
+        "entropy": {kind: round(layer.entropy, 6) for kind, layer in found.items()},
+        "noise_floor_db": top.noise_floor_db,
+        "brightest": {
+            "x_m": round(x, 4),
+            "y_m": round(y, 4),
+            "amplitude": float(abs(peak.value)),
+            "coherence_factor": coherence_factor(np.array(values)),
+        },
+        "flags": {name: line for image in images for name, line in image.attrs["flags"].items()},
     }
 
 

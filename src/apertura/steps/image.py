@@ -1,6 +1,6 @@
 """Rules of the image wing: a focused image of one pair, with its measured error."""
 
-from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from rasterio.crs import CRS
 
 from apertura.campaign import Campaign
 from apertura.echo.compression import window_weights
+from apertura.errors import CampaignError
 from apertura.geodesy import local_crs
+from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.history import Profiles, Spectra
-from apertura.image.peaks import brightest, ground_position
-from apertura.image.quality import coherence_factor, entropy, noise_floor_db, numerical_error, random_pixels
+from apertura.image.peaks import find_peak, ground_position
+from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import Window, form_tiles
 from apertura.steps.scene import grid_spec, scene_grid
 from apertura.steps.stamping import stamped
@@ -31,42 +33,138 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     folder = campaign.stage("image", flight, pair)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     grid, processing = scene_grid(campaign), campaign.settings.processing
-    chosen, reason = _engine(processing.engine)
-    spectra, profiles = _spectra(echo, processing.window), _profiles(profile)
+    history = {"echo": _spectra(echo, processing.window), "profile": _profiles(profile)}
+    ladder = _ladder(processing.engine)
     empty = stamped(
         _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
         "image",
         module=__name__,
         parents=[echo, profile],
-        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "engine": chosen},
+        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "engine": asdict(ladder[0])},
     )
+    windows = list(grid.tiles(processing.tile_px))
     with writing(folder) as wip:
-        windows = list(grid.tiles(processing.tile_px))
         missing = tiles_missing(wip, empty, "image", windows)
-        print(f"{pair}: engine {chosen}, {len(missing)} of {len(windows)} tiles to form", flush=True)
-        engine = ENGINES[chosen]
-        prepared = engine.prepare({"echo": spectra, "profile": profiles}[engine.reads])
+        print(f"{pair}: {len(missing)} of {len(windows)} tiles to form with {ladder[0].line}", flush=True)
         target = zarr.open_array(wip / "image", mode="r+")
-        form_tiles(_mean(engine.form, prepared, len(echo.pulse)), grid, missing, write=_writer(target), threads=threads)
-        formed = np.asarray(target[:], np.complex64)
+        work = Work(history, grid, target, threads)
+        work.form(ladder[0], missing)
         quality = {
-            "engine": chosen,
-            "models": {"engine": reason, **profile.attrs.get("models", {})},
-            **_certificate(formed, spectra, grid),
-            **_measures(formed, spectra, grid),
+            "engine": ladder[0].engine,
+            "models": {"engine": f"{ladder[0].line}: {ladder[0].reason}"},
+            **_certified(work, windows, ladder, processing.accuracy_db),
+            **_measures(work, windows),
             **{name: echo.attrs[name] for name in ("pulses", "sidelink") if name in echo.attrs},
-            "flags": echo.attrs["flags"],
         }
-        zarr.open_group(wip, mode="r+").attrs["quality"] = quality
+        quality["flags"] = echo.attrs["flags"] | quality.pop("crossed")
+        zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
         write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
         finish(wip, folder)
     return folder
 
 
-def _engine(asked: str) -> tuple[str, str]:
-    if asked != "auto":
-        return asked, "asked for in config/config.yaml"
-    return "numba", "cubic interpolation of an 8× table errs below the accuracy asked"
+@dataclass(frozen=True)
+class Choice:
+    """An engine and how it is set."""
+
+    engine: str
+    options: dict[str, Any]
+    reason: str
+
+    @property
+    def line(self) -> str:
+        """The engine and its options in a few words."""
+        return " ".join([self.engine, *(f"{name}={value}" for name, value in self.options.items())])
+
+
+def _ladder(asked: str) -> list[Choice]:
+    """Return the setting to begin with and the next better ones, for tiles that miss the accuracy asked."""
+    rungs = [
+        Choice("native", {"degree": 2, "oversampling": 6}, "the cheapest that errs below the accuracy asked"),
+        Choice("native", {"degree": 2, "oversampling": 10}, "a finer table"),
+        Choice("numba", {"oversampling": 8}, "no compiled kernel here"),
+        Choice("numba", {"oversampling": 32}, "a finer table and float64 phases"),
+        Choice("reference", {}, "the double sum itself"),
+    ]
+    rungs = [rung for rung in rungs if ENGINES[rung.engine].available()]
+    if asked == "auto":
+        return rungs
+    first = next((rung for rung in rungs if rung.engine == asked), None)
+    if first is None:
+        raise CampaignError(
+            f"engine {asked} was not built when apertura was installed",
+            where="config/config.yaml: processing.engine",
+            expected=f"one of {sorted({rung.engine for rung in rungs})}",
+            remedy="Install with a C++ compiler, or choose another engine.",
+        )
+    return [replace(first, reason="asked for in config/config.yaml"), *rungs[rungs.index(first) + 1 :]]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Everything that forms a tile."""
+
+    history: dict[str, Any]
+    grid: SceneGrid
+    target: Any
+    threads: int
+
+    def form(self, choice: Choice, windows: list[Window]) -> None:
+        """Form and write tiles with an engine; the image is the mean over the pulses."""
+        if not windows:
+            return
+        engine = ENGINES[choice.engine]
+        prepared = engine.prepare(self.history[engine.reads], **choice.options)
+        pulses = np.float32(len(self.history["echo"].transfer))
+
+        def mean(pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
+            return np.asarray(engine.form(prepared, pixels) / pulses, np.complex64)
+
+        form_tiles(mean, self.grid, windows, write=self.target.__setitem__, threads=self.threads)
+
+
+def _certified(work: Work, windows: list[Window], ladder: list[Choice], accuracy_db: float) -> dict[str, Any]:
+    """Measure the error; redo tiles that are worse than asked with the next better settings."""
+    spectra = work.history["echo"]
+    pixels = certified_pixels(work.target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
+    exact = reference.form(spectra, work.grid.positions_at(*pixels.T)) / len(spectra.transfer)
+    certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
+    redone: list[dict[str, Any]] = []
+    for choice in ladder[1:]:
+        uncertified, worse = certificate.failing(work.target, windows, accuracy_db)
+        if not worse:
+            break
+        print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {choice.line}", flush=True)
+        work.form(choice, uncertified)
+        work.form(choice, worse)  # last: as long as one fails, a run that was killed here does all of it again
+        redone.append({"tiles": len(worse) + len(uncertified), "with": choice.line})
+    error = certificate.error(work.target)
+    missed = error.rms_db > accuracy_db
+    line = f"numerical error {error.rms_db:.1f} dB, {accuracy_db:.1f} dB asked"
+    return {
+        "numerical_error_db": round(error.rms_db, 2),
+        "peak_error_db": round(error.peak_db, 2),
+        "certified_pixels": len(pixels),
+        "redone": redone,
+        "crossed": {"accuracy_missed": line} if missed else {},
+    }
+
+
+def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
+    found = survey(work.target, windows)
+    peak = find_peak(work.target, found.row, found.column)
+    x, y = ground_position(work.grid, peak)
+    at = work.grid.positions_at(np.array([peak.row]), np.array([peak.column]))
+    return {
+        "entropy": round(found.entropy, 6),
+        "noise_floor_db": found.noise_floor_db,
+        "brightest": {
+            "x_m": round(x, 4),
+            "y_m": round(y, 4),
+            "amplitude": float(abs(peak.value)),
+            "coherence_factor": coherence_factor(reference.terms(work.history["echo"], at)[:, 0]),
+        },
+    }
 
 
 def _spectra(echo: xr.Dataset, window: str) -> Spectra:
@@ -107,44 +205,4 @@ def spatial_reference(crs: str, transform: tuple[float, ...]) -> dict[str, Any]:
     return {
         "crs_wkt": CRS.from_user_input(crs).to_wkt(),
         "GeoTransform": f"{west} {transform[0]} 0 {north} 0 {transform[4]}",
-    }
-
-
-def _mean(
-    form: Callable[..., NDArray[np.complex64]], prepared: object, pulses: int
-) -> Callable[[NDArray[np.float64]], NDArray[np.complex64]]:
-    return lambda pixels: np.asarray(form(prepared, pixels) / np.float32(pulses), np.complex64)
-
-
-def _writer(target: Any) -> Callable[[Window, NDArray[np.complex64]], None]:
-    def write(window: Window, values: NDArray[np.complex64]) -> None:
-        target[window] = values
-
-    return write
-
-
-def _certificate(formed: NDArray[np.complex64], spectra: Spectra, grid: SceneGrid) -> dict[str, Any]:
-    rows, columns = random_pixels(grid.shape, CERTIFIED_PIXELS, np.random.default_rng(0)).T
-    exact = reference.form(spectra, grid.positions_at(rows, columns)) / len(spectra.transfer)
-    error = numerical_error(formed[rows, columns], exact, peak=float(np.abs(formed).max()))
-    return {
-        "numerical_error_db": round(error.rms_db, 2),
-        "peak_error_db": round(error.peak_db, 2),
-        "certified_pixels": len(rows),
-    }
-
-
-def _measures(formed: NDArray[np.complex64], spectra: Spectra, grid: SceneGrid) -> dict[str, Any]:
-    peak = brightest(formed)
-    x, y = ground_position(grid, peak)
-    terms = reference.terms(spectra, grid.positions_at(np.array([peak.row]), np.array([peak.column])))
-    return {
-        "entropy": round(entropy(formed), 6),
-        "noise_floor_db": round(noise_floor_db(formed), 3),
-        "brightest": {
-            "x_m": round(x, 4),
-            "y_m": round(y, 4),
-            "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(terms[:, 0]),
-        },
     }

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from apertura.image.engines import numba, reference
+from apertura.image.engines import native, numba, reference
 
 
 @dataclass(frozen=True)
@@ -19,14 +19,18 @@ class Engine:
         (prepared, pixels (y, x, 3) float64) → (y, x) complex; releases the GIL, starts no threads.
     reads
         Which history it is given: `Spectra` of the echo, or `Profiles`.
+    available
+        Whether it can run here.
     """
 
     prepare: Callable[..., Any]
     form: Callable[..., Any]
     reads: Literal["echo", "profile"]
+    available: Callable[[], bool] = lambda: True
 
 
 ENGINES = {
     "reference": Engine(reference.prepare, reference.form, "echo"),
     "numba": Engine(numba.prepare, numba.form, "profile"),
+    "native": Engine(native.prepare, native.form, "profile", native.available),
 }

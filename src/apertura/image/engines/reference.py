@@ -1,5 +1,6 @@
 """The double sum over pulses and subcarriers in float64: slow, and what every other engine answers to."""
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,9 +80,21 @@ def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slic
         for centre in (spectra.tx_position_m, spectra.rx_position_m)
     )
     delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[pulses, None]
-    turn = np.exp(2j * np.pi * (step * delay % 1.0))
-    total = np.zeros_like(turn)
-    for subcarrier in range(weighted.shape[1] - 1, -1, -1):
-        total *= turn
-        total += weighted[:, subcarrier, None]
+    total = _polynomial(weighted.astype(np.complex128), np.exp(2j * np.pi * (step * delay % 1.0)))
     return np.asarray(total * np.exp(2j * np.pi * (frequency[0] * delay % 1.0)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
+    """Return Σ_n coefficients[p, n]·argument[p, i]**n, (pulse, pixel): Horner, all pixels of a pulse side by side."""
+    pulses, count = argument.shape
+    real, imag = np.zeros((pulses, count)), np.zeros((pulses, count))
+    for p in range(pulses):
+        z_real, z_imag = argument[p].real.copy(), argument[p].imag.copy()
+        for n in range(coefficients.shape[1] - 1, -1, -1):
+            c_real, c_imag = coefficients[p, n].real, coefficients[p, n].imag
+            for i in range(count):
+                turned = real[p, i] * z_real[i] - imag[p, i] * z_imag[i] + c_real
+                imag[p, i] = real[p, i] * z_imag[i] + imag[p, i] * z_real[i] + c_imag
+                real[p, i] = turned
+    return real + 1j * imag
