@@ -2,13 +2,13 @@
 
 Seconds are the median over rounds of the process's CPU time, since other work on the machine stretches the wall
 clock; rounds visit all contestants in turn, so that a slow minute hits all alike. Two threads count the CPU time of
-the busier one, which is the wall clock of an idle machine. Tables are a row of their own; fastsar compresses within its call, so its own compression is timed too
-and taken off. Prints a table and writes benchmarks/latest.json.
+the busier one, which is the wall clock of an idle machine. Tables are a row of their own; fastsar compresses within
+its call, so its own compression is timed too and taken off. Prints a table and writes benchmarks/latest.json.
 """
 
 import os
 
-os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
 import argparse
 import importlib.util
@@ -116,33 +116,32 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
     import fastsar
     from fastsar import bp
 
+    fmin_hz = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
+    tx, rx, mean, middle = centred(job)
+    history, points = spectra(job, 2 * mean), job.pixels - middle
+    compress = Contestant("fastsar compression", "bistatic", compression(bp, history, 8), every=4)
+    found = [compress]
+
+    def form_points() -> np.ndarray:
+        options = {"rcv": rx, "ref": mean, "backend": "cpu", "window": False}
+        return fastsar.backproject(history, tx, fmin_hz, SPACING_HZ, points, **options)
+
+    found.append(Contestant("fastsar backproject", "bistatic", form_points, job, every=4, less=compress))
+    antenna, _, distance, origin = centred(mono)
+    echoes, (rows, columns) = spectra(mono, 2 * distance), mono.pixels.shape[:2]
+    centre = mono.pixels[rows // 2, columns // 2] - origin
+    options = {"backend": "cpu", "window": False, "ref": distance, "center": centre}
+    exact = fastsar.ExactFormer(antenna, fmin_hz, SPACING_HZ, SUBCARRIERS, columns, rows, 0.05, 0.05, **options)
+    compress = Contestant("fastsar compression", "monostatic", compression(bp, echoes, 8), every=4)
+    former = Contestant("fastsar exact cubic", "monostatic", lambda: exact(echoes).T, mono, every=2, less=compress)
+    return [*found, compress, former]
+
+
+def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return antennas from the scene's middle, their mean distance to it, and the middle."""
     middle = job.pixels.mean((0, 1))
-    fmin = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
-    found = []
-    for one, geometry in ((job, "bistatic"), (mono, "monostatic")):
-        tx, rx = one.profiles.tx_position_m - middle, one.profiles.rx_position_m - middle
-        reference = (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2
-        history = spectra(one, 2 * reference)
-        if geometry == "bistatic":
-            compress = Contestant("fastsar compression", geometry, compression(bp, history, 8), every=4)
-            points = one.pixels - middle
-
-            def points_former(s=history, a=tx, b=rx, r=reference, x=points):
-                return fastsar.backproject(s, a, fmin, SPACING_HZ, x, rcv=b, ref=r, backend="cpu", window=False)
-
-            found += [compress, Contestant("fastsar backproject", geometry, points_former, one, every=4, less=compress)]
-        else:
-            rows, columns = one.pixels.shape[:2]
-            exact = fastsar.ExactFormer(
-                tx, fmin, SPACING_HZ, SUBCARRIERS, columns, rows, 0.05, 0.05, backend="cpu", window=False, ref=reference,
-                center=(one.pixels[rows // 2, columns // 2] - middle),
-            )  # fmt: skip
-            compress = Contestant("fastsar compression", geometry, compression(bp, history, 8), every=4)
-            found += [
-                compress,
-                Contestant("fastsar exact cubic", geometry, lambda: exact(history).T, one, every=2, less=compress),
-            ]
-    return found
+    tx, rx = job.profiles.tx_position_m - middle, job.profiles.rx_position_m - middle
+    return tx, rx, (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2, middle
 
 
 def compression(bp: Any, history: np.ndarray, upsample: int) -> Callable[[], None]:
