@@ -26,7 +26,7 @@ class LineOfSight:
     phase_rad
         (pulse,) float64, phase at the middle of the band.
     amplitude
-        (pulse,) float64, per subcarrier, in the units of the sidelink; noise does not raise it.
+        (pulse,) float64, per subcarrier, in the units of the sidelink.
     noise_power
         (pulse,) float64, per subcarrier.
     locked
@@ -65,8 +65,7 @@ def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
     """
     blocks = [_fit(sidelink[i : i + _PULSES_AT_ONCE]) for i in range(0, len(sidelink), _PULSES_AT_ONCE)]
     delay, phase, amplitude, noise = (np.concatenate(part) for part in zip(*blocks, strict=True))
-    # the highest of ~1.5·N independent samples of noise passes ln(1.5·N/P_fa) times its mean with chance P_fa
-    threshold = np.log(1.5 * sidelink.shape[1] / LOCK_FALSE_ALARM)
+    threshold = _lock_threshold(sidelink.shape[1])
     locked = amplitude**2 > threshold * noise / sidelink.shape[1]
     return LineOfSight(delay, phase, amplitude, noise, locked)
 
@@ -102,3 +101,15 @@ def _fit(sidelink: Complexes) -> tuple[Floats, Floats, Floats, Floats]:
     # the median of an exponential variable is ln 2 of its mean; few strong cells (echoes, ripple) do not move it
     noise = np.median(np.abs(fft.ifft(aligned, axis=1)) ** 2, axis=1) / np.log(2) * subcarriers
     return delay, np.angle(total), np.abs(total), noise
+
+
+def _lock_threshold(subcarriers: int) -> float:
+    """Return how far above the mean noise of a delay cell the highest of pure noise rises once in 1/P_fa pulses.
+
+    |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per 1/B, and there are N of these.
+    """
+    alone = float(np.log(subcarriers / LOCK_FALSE_ALARM))
+    threshold = alone
+    for _ in range(5):
+        threshold = alone + 0.5 * float(np.log(np.pi * threshold / 3))
+    return threshold

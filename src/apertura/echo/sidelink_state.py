@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.stats import gamma
 
 from apertura.echo.line_of_sight import (
     LOCK_FALSE_ALARM,
@@ -169,7 +170,9 @@ def _strongest_echo(found: _Average) -> tuple[float, int]:
     one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
     best = int(np.argmax(one_sided))
     level, cell = float(one_sided[best]), int(cells[best])
-    seen = 5 * found.noise / np.sqrt(found.pulses)
+    # what the highest of N averages of exponential noise passes with the chance of a false lock
+    highest = gamma.isf(LOCK_FALSE_ALARM / found.power.size, found.pulses) / found.pulses
+    seen = found.noise * (float(highest) - 1)
     # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
     highest_noise = found.noise * np.log(found.power.size / LOCK_FALSE_ALARM)
     if found.second_power > max(4 * found.power[found.second_cell], highest_noise, level):
@@ -185,7 +188,7 @@ def _ripple(found: _Average) -> tuple[float, float]:
     cells = np.arange(1, power.size // 2)
     noise = found.noise / found.pulses
     paired = np.minimum(power[cells], power[-cells]) - noise
-    paired[paired < 7 * noise] = 0.0
+    paired[paired < 5 * noise] = 0.0  # the lesser of two exponentials passes 6 times its mean once in 160 000
     inside = cells <= GATE_CELLS
     # cos of amplitude a makes two echoes of a/2
     amplitude = [min(2 * float(np.sqrt(paired[some].sum())), 0.95) for some in (inside, ~inside)]
