@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
@@ -23,13 +23,16 @@ class SceneGrid:
     crs
         What pyproj reads, or 'local' for Cartesian axes without a place on Earth (x east, y north, z up).
     west_m, north_m
-        Outer corner of pixel (0, 0), metres in `crs`.
+        Outer corner of the whole grid, metres in `crs`.
     spacing_m
         Pixel spacing, metres.
     shape
         Rows, columns.
     height_m
         Ground height: ellipsoidal metres, or z of the local frame.
+    first
+        Row and column of pixel (0, 0) in the whole grid: a window counts from the whole grid's corner, so that its
+        coordinates are the whole's to the bit.
 
     Examples
     --------
@@ -46,6 +49,7 @@ class SceneGrid:
     spacing_m: float
     shape: tuple[int, int]
     height_m: float
+    first: tuple[int, int] = (0, 0)
 
     @classmethod
     def from_bounds(
@@ -67,34 +71,40 @@ class SceneGrid:
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
         """[xmin, ymin, xmax, ymax], outer pixel edges."""
-        rows, columns = self.shape
-        south, east = self.north_m - rows * self.spacing_m, self.west_m + columns * self.spacing_m
-        return (self.west_m, south, east, self.north_m)
+        (west, north), (rows, columns) = self._corner, self.shape
+        return (west, north - rows * self.spacing_m, west + columns * self.spacing_m, north)
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
         """Affine coefficients a…f of (column, row) → (x, y), as rasterio takes them."""
-        return (self.spacing_m, 0.0, self.west_m, 0.0, -self.spacing_m, self.north_m)
+        west, north = self._corner
+        return (self.spacing_m, 0.0, west, 0.0, -self.spacing_m, north)
+
+    @property
+    def _corner(self) -> tuple[float, float]:
+        return (self.west_m + self.first[1] * self.spacing_m, self.north_m - self.first[0] * self.spacing_m)
 
     @property
     def x_m(self) -> NDArray[np.float64]:
         """Pixel centres eastward, (column,) float64."""
-        return np.asarray(self.west_m + (np.arange(self.shape[1]) + 0.5) * self.spacing_m, np.float64)
+        return self._easting(np.arange(self.shape[1]))
 
     @property
     def y_m(self) -> NDArray[np.float64]:
         """Pixel centres from north to south, (row,) float64."""
-        return np.asarray(self.north_m - (np.arange(self.shape[0]) + 0.5) * self.spacing_m, np.float64)
+        return self._northing(np.arange(self.shape[0]))
+
+    def _easting(self, column: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray(self.west_m + (np.asarray(column) + self.first[1] + 0.5) * self.spacing_m, np.float64)
+
+    def _northing(self, row: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray(self.north_m - (np.asarray(row) + self.first[0] + 0.5) * self.spacing_m, np.float64)
 
     def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
         """Return the grid of a window of rows and columns, without steps."""
         rows, columns = (range(size)[part] for part, size in zip(window, self.shape, strict=True))
-        return replace(
-            self,
-            west_m=self.west_m + columns.start * self.spacing_m,
-            north_m=self.north_m - rows.start * self.spacing_m,
-            shape=(len(rows), len(columns)),
-        )
+        first = (self.first[0] + rows.start, self.first[1] + columns.start)
+        return replace(self, first=first, shape=(len(rows), len(columns)))
 
     def tiles(self, side_px: int) -> Iterator[tuple[slice, slice]]:
         """Yield the windows of square tiles, row by row; those at the south and east edges may be smaller."""
@@ -116,10 +126,9 @@ class SceneGrid:
         x, y = np.meshgrid(self.x_m, self.y_m)
         return self._place(x, y)
 
-    def positions_at(self, row: NDArray[np.float64], column: NDArray[np.float64]) -> NDArray[np.float64]:
+    def positions_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
         """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre."""
-        x = self.west_m + (np.asarray(column, np.float64) + 0.5) * self.spacing_m
-        return self._place(x, self.north_m - (np.asarray(row, np.float64) + 0.5) * self.spacing_m)
+        return self._place(self._easting(column), self._northing(row))
 
     def _place(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         height = np.full_like(x, self.height_m)

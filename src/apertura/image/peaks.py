@@ -194,7 +194,5 @@ def _width(line: NDArray[np.float64], middle: int) -> float:
 
 def ground_position(grid: SceneGrid, peak: Peak) -> tuple[float, float]:
     """Return easting and northing (m, in the grid's CRS) of a peak."""
-    return (
-        grid.west_m + (peak.column + 0.5) * grid.spacing_m,
-        grid.north_m - (peak.row + 0.5) * grid.spacing_m,
-    )
+    west, _, _, north = grid.bounds_m
+    return (west + (peak.column + 0.5) * grid.spacing_m, north - (peak.row + 0.5) * grid.spacing_m)

@@ -21,7 +21,7 @@ def form_tiles(
     *,
     write: Callable[[Window, NDArray[np.complex64]], None],
     threads: int,
-    seconds_between_reports: float = 1.0,
+    seconds_between_reports: float = 0.25,
 ) -> None:
     """Form each window of `grid` and write it as soon as it is done.
 

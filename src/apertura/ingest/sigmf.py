@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,9 @@ def read_sigmf(meta_path: Path, data_path: Path, *, node: str) -> xr.Dataset:
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
-        validate_schema(meta)
+        with warnings.catch_warnings():  # the library warns of extensions that are used but not declared
+            warnings.simplefilter("ignore", DeprecationWarning)
+            validate_schema(meta)
     except Exception as error:  # the library raises jsonschema's, json's and its own errors
         reason = str(getattr(error, "message", error)).splitlines()[0]
         raise CampaignError(f"not valid SigMF: {reason}", path, "SigMF metadata", "Mend it.") from error

@@ -50,7 +50,7 @@ def _settled(campaign: Campaign, asked: Scene) -> tuple[SceneGrid, dict[str, str
 def scene_grid(campaign: Campaign) -> SceneGrid:
     """Return the grid of results/scene.json."""
     found = json.loads((campaign.root / PATH).read_text(encoding="utf-8"))["grid"]
-    return SceneGrid(**{**found, "shape": tuple(found["shape"])})
+    return SceneGrid(**{**found, "shape": tuple(found["shape"]), "first": tuple(found["first"])})
 
 
 def grid_spec(grid: SceneGrid) -> str:
