@@ -1,0 +1,180 @@
+"""Closed forms of the source paper: waveform, clocks, timing, resolution and coherence.
+
+Every claim that follows from parameters alone is computed here; what needs an image is measured elsewhere.
+Source of all: the paper's equations as DESIGN section 4 settles them, unless a function says otherwise.
+"""
+
+import numpy as np
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+
+HALF_POWER_OF_SINC = 0.886
+"""−3 dB width of |sinc(x)|²."""
+
+HALF_POWER_OF_HANN = 1.441
+"""−3 dB width of the response of a Hann window, in the same unit 1/B.
+
+Source: F. J. Harris, "On the use of windows for harmonic analysis with the DFT", Proc. IEEE 66 (1978), table I.
+"""
+
+
+def bandwidth_hz(subcarriers: int, subcarrier_spacing_hz: float) -> float:
+    """Return B = N·Δf.
+
+    Examples
+    --------
+    >>> bandwidth_hz(4096, 100e3)
+    409600000.0
+    """
+    return subcarriers * subcarrier_spacing_hz
+
+
+def duty_cycle(symbol_s: float, cyclic_prefix_s: float, prf_hz: float) -> float:
+    """Return γ = (T + T_cp)·f_prf, the share of the time that is recorded.
+
+    Examples
+    --------
+    >>> round(100 * duty_cycle(12.5e-6, 3.125e-6, 100.0), 6)
+    0.15625
+    """
+    return (symbol_s + cyclic_prefix_s) * prf_hz
+
+
+def data_rate_bit_s(sample_rate_hz: float, bits: int, duty: float) -> float:
+    """Return the mean rate 2·f_s·ν·γ of complex samples, I and Q of ν bits each.
+
+    Examples
+    --------
+    >>> round(data_rate_bit_s(1.024e9, 14, 0.0015625))
+    44800000
+    """
+    return 2 * sample_rate_hz * bits * duty
+
+
+def sfo_limit_hz(sample_rate_hz: float, bandwidth_hz: float, symbol_s: float) -> float:
+    """Return f_s(1 − 1/(1 + 1/(BT))): the last subcarrier drifts by one turn over the symbol.
+
+    Examples
+    --------
+    >>> round(sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6))
+    199961
+    """
+    return sample_rate_hz * (1 - 1 / (1 + 1 / (bandwidth_hz * symbol_s)))
+
+
+def cfo_limit_hz(subcarrier_spacing_hz: float) -> float:
+    """Return Δf/10, which costs 20·lg sinc(0.1) = −0.14 dB.
+
+    Examples
+    --------
+    >>> cfo_limit_hz(100e3)
+    10000.0
+    """
+    return subcarrier_spacing_hz / 10
+
+
+def ppm(offset_hz: float, of_hz: float) -> float:
+    """Return an offset in parts per million of a frequency.
+
+    Examples
+    --------
+    >>> round(ppm(10e3, 1.2e9), 2)
+    8.33
+    """
+    return 1e6 * offset_hz / of_hz
+
+
+def timing_requirement_s(range_error_m: float) -> float:
+    """Return 2δR/c: the timing error that displaces an echo as a one-way range error does.
+
+    Examples
+    --------
+    >>> round(timing_requirement_s(0.02) * 1e12, 1)
+    133.4
+    """
+    return 2 * range_error_m / SPEED_OF_LIGHT_M_S
+
+
+def association_requirement_s(prf_hz: float) -> float:
+    """Return 1/f_prf: the error of a time tag that takes a pulse for its neighbour.
+
+    Examples
+    --------
+    >>> association_requirement_s(100.0)
+    0.01
+    """
+    return 1 / prf_hz
+
+
+def time_tag_requirement_s(range_error_m: float, speed_m_s: float) -> float:
+    """Return 2δR/v: the error of a time tag that displaces a platform by twice the range error.
+
+    Examples
+    --------
+    >>> time_tag_requirement_s(0.02, 10.0)
+    0.004
+    """
+    return 2 * range_error_m / speed_m_s
+
+
+def effective_chirp_bandwidth_hz(bandwidth_hz: float, symbol_s: float, delay_spread_s: float) -> float:
+    """Return B(T − Δt_max)/T: what a dechirped pulse keeps of its band for the farthest echo; OFDM keeps all.
+
+    Examples
+    --------
+    >>> effective_chirp_bandwidth_hz(409.6e6, 12.5e-6, 3.125e-6)
+    307200000.0
+    """
+    return bandwidth_hz * (symbol_s - delay_spread_s) / symbol_s
+
+
+def ground_range_resolution_m(
+    bandwidth_hz: float, ground_range_m: float, height_m: float, *, half_power: float = HALF_POWER_OF_SINC
+) -> float:
+    """Return half_power·c/2B·R/r_g, the −3 dB width on the ground abreast of the track.
+
+    Examples
+    --------
+    >>> [round(100 * ground_range_resolution_m(409.6e6, r, 10.0), 1) for r in (5.0, 25.0)]
+    [72.5, 34.9]
+    """
+    slant_m = np.hypot(ground_range_m, height_m)
+    return float(half_power * SPEED_OF_LIGHT_M_S / (2 * bandwidth_hz) * slant_m / ground_range_m)
+
+
+def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture_m: float) -> float:
+    """Return 0.886·λR/2L, the −3 dB width along the track of a short aperture.
+
+    Examples
+    --------
+    >>> round(100 * cross_range_resolution_m(1.40475e9, 12.51, 3.4), 1)
+    34.8
+    """
+    wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
+    return HALF_POWER_OF_SINC * wavelength_m * slant_range_m / (2 * aperture_m)
+
+
+def expected_coherence_factor(snr: float, pulses: int) -> float:
+    """Return E|Σs|²/(M·E Σ|s|²) of M equal echoes in white noise: (SNR + 1/M)/(SNR + 1), 1/M without echo.
+
+    Notes
+    -----
+    Source: docs/theory/study.md, "Coherence factor".
+
+    Examples
+    --------
+    >>> round(expected_coherence_factor(70.0, 200), 3), expected_coherence_factor(0.0, 200)
+    (0.986, 0.005)
+    """
+    return (snr + 1 / pulses) / (snr + 1)
+
+
+def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
+    """Return the power SNR of one compressed pulse at which `expected_coherence_factor` is `coherence`.
+
+    Examples
+    --------
+    >>> [round(10 * float(np.log10(snr_of_coherence_factor(g, 200))), 1) for g in (0.986, 0.9995, 0.9999)]
+    [18.5, 33.0, 40.0]
+    """
+    return (coherence - 1 / pulses) / (1 - coherence)
