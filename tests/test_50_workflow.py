@@ -99,7 +99,7 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
     code, output = finished(snakemake(tiny))
     assert code == 0, output
     log = "".join(path.read_text() for path in (tiny / "results" / "logs" / "f01").glob("*.image.log"))
-    formed_again = sum(int(line.split(", ")[1].split()[0]) for line in log.splitlines() if "tiles to form" in line)
+    formed_again = sum(int(line.split(": ")[1].split()[0]) for line in log.splitlines() if "tiles to form" in line)
     assert formed_again <= 2 * 100 - made
     assert contents(tiny) == unbroken
     assert not list((tiny / "results").rglob("*.wip"))
