@@ -132,7 +132,8 @@ def decide_clock(offset: ClockOffset, waveform: Waveform, *, accuracy_db: float)
     """
     floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, waveform)
     sfo_std_ppm = offset.cfo_std_hz / waveform.carrier_hz * 1e6 if offset.one_clock else offset.sfo_std_ppm
-    left_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, waveform)
+    unknown = not np.isfinite(offset.cfo_std_hz)
+    left_db = 0.0 if unknown else interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, waveform)
     correct = floor_db > max(accuracy_db, left_db)
     what = "samples corrected" if correct else "left alone"
     reason = (
@@ -167,7 +168,7 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, waveform: Waveform) -> 
     -48.0
     """
     off_bin = (cfo_hz + waveform.numbers * waveform.spacing_hz * sfo_ppm * 1e-6) / waveform.spacing_hz
-    lost = float(np.mean(1 - np.sinc(np.clip(off_bin, -1000, 1000)) ** 2))  # clipped: an unknown clock is infinite
+    lost = float(np.mean(1 - np.sinc(off_bin) ** 2))
     return float(10 * np.log10(max(2 * lost / waveform.numbers.size, 1e-30)))
 
 
