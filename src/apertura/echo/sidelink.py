@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.echo.line_of_sight import Complexes, LineOfSight, fit_line_of_sight, phasor
-from apertura.echo.sidelink_state import GATE_CELLS, NULL_DB, SidelinkState, measure
+from apertura.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 
 DIVIDE_SNR_DB = 10.0
 WIENER_SNR_DB = 6.0
-ECHO_DB = -20.0
 RIPPLE_DB = 0.5
 FIT_SNR_DB = 13.4
 """Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""

@@ -22,6 +22,9 @@ from apertura.errors import CampaignError
 GATE_CELLS = 16
 """Half width of the gate, in cells of 1/B around the direct path."""
 
+ECHO_DB = -20.0
+"""Ghosts this far below the image are tolerated; an echo of the sidelink makes one as strong as itself."""
+
 SECOND_ARRIVAL_DB = -6.0
 """An arrival this strong beside the direct path is another transmitter, or a reflection as good as one."""
 
@@ -106,7 +109,8 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     found = _average(sidelink, path)
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
     echo_db, echo_cells = _strongest_echo(found)
-    ripple_db, fine_ripple_db = _ripple(found)
+    # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
+    ripple_db, fine_ripple_db = _ripple(found, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB))
     flat = found.spectrum - found.noise * sidelink.shape[1]
     state = SidelinkState(
         subcarriers=sidelink.shape[1],
@@ -182,17 +186,22 @@ def _strongest_echo(found: _Average) -> tuple[float, int]:
     return _db(level), cell if cell < found.power.size / 2 else cell - found.power.size
 
 
-def _ripple(found: _Average) -> tuple[float, float]:
-    """Return peak-to-peak ripple (dB) inside and outside the gate, from paired echoes common to all pulses."""
+def _ripple(found: _Average, *, one_sided: bool) -> tuple[float, float]:
+    """Return peak-to-peak ripple (dB) inside and outside the gate, from echoes that all pulses have in common.
+
+    cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
+    inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
+    """
     power = np.abs(found.mean / found.mean[0]) ** 2
     cells = np.arange(1, power.size // 2)
     noise = found.noise / found.pulses
-    paired = np.minimum(power[cells], power[-cells]) - noise
-    paired[paired < 5 * noise] = 0.0  # the lesser of two exponentials passes 6 times its mean once in 160 000
+    sides = np.stack([power[cells], power[-cells]]) - noise
+    single = np.sqrt(np.where(sides > 9 * noise, sides, 0.0)).sum(0)
+    paired = np.sqrt(np.where(sides.min(0) > 5 * noise, sides.min(0), 0.0)) * 2
     inside = cells <= GATE_CELLS
-    # cos of amplitude a makes two echoes of a/2
-    amplitude = [min(2 * float(np.sqrt(paired[some].sum())), 0.95) for some in (inside, ~inside)]
-    return _peak_to_peak_db(amplitude[0]), _peak_to_peak_db(amplitude[1])
+    amplitudes = (single if one_sided else paired)[inside], paired[~inside]
+    coarse, fine = (min(float(np.sqrt((amplitude**2).sum())), 0.95) for amplitude in amplitudes)
+    return _peak_to_peak_db(coarse), _peak_to_peak_db(fine)
 
 
 def _peak_to_peak_db(amplitude: float) -> float:
