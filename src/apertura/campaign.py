@@ -1,37 +1,18 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
-import csv
 import difflib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from apertura.errors import CampaignError
-from apertura.settings import Name, OfdmWaveform, Settings
+from apertura.flights import FLIGHTS, Flight, read_flights
+from apertura.settings import OfdmWaveform, Settings
 
 CONFIG = Path("config/config.yaml")
-FLIGHTS = Path("config/flights.tsv")
-_COLUMNS = ["flight", "kind", "transmitter", "nodes"]
-_NAME: TypeAdapter[str] = TypeAdapter(Name)
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One line of flights.tsv."""
-
-    name: str
-    kind: str
-    transmitter: str
-    nodes: tuple[str, ...]
-
-    @property
-    def pairs(self) -> tuple[str, ...]:
-        """Transmitter-receiver names, as folders are named."""
-        return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
 
 
 @dataclass(frozen=True)
@@ -55,7 +36,7 @@ class Campaign:
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
         root = Path(root)
         settings = _read_settings(root / CONFIG)
-        return cls(root, settings, tuple(_read_flights(root / FLIGHTS, settings)))
+        return cls(root, settings, tuple(read_flights(root / FLIGHTS, nodes=settings.nodes)))
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
@@ -117,10 +98,14 @@ class Campaign:
         settings = self.settings.model_dump(mode="json")
         processing, nodes = settings["processing"], {name: settings["nodes"][name] for name in pair.split("-") if name}
         chosen: dict[str, dict[str, Any]] = {
-            "echo": {"waveform": settings["waveform"], "nodes": nodes, "sidelink": processing["sidelink"]},
+            "echo": {
+                "waveform": settings["waveform"],
+                "nodes": nodes,
+                **{key: processing[key] for key in ("sidelink", "accuracy_db")},
+            },
             "scene": {"scene": settings["scene"]},
             "profile": {"window": processing["window"]},
-            "image": {name: processing[name] for name in ("accuracy_db", "engine", "tile_px")},
+            "image": {name: value for name, value in processing.items() if name not in {"window", "sidelink"}},
         }
         return chosen.get(stage, {})
 
@@ -242,58 +227,3 @@ def _walk_keys(schema: object) -> set[str]:
     nested = set().union(*map(_walk_keys, schema.values()))
     properties = schema.get("properties", {})
     return nested | set(properties) if isinstance(properties, dict) else nested
-
-
-def _read_flights(path: Path, settings: Settings) -> Iterator[Flight]:
-    if not path.is_file():
-        raise CampaignError(
-            "no such file",
-            where=path,
-            expected=f"a tab-separated table {_COLUMNS}",
-            remedy="Write one line per flight.",
-        )
-    with path.open(encoding="utf-8", newline="") as lines:
-        table = csv.DictReader(lines, delimiter="\t")
-        if table.fieldnames is None or [name.strip() for name in table.fieldnames] != _COLUMNS:
-            raise CampaignError(
-                f"columns {table.fieldnames}", where=path, expected=f"{_COLUMNS}, tab-separated", remedy="Mend line 1."
-            )
-        seen: set[str] = set()
-        for number, row in enumerate(table, start=2):
-            flight = _flight(row, settings, where=f"{path}: line {number}")
-            if flight.name in seen:
-                raise CampaignError(
-                    f"flight {flight.name} a second time",
-                    where=f"{path}: line {number}",
-                    expected="each flight once",
-                    remedy="Join the lines or rename one flight.",
-                )
-            seen.add(flight.name)
-            yield flight
-    if not seen:
-        raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
-
-
-def _flight(row: dict[str, str | None], settings: Settings, *, where: str) -> Flight:
-    cells = {key: (value or "").strip() for key, value in row.items() if key in _COLUMNS}
-    nodes = tuple(name.strip() for name in cells["nodes"].split(",") if name.strip())
-    problem = None
-    try:
-        _NAME.validate_python(cells["flight"])
-    except ValidationError as error:
-        problem = error.errors()[0]["msg"].removeprefix("Value error, ")
-    if cells["kind"] not in {"image", "calibration"}:
-        problem = f"kind {cells['kind']!r} is neither image nor calibration"
-    unknown = [name for name in (cells["transmitter"], *nodes) if name not in settings.nodes]
-    if unknown:
-        problem = f"node {unknown[0]!r} is not in {CONFIG}: nodes"
-    if not nodes or len(set(nodes)) != len(nodes):
-        problem = f"nodes {cells['nodes']!r} are none or doubled"
-    if problem:
-        raise CampaignError(
-            problem,
-            where=where,
-            expected=f"flight, image|calibration, a transmitter and nodes among {sorted(settings.nodes)}",
-            remedy="Mend the line.",
-        )
-    return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)

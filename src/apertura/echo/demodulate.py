@@ -23,14 +23,14 @@ def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
 
 
 def demodulate(
-    iq: NDArray[np.int16], *, numbers: NDArray[np.int64], prefix_samples: int, dft_samples: int
+    captures: NDArray[np.complex64], *, numbers: NDArray[np.int64], prefix_samples: int, dft_samples: int
 ) -> NDArray[np.complex64]:
     """Return the received code symbols c_n·H_n of captures.
 
     Parameters
     ----------
-    iq
-        (pulse, sample, 2) int16 ADC counts; sample 0 is the start of the cyclic prefix.
+    captures
+        (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
     numbers
         (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier.
     prefix_samples
@@ -54,19 +54,18 @@ def demodulate(
 
     Examples
     --------
-    >>> phase = 2 * np.pi * 3 * np.arange(16) / 16
-    >>> tone = np.stack([1000 * np.cos(phase), 1000 * np.sin(phase)], -1).round().astype(np.int16)
+    >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(16) / 16).astype(np.complex64)
     >>> symbols = demodulate(tone[None], numbers=np.arange(8), prefix_samples=0, dft_samples=16)
     >>> abs(symbols[0]).round().astype(int).tolist()
     [0, 0, 0, 1000, 0, 0, 0, 0]
     """
-    pulses, samples, _ = iq.shape
+    pulses, samples = captures.shape
     if samples < prefix_samples + dft_samples:
         raise ValueError(f"{samples=}: a capture needs {prefix_samples + dft_samples} (prefix and DFT window)")
     symbols = np.empty((pulses, len(numbers)), np.complex64)
     for first in range(0, pulses, _PULSES_AT_ONCE):
-        block = iq[first : first + _PULSES_AT_ONCE, prefix_samples : prefix_samples + dft_samples].astype(np.float32)
-        spectrum = fft.fft(block[..., 0] + 1j * block[..., 1], axis=1, norm="forward")
+        block = captures[first : first + _PULSES_AT_ONCE, prefix_samples : prefix_samples + dft_samples]
+        spectrum = fft.fft(block, axis=1, norm="forward")
         symbols[first : first + len(block)] = spectrum[:, numbers % dft_samples]
     return symbols
 

@@ -1,8 +1,7 @@
 """Rule `echo`: recordings and tracks of a pair become calibrated transfer functions and phase centres."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,16 +10,19 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association, associate, detect_wrong_association
-from apertura.echo.demodulate import demodulate, remove_path, subcarrier_numbers
-from apertura.echo.geometry import phase_centres
+from apertura.echo.captures import CODE_SIGMA, SATURATED_SHARE, code_contrast_sigma, saturated_share
+from apertura.echo.clock import decide_clock, estimate_clock
+from apertura.echo.demodulate import remove_path
+from apertura.echo.resampling import Waveform, correct_clock
 from apertura.echo.sidelink import METHODS, choose, edges, measure
 from apertura.echo.sidelink_state import SidelinkState
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES
 from apertura.provenance import sha256_file
-from apertura.settings import Node, OfdmWaveform, PhaseHistoryWaveform
+from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
+from apertura.steps.recording import Recording, open_recording
 from apertura.steps.stamping import stamped
-from apertura.store import open_stage, save_stage
+from apertura.store import save_stage
 
 
 def echo(campaign: Campaign, flight: str, pair: str) -> Path:
@@ -34,80 +36,14 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     else:
         files = [campaign.root / waveform.codes]
         codes = _read_codes(files[0], waveform.subcarriers)
-        recordings = {node: _open(campaign, flight, node, waveform) for node in {tx, rx}}
+        recordings = {node: open_recording(campaign, flight, node, waveform) for node in {tx, rx}}
         parents = [stage for node in recordings.values() for stage in (node.raw, node.track)]
-        sidelink = campaign.settings.processing.sidelink
-        dataset = _ofdm(recordings[tx], recordings[rx], codes, waveform, sidelink=sidelink)
+        dataset = _ofdm(recordings[tx], recordings[rx], codes, waveform, campaign.settings.processing)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
     relevant = campaign.relevant("echo", pair)
     folder = campaign.stage("echo", flight, pair)
     save_stage(stamped(dataset, "echo", module=__name__, parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What one node recorded in one flight."""
-
-    name: str
-    raw: xr.Dataset
-    track: xr.Dataset
-    settings: Node
-    files: Path
-
-    def symbols(self, channel: str, pulses: NDArray[np.int64], waveform: OfdmWaveform) -> NDArray[np.complex64]:
-        """Return the code symbols received on a channel, (pulse, subcarrier) complex64."""
-        channels = self.raw.attrs["channels"]
-        if channel not in channels:
-            raise CampaignError(
-                f"channels {channels}",
-                where=f"{self.files}.sigmf-meta: apertura:channels",
-                expected=f"a channel named {channel!r}",
-                remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
-            )
-        prefix, dft = (
-            round(waveform.cyclic_prefix_s * waveform.sample_rate_hz),
-            round(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz),
-        )
-        iq = self.raw.iq.isel(channel=channels.index(channel)).values[pulses]
-        if iq.shape[1] < prefix + dft:
-            raise CampaignError(
-                f"captures of {iq.shape[1]} samples",
-                where=f"{self.files}.sigmf-meta",
-                expected=f"at least {prefix + dft}: cyclic prefix and one period of 1/subcarrier_spacing_hz",
-                remedy="Correct the waveform in config/config.yaml or record longer captures.",
-            )
-        numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-        return demodulate(iq, numbers=numbers, prefix_samples=prefix, dft_samples=dft)
-
-    def antenna(
-        self, name: Literal["radar_tx", "radar_rx", "sidelink"], pulses: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        """Return the ECEF position of an antenna at the node's own time tags, (pulse, 3) float64 metres."""
-        return phase_centres(
-            self.track.time.values,
-            self.track.position.values,
-            self.track.attitude.values,
-            at=self.raw.time.values[pulses],
-            lever_arm_m=getattr(self.settings.lever_arms_m, name),
-            attitude_from=self.settings.attitude,
-            where=f"{self.files}.track",
-        )
-
-
-def _open(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Recording:
-    raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
-    files = Path("raw") / flight / node
-    for key, found in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
-        asked = getattr(waveform, key)
-        if abs(found - asked) > 1e-9 * asked:
-            raise CampaignError(
-                f"recorded with {key} {found:.6f}",
-                where=f"{files}.sigmf-meta",
-                expected=f"{asked:.6f}, as config/config.yaml: waveform.{key}",
-                remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
-            )
-    return Recording(node, raw, track, campaign.settings.nodes[node], files)
 
 
 def _read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
@@ -141,25 +77,31 @@ def _pulses(tx: Recording, rx: Recording, prf_hz: float) -> Association:
 
 
 def _ofdm(
-    tx: Recording, rx: Recording, codes: NDArray[np.complex64], waveform: OfdmWaveform, *, sidelink: str
+    tx: Recording, rx: Recording, codes: NDArray[np.complex64], waveform: OfdmWaveform, processing: Processing
 ) -> xr.Dataset:
     pulses = _pulses(tx, rx, waveform.prf_hz)
     tx_index, rx_index = pulses.tx_index, pulses.rx_index
-    flags, attrs = dict(pulses.flags), {}
-    transfer = rx.symbols("radar", rx_index, waveform) / codes
+    symbol = round((waveform.cyclic_prefix_s + waveform.symbol_s) * waveform.sample_rate_hz)
+    iq = {name: rx.captures(name, rx_index) for name in (["radar"] if tx.name == rx.name else ["radar", "sidelink"])}
+    flags, attrs = {**pulses.flags, **_saturation(iq)}, {}
+    captured = {name: _complex(samples[:, :symbol]) for name, samples in iq.items()}
     beyond_m = np.full(len(rx_index), rx.settings.path_offset_m.radar)  # path of an echo beyond tx → scene → rx
-    if tx.name != rx.name:
-        direct = rx.symbols("sidelink", rx_index, waveform) / codes
+    if tx.name == rx.name:
+        transfer = rx.symbols(captured["radar"]) / codes
+        flags |= _code_fits(transfer, waveform)
+    else:
+        captured, attrs["clock"], crossed = _clock_corrected(captured, rx.waveform, processing.accuracy_db)
+        flags |= crossed
+        transfer, direct = (rx.symbols(captured[name]) / codes for name in ("radar", "sidelink"))
         length_m = np.linalg.norm(tx.antenna("sidelink", tx_index) - rx.antenna("sidelink", rx_index), axis=1)
         state = measure(direct, where=f"{rx.files}: sidelink")
-        attrs["sidelink"], crossed = _sidelink_report(state, sidelink, length_m, waveform)
+        attrs["sidelink"], crossed = _sidelink_report(state, processing.sidelink, length_m, waveform)
         flags |= crossed
         locked = state.locked
         transfer = METHODS[attrs["sidelink"]["method"]](transfer[locked], direct[locked])
         beyond_m = (beyond_m - rx.settings.path_offset_m.sidelink - length_m)[locked]
         tx_index, rx_index = tx_index[locked], rx_index[locked]
-    step = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = np.asarray(waveform.carrier_hz + step * waveform.subcarrier_spacing_hz, np.float64)
+    frequency = np.asarray(waveform.carrier_hz + rx.waveform.numbers * waveform.subcarrier_spacing_hz, np.float64)
     sent = len(tx.raw.time)
     attrs |= {"flags": flags, "pulses": {"used": len(rx_index), "dropped": sent - len(rx_index)}}
     return xr.Dataset(
@@ -177,6 +119,47 @@ def _ofdm(
         },
         attrs={"frame": "ecef", "pair": f"{tx.name}-{rx.name}", **attrs},
     )
+
+
+def _complex(iq: NDArray[np.int16]) -> NDArray[np.complex64]:
+    return np.ascontiguousarray(iq, np.float32).view(np.complex64)[..., 0]
+
+
+def _saturation(iq: dict[str, NDArray[np.int16]]) -> dict[str, str]:
+    shares = {name: saturated_share(samples) for name, samples in iq.items()}
+    return {
+        f"saturated_{name}": f"{100 * share:.2f} % of the samples of channel {name} sit at the converter's end stops"
+        for name, share in shares.items()
+        if share > SATURATED_SHARE
+    }
+
+
+def _code_fits(transfer: NDArray[np.complex64], waveform: OfdmWaveform) -> dict[str, str]:
+    bandwidth_hz = waveform.subcarriers * waveform.subcarrier_spacing_hz
+    found = code_contrast_sigma(transfer, prefix_cells=round(waveform.cyclic_prefix_s * bandwidth_hz))
+    if found >= CODE_SIGMA:
+        return {}
+    line = f"energy inside the prefix stands {found:.1f} σ out of an even spread, {CODE_SIGMA} σ expected: "
+    return {"code_unconfirmed": line + "the codes file is wrong, or no echo rises above the noise"}
+
+
+def _clock_corrected(
+    captured: dict[str, NDArray[np.complex64]], waveform: Waveform, accuracy_db: float
+) -> tuple[dict[str, NDArray[np.complex64]], dict[str, Any], dict[str, str]]:
+    """Correct the receiver's clock in the samples where it matters; return also what was found, and flags."""
+    try:
+        clock = estimate_clock(captured["sidelink"], waveform)
+    except ValueError as error:
+        return captured, {"corrected": False, "reason": str(error)}, {"clock_unmeasured": str(error)}
+    decision = decide_clock(clock, waveform, accuracy_db=accuracy_db)
+    report = {"corrected": decision.correct, "reason": decision.reason, "floor_db": round(decision.floor_db, 2)}
+    if decision.correct:
+        cfo_hz = clock.cfo_of_pulses_hz(len(captured["sidelink"]))
+        captured = {
+            name: correct_clock(samples, waveform, cfo_hz=cfo_hz, sfo_ppm=clock.sfo_ppm)
+            for name, samples in captured.items()
+        }
+    return captured, report, dict(decision.flags)
 
 
 def _sidelink_report(

@@ -54,7 +54,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "models": {"engine": f"{ladder[0].line}: {ladder[0].reason}"},
             **_certified(work, windows, ladder, processing.accuracy_db),
             **_measures(work, windows),
-            **{name: echo.attrs[name] for name in ("pulses", "sidelink") if name in echo.attrs},
+            **{name: echo.attrs[name] for name in ("pulses", "sidelink", "clock") if name in echo.attrs},
         }
         quality["flags"] = echo.attrs["flags"] | quality.pop("crossed")
         zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})

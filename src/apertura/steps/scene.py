@@ -21,7 +21,7 @@ def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for, with every `auto` settled and why."""
     asked = campaign.settings.scene
     if asked.crs == "auto" or asked.bounds_m == "auto" or asked.spacing_m == "auto":
-        grid, chosen = _settled(campaign, asked)
+        grid, chosen = settle(asked, *_first_flight(campaign))
     else:
         grid = SceneGrid.from_bounds(asked.crs, asked.bounds_m, spacing_m=asked.spacing_m, height_m=asked.height_m)
         chosen = {}
@@ -30,18 +30,36 @@ def scene(campaign: Campaign) -> Path:
     return path
 
 
-def _settled(campaign: Campaign, asked: Scene) -> tuple[SceneGrid, dict[str, str]]:
-    tx, rx, frequency, limit = _first_flight(campaign)
+def settle(
+    asked: Scene,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    frequency_hz: NDArray[np.float64],
+    path_limit_m: float,
+) -> tuple[SceneGrid, dict[str, str]]:
+    """Return the grid that is asked for, every `auto` settled from a flight's phase centres, and why.
+
+    Parameters
+    ----------
+    asked
+        Section `scene` of the config.
+    tx, rx
+        (pulse, 3) float64 phase centres, metres, ECEF or the local frame.
+    frequency_hz
+        (subcarrier,) float64.
+    path_limit_m
+        Longest total path inside the cyclic prefix, metres.
+    """
     chosen: dict[str, str] = {}
     crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
     if crs == "auto":
         crs = utm_crs(np.median(np.concatenate([tx, rx]), axis=0))
         chosen["crs"] = "UTM zone of the first image flight"
     if bounds == "auto":
-        bounds = auto_bounds(tx, rx, crs=crs, height_m=asked.height_m, path_limit_m=limit)
+        bounds = auto_bounds(tx, rx, crs=crs, height_m=asked.height_m, path_limit_m=path_limit_m)
         chosen["bounds_m"] = "ground that the first image flight sees well (docs/theory.md, eq. 8)"
     if spacing == "auto":
-        spacing = auto_spacing(tx, rx, frequency, crs=crs, bounds_m=bounds, height_m=asked.height_m)
+        spacing = auto_spacing(tx, rx, frequency_hz, crs=crs, bounds_m=bounds, height_m=asked.height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
     whole = bounds if asked.bounds_m != "auto" and asked.spacing_m != "auto" else _whole(bounds, spacing)
     return SceneGrid.from_bounds(crs, whole, spacing_m=spacing, height_m=asked.height_m), chosen

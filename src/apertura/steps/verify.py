@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from apertura.campaign import Campaign, Flight
+from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.flights import Flight
 from apertura.geodesy import projected_from_ecef
 from apertura.image.grid import LOCAL
 from apertura.image.peaks import cut_through, find_peak

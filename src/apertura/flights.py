@@ -1,0 +1,99 @@
+"""config/flights.tsv: one line per flight."""
+
+import csv
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from apertura.errors import CampaignError
+from apertura.settings import Name
+
+FLIGHTS = Path("config/flights.tsv")
+_COLUMNS = ["flight", "kind", "transmitter", "nodes"]
+_NAME: TypeAdapter[str] = TypeAdapter(Name)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One line of flights.tsv."""
+
+    name: str
+    kind: str
+    transmitter: str
+    nodes: tuple[str, ...]
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Transmitter-receiver names, as folders are named."""
+        return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
+
+
+def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
+    """Yield the flights of a flights.tsv.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, kind, transmitter, nodes.
+    nodes
+        Names that config/config.yaml knows.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    if not path.is_file():
+        raise CampaignError(
+            "no such file",
+            where=path,
+            expected=f"a tab-separated table {_COLUMNS}",
+            remedy="Write one line per flight.",
+        )
+    with path.open(encoding="utf-8", newline="") as lines:
+        table = csv.DictReader(lines, delimiter="\t")
+        if table.fieldnames is None or [name.strip() for name in table.fieldnames] != _COLUMNS:
+            raise CampaignError(
+                f"columns {table.fieldnames}", where=path, expected=f"{_COLUMNS}, tab-separated", remedy="Mend line 1."
+            )
+        seen: set[str] = set()
+        for number, row in enumerate(table, start=2):
+            flight = _flight(row, nodes, where=f"{path}: line {number}")
+            if flight.name in seen:
+                raise CampaignError(
+                    f"flight {flight.name} a second time",
+                    where=f"{path}: line {number}",
+                    expected="each flight once",
+                    remedy="Join the lines or rename one flight.",
+                )
+            seen.add(flight.name)
+            yield flight
+    if not seen:
+        raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
+
+
+def _flight(row: dict[str, str | None], known: Collection[str], *, where: str) -> Flight:
+    cells = {key: (value or "").strip() for key, value in row.items() if key in _COLUMNS}
+    nodes = tuple(name.strip() for name in cells["nodes"].split(",") if name.strip())
+    problem = None
+    try:
+        _NAME.validate_python(cells["flight"])
+    except ValidationError as error:
+        problem = error.errors()[0]["msg"].removeprefix("Value error, ")
+    if cells["kind"] not in {"image", "calibration"}:
+        problem = f"kind {cells['kind']!r} is neither image nor calibration"
+    unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
+    if unknown:
+        problem = f"node {unknown[0]!r} is not in config/config.yaml: nodes"
+    if not nodes or len(set(nodes)) != len(nodes):
+        problem = f"nodes {cells['nodes']!r} are none or doubled"
+    if problem:
+        raise CampaignError(
+            problem,
+            where=where,
+            expected=f"flight, image|calibration, a transmitter and nodes among {sorted(known)}",
+            remedy="Mend the line.",
+        )
+    return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)

@@ -1,0 +1,154 @@
+"""Each failure edge raises its flag in the product, and only beyond the edge: recordings with one impairment each."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_41_bad_input import complaint, edit_config, ingest_all
+
+from apertura.campaign import Campaign
+from apertura.simulate.campaign import write_campaign
+from apertura.simulate.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag
+from apertura.simulate.plan import grid_around
+from apertura.simulate.presets import DEMO_ORIGIN, tandem
+from apertura.steps import echo, image, profile, scene
+from apertura.store import open_stage
+
+
+def flown(folder, node="uav2", *, pulses=40, **impairments):
+    """A tandem flight whose one node has other impairments; its echo stages made."""
+    generator = np.random.default_rng(11)
+    plan = replace(tandem(generator, pulses=pulses), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
+    nodes = tuple(
+        replace(each, impairments=replace(each.impairments, **impairments)) if each.name == node else each
+        for each in plan.nodes
+    )
+    campaign = Campaign.load(write_campaign(folder / "campaign", replace(plan, nodes=nodes), generator))
+    ingest_all(campaign)
+    return campaign
+
+
+def echo_of(campaign, pair="uav1-uav2"):
+    echo.echo(campaign, "f01", pair)
+    return open_stage(campaign.stage("echo", "f01", pair), "echo")
+
+
+def test_an_undisturbed_flight_raises_no_flag(tmp_path):
+    campaign = flown(tmp_path)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        dataset = echo_of(campaign, pair)
+        assert dataset.attrs["flags"] == {}
+    assert dataset.attrs["sidelink"]["method"] == "divide"
+    assert dataset.attrs["sidelink"]["lock_rate"] == 1.0
+    assert dataset.attrs["clock"]["corrected"] is False
+
+
+@pytest.mark.parametrize(("backoff_db", "flagged"), [(4.0, True), (14.0, False)])
+def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
+    flags = echo_of(flown(tmp_path, adc=Adc(backoff_db=backoff_db))).attrs["flags"]
+    assert ("saturated_radar" in flags) is flagged
+    assert ("saturated_sidelink" in flags) is flagged
+
+
+@pytest.mark.parametrize(
+    ("snr_db", "method", "noisy"),
+    [(30.0, "divide", False), (8.0, "wiener", False), (-5.0, "gated", False), (-14.0, "two_parameter", False)],
+)
+def test_auto_takes_the_cheapest_adequate_correction(tmp_path, snr_db, method, noisy):
+    attrs = echo_of(flown(tmp_path, sidelink_snr_db=snr_db)).attrs
+    assert attrs["sidelink"]["method"] in {method, "two_parameter"}
+    assert float(attrs["sidelink"]["reason"].split()[1]) == pytest.approx(snr_db, abs=0.5)
+    assert ("sidelink_noisy" in attrs["flags"]) is noisy
+
+
+@pytest.mark.parametrize(("snr_db", "flagged"), [(8.0, True), (12.0, False)])
+def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, flagged):
+    campaign = flown(tmp_path, sidelink_snr_db=snr_db)
+    edit_config(campaign.root, lambda document: document.update(processing={"sidelink": "divide"}))
+    attrs = echo_of(Campaign.load(campaign.root)).attrs
+    assert attrs["sidelink"]["method"] == "divide"
+    assert ("sidelink_noisy" in attrs["flags"]) is flagged
+
+
+@pytest.mark.parametrize(("amplitude", "flagged"), [(0.3, True), (0.03, False)])
+def test_an_echo_in_the_sidelink_is_flagged_where_division_is_asked_for(tmp_path, amplitude, flagged):
+    campaign = flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=amplitude),))
+    edit_config(campaign.root, lambda document: document.update(processing={"sidelink": "divide"}))
+    assert ("sidelink_echo" in echo_of(Campaign.load(campaign.root)).attrs["flags"]) is flagged
+
+
+def test_auto_avoids_ghosts_of_an_echo_in_the_sidelink(tmp_path):
+    attrs = echo_of(flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=0.3),))).attrs
+    assert attrs["sidelink"]["method"] == "two_parameter"
+
+
+def test_ripple_of_the_transmitter_keeps_the_division(tmp_path):
+    attrs = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(1.0, 5e-9))).attrs
+    assert attrs["sidelink"]["method"] == "divide"
+    assert attrs["flags"] == {}
+
+
+def test_pulses_without_sidelink_are_dropped_counted_and_flagged(tmp_path):
+    dataset = echo_of(flown(tmp_path, sidelink_blockage=Blockage(0.3, mean_pulses=5)))
+    lost = dataset.attrs["flags"]["sidelink_lost"]
+    rate = dataset.attrs["sidelink"]["lock_rate"]
+    assert 0.4 < rate < 0.95
+    assert int(lost.split()[0]) == round((1 - rate) * int(lost.split()[2]))
+    assert len(dataset.pulse) == dataset.attrs["pulses"]["used"]
+    assert len(dataset.pulse) < 38
+
+
+def test_a_sidelink_that_never_locks_is_refused(tmp_path):
+    campaign = flown(tmp_path, sidelink_snr_db=-60.0)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
+    assert "uav2: sidelink" in message
+
+
+@pytest.mark.parametrize(("ppm", "corrected"), [(8.0, True), (0.5, False)])
+def test_a_clock_is_corrected_in_the_samples_only_where_it_matters(tmp_path, ppm, corrected):
+    clock = Clock(cfo_hz=ppm * 1200.0, sfo_hz=ppm * 1024.0)
+    attrs = echo_of(flown(tmp_path, clock=clock)).attrs
+    assert attrs["clock"]["corrected"] is corrected
+    assert float(attrs["clock"]["reason"].split()[1]) == pytest.approx(ppm, abs=0.1)
+
+
+def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
+    campaign = flown(tmp_path)
+    codes = np.load(campaign.root / "raw" / "codes.npy")
+    assert "code_unconfirmed" not in echo_of(campaign, "uav1-uav1").attrs["flags"]
+    np.save(campaign.root / "raw" / "codes.npy", np.random.default_rng(3).permutation(codes))
+    assert "code_unconfirmed" in echo_of(campaign, "uav1-uav1").attrs["flags"]
+
+
+@pytest.mark.parametrize(("offset_s", "flagged"), [(22e-3, True), (4e-3, False)])
+def test_a_tag_offset_near_half_an_interval_is_flagged(tmp_path, offset_s, flagged):
+    flags = echo_of(flown(tmp_path, time_tag=TimeTag(offset_s=offset_s))).attrs["flags"]
+    assert ("association_ambiguous" in flags) is flagged
+
+
+def test_flags_reach_image_json(tmp_path):
+    campaign = flown(tmp_path, adc=Adc(backoff_db=4.0))
+    dataset = echo_of(campaign)
+    scene.scene(campaign)
+    profile.profile(campaign, "f01", "uav1-uav2")
+    image.image(campaign, "f01", "uav1-uav2")
+    report = json.loads((campaign.results / "f01" / "uav1-uav2" / "image.json").read_text())
+    assert report["flags"] == dataset.attrs["flags"] != {}
+    assert report["sidelink"]["lock_rate"] == 1.0
+    assert report["clock"]["corrected"] is False
+
+
+def test_an_accuracy_no_engine_meets_is_flagged(tmp_path):
+    campaign = flown(tmp_path)
+    edit_config(
+        campaign.root, lambda document: document.update(processing={"engine": "reference", "accuracy_db": -120})
+    )
+    campaign = Campaign.load(campaign.root)
+    echo.echo(campaign, "f01", "uav1-uav1")
+    scene.scene(campaign)
+    profile.profile(campaign, "f01", "uav1-uav1")
+    image.image(campaign, "f01", "uav1-uav1", threads=2)
+    report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
+    assert report["numerical_error_db"] < -110
+    assert ("accuracy_missed" in report["flags"]) is (report["numerical_error_db"] > -120)
