@@ -9,7 +9,7 @@ import yaml
 
 from apertura.campaign import validated
 from apertura.errors import CampaignError
-from apertura.settings import Settings
+from apertura.settings import Processing, Settings
 from apertura.template import config_schema, config_template, flights_template
 
 ROOT = Path(__file__).parents[1]
@@ -82,11 +82,9 @@ def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
 
 def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
     """A wing that saw the whole config would rerun for nothing."""
-    everything = Settings.model_json_schema()["properties"]
+    everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}
     for stage in ("echo", "profile", "image", "scene"):
-        assert set(finished_tiny.relevant(stage, "uav1-uav2")) < {*everything, "window", "sidelink", "accuracy_db"} | {
-            "engine",
-            "tile_px",
-        }
+        assert set(finished_tiny.relevant(stage, "uav1-uav2")) < everything
+    assert not {"window", "sidelink"} & finished_tiny.relevant("image").keys()
     assert set(finished_tiny.relevant("echo", "uav1-uav1")["nodes"]) == {"uav1"}
     assert "window" not in finished_tiny.relevant("echo", "uav1-uav1")

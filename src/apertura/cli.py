@@ -57,6 +57,26 @@ def _workflow_folder() -> Path:
 
 
 @app.command()
+def plan(campaign: Annotated[Path, typer.Argument(help="campaign folder")], threads: Threads = 1) -> None:
+    """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
+    from apertura.steps.plan import print_plan
+
+    print_plan(Campaign.load(campaign), threads=threads)
+
+
+@app.command("calibrate-cost")
+def calibrate_cost() -> None:
+    """Measure what imaging costs on this machine, for the planner; takes less than a minute."""
+    from apertura.image.calibration import measure_costs
+    from apertura.image.cost import write_costs
+
+    costs = measure_costs()
+    for name, seconds in sorted(costs.seconds.items()):
+        print(f"{name:<24}{1e9 * seconds:>12.3g} ns")
+    print(write_costs(costs))
+
+
+@app.command()
 def verify(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
 ) -> None:

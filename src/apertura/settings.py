@@ -122,8 +122,31 @@ class Scene(Section):
         "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
     )
     spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
-    height_m: float = Field(0.0, description="height of the ground, m")
-    height_datum: Literal["ellipsoid"] = Field("ellipsoid", description="what height_m counts from")
+    height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
+    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field(
+        "ellipsoid", description="what height_m counts from"
+    )
+    dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
+    dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(
+        None, description="what the heights of dem count from; carried: its own CRS says it"
+    )
+    geoid: str | None = Field(
+        None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
+    )
+
+    @model_validator(mode="after")
+    def _datum_is_stated(self) -> Self:
+        if self.dem is not None and self.dem_datum is None:
+            raise ValueError(
+                "dem is given without dem_datum: state what its heights count from "
+                "(ellipsoid, egm96, egm2008, or carried where its CRS says it); it is never guessed"
+            )
+        if self.dem is None and self.dem_datum is not None:
+            raise ValueError(f"dem_datum={self.dem_datum} is given without dem")
+        stated = {self.dem_datum, self.height_datum}
+        if self.crs == "local" and stated & {"egm96", "egm2008"}:
+            raise ValueError("heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid")
+        return self
 
     @model_validator(mode="after")
     def _bounds_are_pixels(self) -> Self:
@@ -159,6 +182,27 @@ class Processing(Section):
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
     tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
+    table_degree: Annotated[int, Field(ge=1, le=2)] | Literal["auto"] = Field(
+        "auto", description="native: degree of the polynomials in a table cell, 1 or 2"
+    )
+    table_oversampling: Annotated[int, Field(ge=2, le=64)] | Literal["auto"] = Field(
+        "auto", description="native and numba: table cells per resolution cell c/B of total path"
+    )
+    phase_tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | Literal["auto"] = Field(
+        "auto", description="native: largest phase error its fast forms may make, rad"
+    )
+    accumulate: Literal["auto", "complex64", "complex128"] = Field(
+        "auto", description="native: type of sums over pulses"
+    )
+    pulse_thinning: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
+        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
+    )
+    midpoint: bool | Literal["auto"] = Field(
+        "auto", description="image a bistatic pair as if both antennas were at their midpoint: true, false or auto"
+    )
+    terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
+        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
+    )
 
 
 class Settings(Section):

@@ -1,0 +1,221 @@
+"""Every setting of every engine, with the error and the cost that geometry and waveform predict for it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.image import cost
+from apertura.image.engines import ENGINES
+from apertura.image.engines.tables import MARGIN, TAPS, plan, ratio
+from apertura.image.view import View, forms
+
+DEGREES = (1, 2)
+OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
+    1: (4, 5, 6, 8, 10, 12, 16, 20, 24, 32),
+    2: (2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20),
+}
+TOLERANCES_RAD = (1.5e-3, 5e-4, 1.5e-4, 5e-5, 1.5e-5)
+NUMBA_OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
+
+WIDE_SUM_DB = -105.0
+"""Below this error the sum over pulses is float64; in float32 it errs by about -115 dB."""
+
+_WORST_TO_RMS = 0.25
+_FLOAT32_RAD = 2e-6
+_REFINED_DB = -98.0  # the sinc filter of numba's table
+_REFERENCE_DB = -140.0  # images are complex64
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What profiles hold: centre frequency, samples per cell c/B, path between samples (m), samples per pulse."""
+
+    centre_hz: float
+    oversampling: float
+    step_m: float
+    samples: int
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/c."""
+        return 2 * np.pi * self.centre_hz / SPEED_OF_LIGHT_M_S
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An engine and how it is set, with what that is predicted to give.
+
+    Attributes
+    ----------
+    engine
+        A key of `ENGINES`.
+    options, form_options
+        Keywords of its `prepare` and of its `form`.
+    error_db
+        Predicted RMS error on random pixels.
+    seconds, table_seconds
+        Predicted on one thread: in all, and for what all tiles share.
+    table_bytes
+        What `prepare` returns.
+    reason
+        One line.
+    """
+
+    engine: str
+    options: Mapping[str, Any]
+    form_options: Mapping[str, Any]
+    error_db: float
+    seconds: float
+    table_bytes: int
+    reason: str = ""
+    table_seconds: float = 0.0
+    shares: tuple[float, float, float] = (1.0, 0.0, 0.0)
+
+    @property
+    def line(self) -> str:
+        """The engine and its options in a few words.
+
+        Examples
+        --------
+        >>> Setting("numba", {"oversampling": 8}, {}, -80.0, 1.0, 0).line
+        'numba oversampling=8'
+        """
+        return " ".join(
+            [self.engine, *(f"{name}={value}" for name, value in {**self.options, **self.form_options}.items())]
+        )
+
+
+def candidates(
+    view: View, signal: Signal, load: cost.Load, costs: cost.Costs, *, asked: Mapping[str, Any] | None = None
+) -> list[Setting]:
+    """Return every setting that can run here and that `asked` leaves, cheapest first; equal costs by predicted error.
+
+    Parameters
+    ----------
+    view, signal
+        Geometry and waveform.
+    load
+        How much there is to do; its `cells` are set for each setting.
+    costs
+        Constants of this machine.
+    asked
+        Values of engine, table_degree, table_oversampling, phase_tolerance_rad, accumulate that a person asks for.
+        Those of native's tables leave native alone, where it was built.
+    """
+    asked = asked or {}
+    engines = {"reference", "numba", *(("native",) if ENGINES["native"].available() else ())}
+    if "engine" in asked:
+        engines &= {asked["engine"]}
+    elif "native" in engines and asked.keys() & {"table_degree", "phase_tolerance_rad", "accumulate"}:
+        engines = {"native"}
+    elif "table_oversampling" in asked:
+        engines -= {"reference"}
+    found = [_reference(load, costs)] if "reference" in engines else []
+    if "numba" in engines:
+        wanted = _only(asked, "table_oversampling", NUMBA_OVERSAMPLINGS)
+        found += [_numba(signal, load, costs, n) for n in wanted if n >= signal.oversampling or len(wanted) == 1]
+    if "native" in engines:
+        found += [
+            _native(
+                view,
+                signal,
+                load,
+                costs,
+                degree=degree,
+                oversampling=n,
+                tolerance_rad=tolerance,
+                accumulate=asked.get("accumulate"),
+            )
+            for degree in _only(asked, "table_degree", DEGREES)
+            for n in _only(asked, "table_oversampling", OVERSAMPLINGS[degree])
+            for tolerance in _only(asked, "phase_tolerance_rad", TOLERANCES_RAD)
+        ]
+    return sorted(found, key=lambda setting: (setting.seconds, setting.error_db))
+
+
+def _only(asked: Mapping[str, Any], name: str, otherwise: tuple[Any, ...]) -> tuple[Any, ...]:
+    return (asked[name],) if name in asked else otherwise
+
+
+def _native(
+    view: View,
+    signal: Signal,
+    load: cost.Load,
+    costs: cost.Costs,
+    *,
+    degree: int,
+    oversampling: int,
+    tolerance_rad: float,
+    accumulate: str | None,
+) -> Setting:
+    k = signal.wavenumber_rad_m
+    up, down = ratio(signal.oversampling, oversampling)
+    cell_m = signal.step_m * down / up
+    table_db = plan(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree).error_db
+    shares, path_rad = forms(view, cell_m=cell_m, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
+    cells = -(-((signal.samples - 1) * up // down + 1 + 2 * MARGIN) // TAPS) * TAPS
+    paths_db = 20 * np.log10(_WORST_TO_RMS * path_rad + _FLOAT32_RAD)
+    error_db = power_sum_db(table_db, paths_db)
+    tables, tiles = cost.seconds(costs, "native", replace(load, cells=cells), degree=degree, shares=shares)
+    sum_type = accumulate or ("complex64" if error_db > WIDE_SUM_DB else "complex128")
+    return Setting(
+        "native",
+        {"degree": degree, "oversampling": oversampling},
+        {"accumulate": sum_type, "tolerance_rad": tolerance_rad},
+        error_db,
+        tables + tiles,
+        load.pulses * cells * 8 * (degree + 1),
+        f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB",
+        tables,
+        shares,
+    )
+
+
+def _numba(signal: Signal, load: cost.Load, costs: cost.Costs, oversampling: int) -> Setting:
+    factor = max(1, round(oversampling / signal.oversampling))
+    cells = signal.samples * factor
+    cubic_db = cubic_error_db(signal.oversampling * factor)
+    tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells))
+    error_db = power_sum_db(cubic_db, _REFINED_DB)
+    reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
+    table_bytes = 8 * load.pulses * cells
+    return Setting("numba", {"oversampling": oversampling}, {}, error_db, tables + tiles, table_bytes, reason, tables)
+
+
+def _reference(load: cost.Load, costs: cost.Costs) -> Setting:
+    spent = cost.seconds(costs, "reference", load)[1]
+    return Setting("reference", {}, {}, _REFERENCE_DB, spent, 0, "the double sum itself, float64")
+
+
+def cubic_error_db(oversampling: float) -> float:
+    """Return the RMS error of four-point Lagrange interpolation of a flat spectrum, dB.
+
+    Examples
+    --------
+    >>> round(cubic_error_db(4)), round(cubic_error_db(8))
+    (-54, -78)
+    """
+    omega = np.pi / oversampling * np.linspace(-1, 1, 201)
+    u = np.linspace(0, 1, 41)[:, None]
+    weights = (
+        -u * (u - 1) * (u - 2) / 6,
+        (u + 1) * (u - 1) * (u - 2) / 2,
+        -(u + 1) * u * (u - 2) / 2,
+        (u + 1) * u * (u - 1) / 6,
+    )
+    value = sum(weight * np.exp(1j * omega * (n - 1)) for n, weight in enumerate(weights))
+    return float(10 * np.log10((np.abs(value - np.exp(1j * omega * u)) ** 2).mean()))
+
+
+def power_sum_db(*parts_db: float) -> float:
+    """Return the sum of independent errors, dB.
+
+    Examples
+    --------
+    >>> round(power_sum_db(-60.0, -60.0), 1)
+    -57.0
+    """
+    return float(10 * np.log10(sum(10 ** (part / 10) for part in parts_db)))

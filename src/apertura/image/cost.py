@@ -1,0 +1,211 @@
+"""What a setting costs in seconds: a few constants per engine, shipped, or measured on a machine."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from apertura.image.engines import ENGINES, native
+
+_WIDE_FORMS = ("shared", "wide", "exact")
+
+DEFAULTS: Mapping[str, Mapping[str, float]] = {
+    "common": {
+        "numba.table": 3.1e-08,
+        "numba.pixel": 3.2e-08,
+        "reference.subcarrier": 5.3e-10,
+        "place.ecef": 5.0e-07,
+        "place.local": 2.7e-09,
+        "tile": 4.0e-03,
+        "thin": 8.0e-08,
+    },
+    "avx512": {
+        "native.table": 1.5e-09,
+        "native.shared.1": 2.4e-10,
+        "native.shared.2": 2.8e-10,
+        "native.wide.1": 2.9e-10,
+        "native.wide.2": 3.7e-10,
+        "native.exact.1": 3.2e-09,
+        "native.exact.2": 3.8e-09,
+    },
+    "avx2": {
+        "native.table": 2.5e-09,
+        "native.shared.1": 4.3e-10,
+        "native.shared.2": 5.0e-10,
+        "native.wide.1": 7.0e-10,
+        "native.wide.2": 8.5e-10,
+        "native.exact.1": 4.5e-09,
+        "native.exact.2": 5.5e-09,
+    },
+    "portable": {
+        "native.table": 4.0e-09,
+        "native.shared.1": 2.3e-09,
+        "native.shared.2": 2.7e-09,
+        "native.wide.1": 2.4e-09,
+        "native.wide.2": 2.8e-09,
+        "native.exact.1": 1.1e-08,
+        "native.exact.2": 1.2e-08,
+    },
+}
+"""Seconds on one core of a 2.x GHz server of 2023, by instruction set; `apertura calibrate-cost` replaces them."""
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds per unit of work on one core.
+
+    Attributes
+    ----------
+    seconds
+        ``native.table`` per pulse, cell and coefficient; ``native.<form>.<degree>`` per pixel and pulse;
+        ``numba.table`` per pulse and fine sample; ``numba.pixel`` per pixel and pulse; ``reference.subcarrier`` per
+        pixel, pulse and subcarrier; ``place.<frame>`` per pixel position; ``tile`` per tile; ``thin`` per pulse and
+        range sample of a low-pass sum.
+    source
+        Where they come from, in one line.
+    """
+
+    seconds: Mapping[str, float]
+    source: str
+
+
+@dataclass(frozen=True)
+class Load:
+    """How much there is to do.
+
+    Attributes
+    ----------
+    pixels, pulses, subcarriers, tiles
+        Counts.
+    cells
+        Cells or fine samples of the table of one pulse.
+    frame
+        'ecef' or 'local': how pixel positions are found.
+    """
+
+    pixels: int
+    pulses: int
+    subcarriers: int
+    tiles: int
+    cells: int
+    frame: str
+
+
+def cache_file() -> Path:
+    """Return where measured costs are kept: $XDG_CACHE_HOME/apertura/cost.json.
+
+    Examples
+    --------
+    >>> cache_file().name
+    'cost.json'
+    """
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "apertura" / "cost.json"
+
+
+def machine() -> str:
+    """Return what costs depend on: the instruction set of the compiled kernel, 'portable' without one.
+
+    Examples
+    --------
+    >>> machine() in DEFAULTS
+    True
+    """
+    return native.instruction_set() if ENGINES["native"].available() else "portable"
+
+
+def default_costs(instruction_set: str = "avx512") -> Costs:
+    """Return the shipped constants for an instruction set.
+
+    Examples
+    --------
+    >>> default_costs("avx2").source
+    'shipped defaults for avx2'
+    """
+    return Costs({**DEFAULTS["common"], **DEFAULTS[instruction_set]}, f"shipped defaults for {instruction_set}")
+
+
+def read_costs(path: Path | None = None) -> Costs:
+    """Return the costs measured on this machine, or the shipped ones where none that fit are found.
+
+    Parameters
+    ----------
+    path
+        `cache_file()` by default. A file that is unreadable, was measured with another instruction set or lacks a
+        constant counts as none.
+
+    Examples
+    --------
+    >>> read_costs(Path("nowhere.json")).source.startswith("shipped defaults")
+    True
+    """
+    shipped = default_costs(machine())
+    path = path or cache_file()
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        seconds = {name: float(value) for name, value in found["seconds"].items()}
+        fits = found["machine"] == machine() and seconds.keys() >= shipped.seconds.keys()
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return shipped
+    if not fits or not all(0 < value < 1 for value in seconds.values()):
+        return shipped
+    return Costs(seconds, f"measured on this machine ({machine()})")
+
+
+def write_costs(costs: Costs, path: Path | None = None) -> Path:
+    """Keep measured costs for later plans; return the file."""
+    path = path or cache_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    document = {"machine": machine(), "seconds": dict(sorted(costs.seconds.items()))}
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    beside.replace(path)
+    return path
+
+
+def seconds(
+    costs: Costs, engine: str, load: Load, *, degree: int = 2, shares: tuple[float, float, float] = (1.0, 0.0, 0.0)
+) -> tuple[float, float]:
+    """Return predicted seconds (tables, pixels) of an engine.
+
+    Parameters
+    ----------
+    costs
+        Constants.
+    engine
+        A key of `ENGINES`.
+    load
+        How much there is to do.
+    degree
+        Of native's polynomials.
+    shares
+        Parts of pixels × pulses that native computes by its shared, wide and exact forms.
+
+    Returns
+    -------
+    tuple of float
+        Building the table, and forming all tiles, on one thread.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "Cost".
+
+    Examples
+    --------
+    >>> load = Load(512 * 512, 1024, 4096, 4, 500, "local")
+    >>> fast, slow = (sum(seconds(default_costs(), name, load)) for name in ("native", "numba"))
+    >>> slow > 15 * fast
+    True
+    """
+    unit, work = costs.seconds, float(load.pixels) * load.pulses
+    if engine == "native":
+        tables = unit["native.table"] * load.pulses * load.cells * (degree + 1)
+        form = sum(share * unit[f"native.{name}.{degree}"] for name, share in zip(_WIDE_FORMS, shares, strict=True))
+        pixels = work * form
+    elif engine == "numba":
+        tables = unit["numba.table"] * load.pulses * load.cells
+        pixels = work * unit["numba.pixel"]
+    else:
+        tables, pixels = 0.0, work * load.subcarriers * unit["reference.subcarrier"]
+    tiles = load.pixels * unit[f"place.{load.frame}"] + load.tiles * unit["tile"]
+    return tables, pixels + tiles

@@ -1,0 +1,232 @@
+"""Rules for the cheapest model of geometry that a scene needs: midpoint, pulse thinning, terrain, and what to flag."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIDPOINT_WAVELENGTHS = 1 / 16
+TERRAIN_RAD = 0.4
+TERRAIN_PIXELS = 0.5
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One choice.
+
+    Attributes
+    ----------
+    name, value
+        What was chosen: a key of the config's `processing` where it can be overridden.
+    reason
+        One line with the numbers.
+    error_db
+        Error that this choice adds, relative to the full model; None where it adds none.
+    """
+
+    name: str
+    value: str | int | float | bool
+    reason: str
+    error_db: float | None = None
+
+
+def midpoint_error(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how much longer the bistatic path is than twice the range from the midpoint, (pulse, place) metres.
+
+    Notes
+    -----
+    Source: DESIGN section 5; for a baseline b across the line of sight it is b²/4R.
+
+    Examples
+    --------
+    >>> tx, rx = np.array([[-1.0, 0, 0]]), np.array([[1.0, 0, 0]])
+    >>> round(float(midpoint_error(tx, rx, np.array([[0.0, 100.0, 0.0]]))[0, 0]), 5)  # 2²/(4·100)
+    0.01
+    """
+    legs = sum(np.linalg.norm(place_m - antenna[:, None], axis=-1) for antenna in (tx_m, rx_m))
+    return np.asarray(legs - 2 * np.linalg.norm(place_m - (tx_m + rx_m)[:, None] / 2, axis=-1))
+
+
+def midpoint_error_db(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64], *, wavelength_m: float
+) -> float:
+    """Return the error of imaging a pair from its midpoints, dB: RMS phase error over pulses and places.
+
+    What is alike at all places and pulses only turns the image's phase and is not counted.
+    """
+    longer = midpoint_error(tx_m, rx_m, place_m)
+    return float(20 * np.log10(2 * np.pi * float((longer - longer.mean()).std()) / wavelength_m + 1e-12))
+
+
+def decide_midpoint(
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    place_m: NDArray[np.float64],
+    *,
+    wavelength_m: float,
+    accuracy_db: float,
+    bistatic_costs: bool,
+) -> Decision:
+    """Decide whether a bistatic pair may be imaged as if both antennas were at their midpoint.
+
+    Parameters
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, metres.
+    place_m
+        (place, 3) float64, metres: a net over the scene.
+    wavelength_m
+        Of the band centre.
+    accuracy_db
+        Error asked.
+    bistatic_costs
+        Whether the engine takes longer for two legs than for one.
+    """
+    baseline = float(np.linalg.norm(tx_m - rx_m, axis=1).max())
+    if baseline == 0:
+        return Decision("midpoint", False, "monostatic: both phase centres are one")
+    worst = float(np.abs(midpoint_error(tx_m, rx_m, place_m)).max()) / wavelength_m
+    error_db = midpoint_error_db(tx_m, rx_m, place_m, wavelength_m=wavelength_m)
+    allowed = worst < MIDPOINT_WAVELENGTHS
+    line = f"baseline {baseline:.2f} m makes b²/4R up to λ/{1 / max(worst, 1e-9):.3g}, limit λ/16"
+    if allowed and error_db <= accuracy_db - 3 and bistatic_costs:
+        return Decision("midpoint", True, f"{line}; error {error_db:.1f} dB, and one leg is cheaper", error_db)
+    why = "the rule forbids it" if not allowed else f"it would err by {error_db:.1f} dB"
+    if allowed and error_db <= accuracy_db - 3:
+        why = f"it would err by {error_db:.1f} dB only, but the engine sums two legs at the cost of one"
+    return Decision("midpoint", False, f"{line}; {why}")
+
+
+def phase_rates(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64], *, wavelength_m: float
+) -> tuple[float, float]:
+    """Return the widest spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
+
+    Parameters
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, metres; consecutive pulses.
+    place_m
+        (place, 3) float64, metres: a net over the scene, its middle at the middle of the array.
+    wavelength_m
+        Of the highest frequency.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities.
+
+    Examples
+    --------
+    >>> track = np.stack([0.05 * np.arange(50.0), np.zeros(50), np.full(50, 10.0)], -1)
+    >>> places = np.array([[-5.0, 10, 0], [1.25, 10, 0], [7.5, 10, 0]])
+    >>> spread, widest = phase_rates(track, track, places, wavelength_m=0.25)
+    >>> 0.3 < spread < 0.4, widest < spread
+    (True, True)
+    """
+    spread = widest = 0.0
+    for first in range(0, len(tx_m) - 1, 256):
+        part = slice(first, first + 257)
+        path = sum(np.linalg.norm(place_m - antenna[part, None], axis=-1) for antenna in (tx_m, rx_m))
+        rate = np.diff(path, axis=0)
+        spread = max(spread, float(np.ptp(rate, axis=1).max()))
+        widest = max(widest, float(np.abs(rate - rate[:, [len(place_m) // 2]]).max()))
+    return spread / wavelength_m, widest / wavelength_m
+
+
+def upward(net_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit normal of a net of places (row, column, 3) whose rows go south and columns east.
+
+    Examples
+    --------
+    >>> east, south = np.meshgrid(np.arange(3.0), np.arange(2.0))
+    >>> upward(np.stack([east, -south, 0 * east], -1))
+    array([0., 0., 1.])
+    """
+    if min(net_m.shape[:2]) < 2:
+        first = net_m[0, 0]
+        return np.asarray(first / np.linalg.norm(first)) if np.linalg.norm(first) > 6e6 else np.array([0.0, 0.0, 1.0])
+    normal = np.cross(net_m[0, -1] - net_m[0, 0], net_m[0, 0] - net_m[-1, 0])
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
+def wobble_m(position_m: NDArray[np.float64]) -> float:
+    """Return the RMS distance of a track from its straight line, metres.
+
+    Examples
+    --------
+    >>> along = np.linspace(0, 30, 301)
+    >>> round(wobble_m(np.stack([along, 0.1 * np.sin(4 * np.pi * along / 3), 0 * along], -1)), 3)  # 0.1/√2
+    0.071
+    """
+    apart = position_m - position_m.mean(axis=0)
+    strengths = np.linalg.svd(apart, compute_uv=False)
+    return float(np.sqrt((strengths[1:] ** 2).sum() / len(apart)))
+
+
+def decide_terrain(
+    heights_m: NDArray[np.float64] | None,
+    *,
+    track_m: NDArray[np.float64],
+    place_m: NDArray[np.float64],
+    up: NDArray[np.float64],
+    wavelength_m: float,
+    spacing_m: float,
+) -> Decision:
+    """Decide whether a plane, a tilted plane or the DEM stands for the ground.
+
+    Parameters
+    ----------
+    heights_m
+        (row, column) float64 of a DEM over the scene, metres, evenly spread; None without one.
+    track_m
+        (pulse, 3) float64, mean of both phase centres.
+    place_m
+        (place, 3) float64, a net over the scene.
+    up
+        (3,) float64, unit vector.
+    wavelength_m, spacing_m
+        Of the band centre; of the pixels.
+
+    Notes
+    -----
+    Source: DESIGN section 5 and docs/theory/planner.md, "Terrain": a height that is wrong by δh turns the look angle by
+    δh over the ground range and shifts the pixel by δh·H over it.
+    """
+    apart = track_m[:: max(1, len(track_m) // 64)][:, None] - place_m
+    above = apart @ up
+    ground = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
+    nearest, steepest = float(ground.min()), float((np.abs(above) / ground).max())
+    rms = wobble_m(track_m)
+    focus_m = TERRAIN_RAD * wavelength_m * nearest / (4 * np.pi * max(rms, 1e-9))
+    shift_m = TERRAIN_PIXELS * spacing_m / max(steepest, 1e-9)
+    limit = min(focus_m, shift_m)
+    rule = (
+        f"wobble {rms:.3f} m rms and ground range from {nearest:.1f} m bear {focus_m:.3g} m (0.4 rad), "
+        f"half a pixel of shift {shift_m:.3g} m"
+    )
+    if heights_m is None:
+        return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit:.3g} m: {rule}")
+    flat = float(np.abs(heights_m - np.median(heights_m)).max())
+    if flat < limit:
+        return Decision("terrain", "plane", f"relief {flat:.3g} m; {rule}")
+    rest = float(np.abs(heights_m - plane_through(heights_m)).max())
+    if rest < limit:
+        return Decision("terrain", "tilted_plane", f"relief {flat:.3g} m, {rest:.3g} m off a tilted plane; {rule}")
+    return Decision("terrain", "dem", f"relief {flat:.3g} m, {rest:.3g} m off a tilted plane; {rule}")
+
+
+def plane_through(heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the least-squares plane through heights (row, column), metres, at the same places.
+
+    Examples
+    --------
+    >>> tilted = np.arange(4.0)[:, None] + 2 * np.arange(3.0)
+    >>> bool(np.allclose(plane_through(tilted), tilted))
+    True
+    """
+    row, column = np.indices(heights_m.shape)
+    basis = np.stack([np.ones(heights_m.size), row.ravel(), column.ravel()], -1)
+    fitted = basis @ np.linalg.lstsq(basis, heights_m.ravel(), rcond=None)[0]
+    return np.asarray(fitted.reshape(heights_m.shape))

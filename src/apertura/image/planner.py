@@ -1,0 +1,244 @@
+"""The planner: how an image will be formed, why, how exact and how costly, before anything runs."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.errors import CampaignError
+from apertura.image.candidates import WIDE_SUM_DB, Setting, candidates, power_sum_db
+from apertura.image.cost import Costs
+from apertura.image.edges import crossed_edges
+from apertura.image.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db, phase_rates, upward
+from apertura.image.plan import Job, Plan
+from apertura.image.thinning import Presum, design, presum_error_db
+from apertura.image.view import View, look
+
+MARGIN_DB = 3.0
+"""Predicted errors lie this far below what is asked: random pixels of a sparse scene err more than a flat spectrum."""
+
+THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
+_NET_PULSES = 48
+_BASE_BYTES = 300_000_000  # the interpreter and its libraries
+_TILE_BYTES = 150  # per pixel in work: positions, their projection, the sum
+_PRODUCT_BYTES = 60  # per pixel: image, its part of the cube, three rasters with overviews, before compression
+
+
+def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[str, Any] | None = None) -> Plan:
+    """Choose the cheapest setting and models that meet the accuracy asked.
+
+    Parameters
+    ----------
+    job
+        What is to be imaged.
+    accuracy_db
+        Numerical error asked.
+    costs
+        Constants of the machine. The same job and costs give the same plan.
+    overrides
+        Choice → value that a person asks for: engine, table_degree, table_oversampling, accumulate,
+        phase_tolerance_rad, pulse_thinning, midpoint, terrain. 'auto' or None leaves the choice to the planner.
+
+    Raises
+    ------
+    CampaignError
+        If the job holds no pulse, a platform is below the ground, or what is asked cannot run here.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md.
+    """
+    asked = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
+    flags = crossed_edges(
+        job.tx_position_m,
+        job.rx_position_m,
+        job.net_m,
+        spacing_m=job.spacing_m,
+        band_hz=job.band_hz,
+        path_limit_m=job.path_limit_m,
+    )
+    some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
+    desk = _Desk(job, look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m), costs, asked)
+    whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
+    thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
+    midpoint = _decide_midpoint(desk, accuracy_db)
+    models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
+    memory, disk = _bytes(job, chosen, presum)
+    return Plan(
+        setting=chosen,
+        better=desk.ladder(chosen.error_db, chosen.engine),
+        decisions=(*_setting_decisions(chosen, asked, accuracy_db, costs), thinning, midpoint, _decide_terrain(desk)),
+        predicted_error_db=power_sum_db(chosen.error_db, *models),
+        predicted_seconds=_wall_seconds(chosen, job),
+        memory_bytes=memory,
+        disk_bytes=disk,
+        flags=flags,
+        presum=presum,
+        midpoint=bool(midpoint.value),
+        middle_m=job.place_m[len(job.place_m) // 2],
+    )
+
+
+def ladder(plan: Plan) -> tuple[Setting, ...]:
+    """Return the plan's next better settings, in the order to try them; they take the profiles as they are."""
+    return plan.better
+
+
+@dataclass(frozen=True)
+class _Desk:
+    """What every decision looks at."""
+
+    job: Job
+    view: View
+    costs: Costs
+    asked: Mapping[str, Any]
+
+    def cheapest(self, pulses: int, target_db: float) -> Setting:
+        """Return the cheapest setting that meets the target, or the best there is."""
+        load = replace(self.job.load, pulses=pulses)
+        options = candidates(self.view, self.job.signal, load, self.costs, asked=self.asked)
+        if not options:
+            raise CampaignError(
+                f"engine {self.asked.get('engine')} was not built when apertura was installed",
+                where="config/config.yaml: processing.engine",
+                expected="an engine that can run here",
+                remedy="Install with a C++ compiler, or choose another engine.",
+            )
+        exact = (setting for setting in options if setting.error_db <= target_db)
+        return next(exact, min(options, key=lambda setting: setting.error_db))
+
+    def ladder(self, error_db: float, engine: str) -> tuple[Setting, ...]:
+        """Return per 6 dB gained the cheapest setting, ending with the reference."""
+        options = candidates(self.view, self.job.signal, self.job.load, self.costs)
+        rungs: list[Setting] = []
+        while error_db > -130:
+            better = [s for s in options if s.error_db <= error_db - 6 and s.engine != "reference"]
+            if not better or engine == "reference":
+                break
+            rungs.append(better[0])
+            error_db = better[0].error_db
+        last = [setting for setting in options if setting.engine == "reference" and engine != "reference"]
+        return (*rungs, *last)
+
+
+def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[Decision, Presum | None, Setting]:
+    job, asked = desk.job, desk.asked.get("pulse_thinning")
+    tx_m, rx_m, pulses = job.tx_position_m, job.rx_position_m, len(job.tx_position_m)
+    _, widest = phase_rates(tx_m, rx_m, job.place_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
+    oversampled = f"the scene's middle and its edges differ by up to {widest:.3f} cycles per pulse"
+
+    def keep(why: str) -> tuple[Decision, None, Setting]:
+        return Decision("pulse_thinning", 1, f"{oversampled}; {why}"), None, whole
+
+    if asked == 1:
+        return keep("asked for in config/config.yaml")
+    if whole.engine == "reference":
+        return keep("the double sum takes every pulse")
+    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, accuracy_db - 2 * MARGIN_DB)
+    if found is None and asked:
+        raise CampaignError(
+            f"pulse_thinning is {asked}",
+            where="config/config.yaml: processing.pulse_thinning",
+            expected=f"a factor that the low-pass sum can follow: {oversampled}, at most {0.3 / max(widest, 1e-9):.1f}",
+            remedy="Use a smaller factor or auto.",
+        )
+    if found is None:
+        return keep(
+            f"fewer pulses would err by more than {accuracy_db - 2 * MARGIN_DB:.0f} dB even after a low-pass sum"
+        )
+    presum, error_db = found
+    spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
+    less = desk.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
+    if not asked and spent + less.seconds > 0.9 * whole.seconds:
+        return keep(
+            f"a low-pass sum {presum.factor}:1 takes {spent:.2g} s and saves {whole.seconds - less.seconds:.2g} s"
+        )
+    line = f"{oversampled}; a low-pass sum makes {len(presum.at)} of {pulses} pulses"
+    chosen = replace(less, seconds=less.seconds + spent, table_seconds=less.table_seconds + spent)
+    return Decision("pulse_thinning", presum.factor, f"{line} and errs by {error_db:.1f} dB", error_db), presum, chosen
+
+
+def _presum(job: Job, factors: tuple[int, ...], widest: float, limit_db: float) -> tuple[Presum, float] | None:
+    for factor in factors:
+        presum = design(len(job.tx_position_m), factor, widest_cycles=widest, error_db=limit_db)
+        if presum is None or len(presum.at) > 0.8 * len(job.tx_position_m):
+            continue
+        error_db = presum_error_db(presum, job.tx_position_m, job.rx_position_m, job.place_m, highest_hz=job.band_hz[1])
+        if error_db <= limit_db or len(factors) == 1:
+            return presum, error_db
+    return None
+
+
+def _decide_midpoint(desk: _Desk, accuracy_db: float) -> Decision:
+    job = desk.job
+    some = slice(None, None, max(1, len(job.tx_position_m) // 256))
+    found = decide_midpoint(
+        job.tx_position_m[some],
+        job.rx_position_m[some],
+        job.place_m,
+        wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz,
+        accuracy_db=accuracy_db,
+        bistatic_costs=False,  # every engine here sums both legs, native before the pixel loop
+    )
+    asked = desk.asked.get("midpoint")
+    if asked is None or bool(asked) == found.value or found.reason.startswith("monostatic"):
+        return found
+    some_tx, some_rx = job.tx_position_m[some], job.rx_position_m[some]
+    error_db = midpoint_error_db(some_tx, some_rx, job.place_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz)
+    return Decision("midpoint", bool(asked), f"asked for in config/config.yaml; {found.reason}", error_db)
+
+
+def _decide_terrain(desk: _Desk) -> Decision:
+    job = desk.job
+    found = decide_terrain(
+        job.heights_m,
+        track_m=(job.tx_position_m + job.rx_position_m) / 2,
+        place_m=job.place_m,
+        up=upward(job.net_m),
+        wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz,
+        spacing_m=job.spacing_m,
+    )
+    asked = desk.asked.get("terrain")
+    if asked is None or asked == found.value:
+        return found
+    return Decision("terrain", asked, f"asked for in config/config.yaml; the rule says {found.value}: {found.reason}")
+
+
+def _setting_decisions(
+    chosen: Setting, asked: Mapping[str, Any], accuracy_db: float, costs: Costs
+) -> Iterator[Decision]:
+    def why(*keys: str) -> str:
+        return "asked for in config/config.yaml; " if any(key in asked for key in keys) else ""
+
+    met = "meets" if chosen.error_db <= accuracy_db else "does not meet"
+    line = f"{chosen.seconds:.3g} s, {met} {accuracy_db:.0f} dB; costs {costs.source}"
+    yield Decision("engine", chosen.engine, f"{why('engine')}{line}", chosen.error_db)
+    if "oversampling" in chosen.options:
+        yield Decision("table_oversampling", chosen.options["oversampling"], why("table_oversampling") + chosen.reason)
+    if chosen.engine == "native":
+        options = {**chosen.options, **chosen.form_options}
+        shared, wide, exact = (100 * share for share in chosen.shares)
+        forms = f"of pixel·pulses {shared:.0f} % share curvature, {wide:.0f} % need their own or wide windows"
+        reasons = {
+            "table_degree": "cheapest with this oversampling",
+            "phase_tolerance_rad": f"{forms}, {exact:.0f} % the exact way",
+            "accumulate": f"sums in float32 err by -115 dB, wider below {WIDE_SUM_DB:.0f} dB; paths start in float64",
+        }
+        names = {"table_degree": "degree", "phase_tolerance_rad": "tolerance_rad", "accumulate": "accumulate"}
+        for name, reason in reasons.items():
+            yield Decision(name, options[names[name]], why(name) + reason)
+
+
+def _wall_seconds(chosen: Setting, job: Job) -> float:
+    """Return the seconds on the job's threads; choices are made on one, so that they do not depend on it."""
+    return chosen.table_seconds + (chosen.seconds - chosen.table_seconds) / min(job.threads, job.load.tiles)
+
+
+def _bytes(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int, int]:
+    """Return peak memory of the imaging step, and what the pair leaves on disk, bytes."""
+    pulses, pixels = len(job.tx_position_m), job.shape[0] * job.shape[1]
+    history = 8 * pulses * (job.subcarriers + job.signal.samples)
+    virtual = 0 if presum is None else 16 * pulses * job.signal.samples + 16 * len(presum.at) * job.signal.samples
+    tiles = min(job.threads, job.load.tiles) * _TILE_BYTES * min(job.tile_px**2, pixels)
+    memory = _BASE_BYTES + 2 * history + virtual + chosen.table_bytes + tiles
+    return memory, history + _PRODUCT_BYTES * pixels

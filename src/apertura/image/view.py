@@ -1,0 +1,73 @@
+"""How the scene is seen, and which of its forms the compiled engine may take there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.image.cost import machine
+
+
+@dataclass(frozen=True)
+class View:
+    """How the scene is seen: a net of places in it from some of the pulses.
+
+    Attributes
+    ----------
+    range_m
+        (leg, pulse, place) float64, from transmitter and receiver, metres.
+    slope
+        (2, pulse, place) float64, change of total path per pixel along columns and rows, metres.
+    spacing_m
+        Pixel spacing.
+    """
+
+    range_m: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    spacing_m: float
+
+
+def look(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], net_m: NDArray[np.float64], spacing_m: float) -> View:
+    """Return the view of a net of places, (row, column, 3), from phase centres (pulse, 3), metres."""
+    place = net_m.reshape(-1, 3)
+    right, down = (_steps(net_m, axis, spacing_m).reshape(-1, 3) for axis in (1, 0))
+    apart = np.stack([place - antenna[:, None] for antenna in (tx_m, rx_m)])
+    distance = np.linalg.norm(apart, axis=-1)
+    direction = (apart / distance[..., None]).sum(axis=0)
+    return View(distance, np.stack([(direction * step).sum(-1) for step in (right, down)]), spacing_m)
+
+
+def _steps(net_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[np.float64]:
+    if net_m.shape[axis] < 2:
+        return np.zeros_like(net_m)
+    along = np.gradient(net_m, axis=axis)
+    return np.asarray(spacing_m * along / np.linalg.norm(along, axis=-1, keepdims=True))
+
+
+def forms(
+    view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
+) -> tuple[tuple[float, float, float], float]:
+    """Return the parts that native computes by its shared, wide and exact forms, and its phase error.
+
+    The error is the RMS over patches and pulses of the largest in a patch, rad.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Paths" and "Look-ups", for flat patches of 16 × 16 pixels.
+    """
+    reach, inner = 8.49 * view.spacing_m, 2.12 * view.spacing_m
+    inverse = (1 / view.range_m) ** 2
+    base = inverse * (0.19 * inner**3 + inverse * reach**4 * (0.14 * reach + inner))
+    shared = (base + 0.58 * reach * inner**2 * inverse).sum(axis=0) * wavenumber_rad_m
+    own = (base + 0.075 * reach**2 * inner**2 * inverse**1.5).sum(axis=0) * wavenumber_rad_m
+    step = np.abs(view.slope).sum(axis=0)
+    bend = 4.5 * view.spacing_m**2 * (1 / view.range_m).sum(axis=0)
+    span = (3 * step + 2 * bend) / cell_m + 1
+    narrow_cells = 8 if machine() == "avx2" else 16
+    group = span if narrow_cells == 8 else span + 4 * step / cell_m
+    fits = span <= 15.49
+    alike, alone = fits & (shared <= tolerance_rad), fits & (shared > tolerance_rad) & (own <= tolerance_rad)
+    fast = alike & (group <= narrow_cells - 0.51)
+    parts = (float(fast.mean()), float((alike & ~fast).mean() + alone.mean()))
+    error = np.where(alike, shared, np.where(alone, own, 0.0))
+    return (*parts, float(1 - sum(parts))), float(np.sqrt((error**2).mean()))
