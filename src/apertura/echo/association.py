@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 from scipy.ndimage import median_filter
 
-from apertura.echo.frame_counter import ABSENT, pairs_by_frame
+from apertura.echo.frame_counter import pairs_by_frame
+from apertura.echo.framing import ABSENT
 from apertura.echo.time_tags import Floats, Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
 from apertura.errors import CampaignError
 

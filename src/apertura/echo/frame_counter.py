@@ -2,10 +2,8 @@
 
 import numpy as np
 
+from apertura.echo.framing import ABSENT
 from apertura.echo.time_tags import Integers, Pairs
-
-ABSENT = -1
-"""Frame number of a pulse whose payload was not read."""
 
 
 def pairs_by_frame(
