@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.simulate.impairments import Impairments
 from apertura.simulate.observation import Observation, observe
 from apertura.simulate.presets import paper_scene, paper_waveform
-from apertura.simulate.radar import Waveform
+from apertura.simulate.radar import Waveform, qpsk_codes
 from apertura.simulate.recording import Geometry, digitize, full_scale
 from apertura.simulate.scene import Scatterers
 from apertura.simulate.synthesis import transfer_functions
@@ -48,7 +48,13 @@ class Bench:
 
 
 def paper_bench(
-    *, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, length_m: float = 30.0, speed_m_s: float = 1.0
+    *,
+    pulses: int,
+    subcarriers: int,
+    rx_ahead_m: float = 0.0,
+    length_m: float = 30.0,
+    speed_m_s: float = 1.0,
+    qpsk: bool = False,
 ) -> Bench:
     """Return the paper's simulated scene with fewer pulses and subcarriers over the same aperture and band.
 
@@ -62,6 +68,9 @@ def paper_bench(
         Distance of the receiver ahead of the transmitter; 0 for the monostatic pair.
     length_m, speed_m_s
         Aperture and ground speed, which give the repetition frequency.
+    qpsk
+        Random QPSK codes, whose leakage between subcarriers is like noise, instead of the flat quadratic-phase
+        code, which turns part of it into a shift.
 
     Notes
     -----
@@ -75,11 +84,13 @@ def paper_bench(
     """
     waveform = paper_waveform(prf_hz=pulses * speed_m_s / length_m)
     every = len(waveform.codes) // subcarriers
-    waveform = replace(
-        waveform, codes=waveform.codes[::every], subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz
-    )
+    codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else waveform.codes[::every]
+    waveform = replace(waveform, codes=codes, subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz)
     scatterers, geometry = paper_scene(pulses=pulses, length_m=length_m, rx_ahead_m=rx_ahead_m)
     return Bench(waveform, scatterers, geometry)
+
+
+PERFECT = Impairments()
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,7 @@ class Case:
         Pass the samples through the converter of the receiver.
     """
 
-    receiver: Impairments = Impairments()
+    receiver: Impairments = PERFECT
     transmitter: Impairments | None = None
     sampled: bool = False
     quantised: bool = False

@@ -65,7 +65,7 @@ def coherence_claims(*, draws: int = DRAWS, seed: int = 1) -> list[Claim]:
 
 
 def _static() -> Bench:
-    """A recording that does not move: one reflector 15 m away, receiver 4.7 m beside the transmitter."""
+    """Return a recording that does not move: one reflector 15 m away, receiver 4.7 m beside the transmitter."""
     bench = paper_bench(pulses=PULSES, subcarriers=128)
     sender = np.tile([0.0, 0.0, 4.8], (PULSES, 1))
     receiver = sender + [4.7, 0.0, 0.0]

@@ -7,10 +7,9 @@ import numpy as np
 
 from apertura.simulate.recording import Geometry
 from apertura.simulate.scene import Scatterers
-from apertura.study.bench import Bench, Case, paper_bench, receive_pair
+from apertura.study.bench import Bench, Case, Complexes, paper_bench, receive_pair
 from apertura.study.claims import Claim, compare
 from apertura.study.focus import (
-    Complexes,
     Floats,
     find_peaks,
     half_power_widths,
@@ -73,9 +72,7 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     band_hz = len(bench.frequency_hz) * bench.waveform.subcarrier_spacing_hz
     middle_hz = float(bench.frequency_hz.mean())
     ground, cross = (100 * width for width in _uav_widths([_segment(bench, 0.0, UAV_APERTURE_M)]))
-    closed = 100 * ground_range_resolution_m(
-        band_hz, UAV_TARGET_M[0, 1], UAV_HEIGHT_M, half_power=HALF_POWER_OF_HANN
-    )
+    closed = 100 * ground_range_resolution_m(band_hz, UAV_TARGET_M[0, 1], UAV_HEIGHT_M, half_power=HALF_POWER_OF_HANN)
     whole = 100 * cross_range_resolution_m(middle_hz, slant, UAV_APERTURE_M)
     other = 100 * cross_range_resolution_m(middle_hz, slant, SEGMENT_LENGTH_M)
     contradiction = (

@@ -61,14 +61,14 @@ def _symbols(
     seen = paths.delay_s + paths.delay_rate * middle_s - channel.start_s[pulses, None]
     total = np.zeros((len(seen), time_s.size), np.complex128)
     for order in range(_DOPPLER_ORDER + 1 if paths.delay_rate.any() else 1):
-        spectrum = path_spectrum(waveform, seen, paths.amplitude * paths.delay_rate**order)
-        spectrum = spectrum * factor * (-2j * np.pi * waveform.frequency_hz) ** order / factorial(order)
+        of_paths = path_spectrum(waveform, seen, paths.amplitude * paths.delay_rate**order)
+        spectrum = of_paths * factor * (-2j * np.pi * waveform.frequency_hz) ** order / factorial(order)
         since = time_s + channel.start_s[pulses, None] - middle_s
         total += since**order * zoom(spectrum)
     return total
 
 
-def demodulated(samples: NDArray[np.complex128], waveform: Waveform) -> NDArray[np.complex64]:
+def demodulated(samples: NDArray[np.complexfloating], waveform: Waveform) -> NDArray[np.complex64]:
     """Return (pulse, subcarrier) complex64 transfer functions: the DFT of window samples, code removed.
 
     Examples

@@ -1,0 +1,160 @@
+# The studies need no campaign: `snakemake --snakefile workflow/rules/study.smk --cores 2 paper stability`.
+from apertura.provenance import code_sha256
+from apertura.study.commands import PAPER_PARTS
+from apertura.study.sweeps import CHOICES, SWEEPS
+
+ERRORS = [part.removeprefix("loss_") for part in PAPER_PARTS if part.startswith("loss_")]
+
+
+wildcard_constraints:
+    part="|".join(PAPER_PARTS),
+    error="|".join(ERRORS),
+    impairment="|".join(SWEEPS),
+    method="|".join(CHOICES),
+
+
+localrules:
+    paper,
+    stability,
+
+
+rule paper:
+    input:
+        "results/study/paper/claims.csv",
+        expand("results/study/paper/{error}.png", error=ERRORS),
+
+
+rule stability:
+    input:
+        "results/study/stability/summary.csv",
+        expand("results/study/stability/{impairment}.png", impairment=SWEEPS),
+
+
+rule paper_part:
+    output:
+        "results/study/paper/parts/{part}.csv",
+    log:
+        "results/logs/study/paper.{part}.log",
+    benchmark:
+        "results/benchmarks/study/paper.{part}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.commands"),
+    message:
+        "claims of the paper: {wildcards.part}"
+    shell:
+        "apertura study paper-part {wildcards.part} > {log} 2>&1"
+
+
+rule paper_claims:
+    input:
+        expand("results/study/paper/parts/{part}.csv", part=PAPER_PARTS),
+    output:
+        "results/study/paper/claims.csv",
+    log:
+        "results/logs/study/paper.claims.log",
+    benchmark:
+        "results/benchmarks/study/paper.claims.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.claims"),
+    message:
+        "putting the claims together"
+    shell:
+        "apertura study paper-claims > {log} 2>&1"
+
+
+rule paper_figure:
+    output:
+        "results/study/paper/{error}.png",
+    log:
+        "results/logs/study/paper.{error}.png.log",
+    benchmark:
+        "results/benchmarks/study/paper.{error}.png.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.figures"),
+    message:
+        "drawing what {wildcards.error} does"
+    shell:
+        "apertura study paper-figure {wildcards.error} > {log} 2>&1"
+
+
+rule stability_sweep:
+    output:
+        "results/study/stability/parts/{impairment}.{method}.csv",
+    log:
+        "results/logs/study/{impairment}.{method}.log",
+    benchmark:
+        "results/benchmarks/study/{impairment}.{method}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.stability"),
+    message:
+        "sweeping {wildcards.impairment} under {wildcards.method}"
+    shell:
+        "apertura study stability-sweep {wildcards.impairment} {wildcards.method} > {log} 2>&1"
+
+
+rule stability_chart:
+    input:
+        expand("results/study/stability/parts/{{impairment}}.{method}.csv", method=CHOICES),
+    output:
+        "results/study/stability/{impairment}.csv",
+        "results/study/stability/{impairment}.png",
+    log:
+        "results/logs/study/{impairment}.chart.log",
+    benchmark:
+        "results/benchmarks/study/{impairment}.chart.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.charts"),
+    message:
+        "charting {wildcards.impairment}"
+    shell:
+        "apertura study stability-chart {wildcards.impairment} > {log} 2>&1"
+
+
+rule stability_summary:
+    input:
+        expand("results/study/stability/{impairment}.csv", impairment=SWEEPS),
+    output:
+        "results/study/stability/summary.csv",
+        "results/study/stability/summary.png",
+        "results/study/stability/sidelink.csv",
+        "results/study/stability/sidelink_methods.csv",
+    log:
+        "results/logs/study/summary.log",
+    benchmark:
+        "results/benchmarks/study/summary.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.charts"),
+    message:
+        "where each correction fails"
+    shell:
+        "apertura study stability-summary > {log} 2>&1"
