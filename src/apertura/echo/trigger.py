@@ -134,7 +134,7 @@ def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[in
         matches = fft.ifft(fft.fft(window, size) * matched)[:fitting]
         energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
         under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
-        yield first, _power(matches) / np.maximum(under, np.float32(1e-6))
+        yield first, np.asarray(_power(matches) / np.maximum(under, 1e-6), np.float32)
 
 
 def _power(samples: Complexes) -> NDArray[np.float32]:
