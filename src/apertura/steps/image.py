@@ -18,7 +18,7 @@ from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.history import Profiles, Spectra
-from apertura.image.peaks import find_peak, ground_position
+from apertura.image.peaks import cut_through, find_peak, ground_position
 from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import Window, form_tiles
 from apertura.steps.scene import grid_spec, scene_grid
@@ -26,6 +26,9 @@ from apertura.steps.stamping import stamped
 from apertura.store import finish, open_stage, tiles_missing, write_json, writing
 
 CERTIFIED_PIXELS = 256
+
+CUT_REACH_M = 3.0
+"""How far the cuts through the brightest target go to both sides."""
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
@@ -151,10 +154,17 @@ def _certified(work: Work, windows: list[Window], ladder: list[Choice], accuracy
 
 
 def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
-    found = survey(work.target, windows)
+    """Return what one pass over the pixels and a close look at the brightest target tell."""
+    found, grid = survey(work.target, windows), work.grid
     peak = find_peak(work.target, found.row, found.column)
-    x, y = ground_position(work.grid, peak)
-    at = work.grid.positions_at(np.array([peak.row]), np.array([peak.column]))
+    x, y = ground_position(grid, peak)
+    spectra: Spectra = work.history["echo"]
+    terms = reference.terms(spectra, grid.positions_at(np.array([peak.row]), np.array([peak.column])))
+    along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)
+    cuts = {
+        name: cut_through(work.target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
+        for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
+    }
     return {
         "entropy": round(found.entropy, 6),
         "noise_floor_db": found.noise_floor_db,
@@ -162,7 +172,12 @@ def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(reference.terms(work.history["echo"], at)[:, 0]),
+            "coherence_factor": coherence_factor(terms[:, 0]),
+            **{
+                f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
+                for name, cut in cuts.items()
+                for measure, value in asdict(cut).items()
+            },
         },
     }
 
