@@ -115,8 +115,13 @@ class SceneGrid:
                     slice(column, min(column + side_px, self.shape[1])),
                 )
 
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self, height_m: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """Return the pixel centres in the processing frame.
+
+        Parameters
+        ----------
+        height_m
+            (row, column) float64, height of each pixel, metres, counted as `self.height_m`; flat ground if None.
 
         Returns
         -------
@@ -124,14 +129,41 @@ class SceneGrid:
             (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
         """
         x, y = np.meshgrid(self.x_m, self.y_m)
-        return self._place(x, y)
+        return self._place(x, y, height_m)
 
-    def positions_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
-        """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre."""
-        return self._place(self._easting(column), self._northing(row))
+    def positions_at(
+        self, row: ArrayLike, column: ArrayLike, height_m: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre.
 
-    def _place(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        height = np.full_like(x, self.height_m)
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 6), 0.0).positions_at([0], [1], np.array([2.5]))
+        array([[1.5, 3.5, 2.5]])
+        """
+        return self._place(self._easting(column), self._northing(row), height_m)
+
+    def direction(self, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
+        """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16), 0.0).direction(np.array([3.0, 4.0, 1.0]), 2.0, 5.0)
+        (3.0, 4.0)
+        """
+        here, east, north = self.positions_at([row, row, row - 1], [column, column + 1, column])
+        axes = np.stack([east - here, north - here])
+        steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
+        return float(steps[0]), float(steps[1])
+
+    def map_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
+        """Return (..., 2) float64 easting and northing (m) in `crs` of fractional pixel indices."""
+        return np.stack([self._easting(column), self._northing(row)], -1)
+
+    def _place(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], height_m: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        height = np.full_like(x, self.height_m) if height_m is None else np.asarray(height_m, np.float64)
         return np.stack([x, y, height], -1) if self.crs == LOCAL else ecef_from_projected(self.crs, x, y, height)
 
 
