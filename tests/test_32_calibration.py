@@ -1,0 +1,128 @@
+"""A reflector at a known place: the path offset it gives, and when it gives none."""
+
+import numpy as np
+import pytest
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.echo.calibration import NEEDED_STD_M, estimate_path_offset, reflector_history
+from apertura.errors import CampaignError
+
+FREQUENCY = 1.2e9 + np.arange(256) * 1.6e6  # 409.6 MHz
+ALONG = np.linspace(-3, 3, 96)
+TX = np.stack([ALONG, 0 * ALONG, 0 * ALONG + 5], -1)
+RX = TX + [4.7, 0.0, 0.3]
+REFLECTOR = np.array([0.5, 11.0, 0.0])
+
+
+def path(tx, rx, place):
+    return np.linalg.norm(tx - place, axis=1) + np.linalg.norm(rx - place, axis=1)
+
+
+def fly(rng, *, offset_m=1.374, snr_db=3.0, level=1.0, clutter=0.0, wobble_m=0.0, rival=0.0, rival_m=4.0):
+    """Return transfer functions and the path to the reflector as the logged track has it."""
+    error = np.convolve(rng.normal(size=(96 + 16)), np.ones(17) / np.sqrt(17), "valid") * wobble_m
+    true = path(TX, RX, REFLECTOR) + error + offset_m
+    scatterers = rng.uniform([-8, 4, 0], [8, 25, 0], (30, 3))
+    transfer = level * np.exp(-2j * np.pi * FREQUENCY * true[:, None] / C)
+    transfer = transfer + level * rival * np.exp(-2j * np.pi * FREQUENCY * (true[:, None] + rival_m) / C)
+    for place in scatterers if clutter else []:
+        beyond = (path(TX, RX, place) + error + offset_m)[:, None]
+        transfer = transfer + clutter * np.exp(-2j * np.pi * FREQUENCY * beyond / C)
+    noise = (rng.normal(size=transfer.shape) + 1j * rng.normal(size=transfer.shape)) / np.sqrt(2)
+    return (transfer + noise * 10 ** (-snr_db / 20)).astype(np.complex64), path(TX, RX, REFLECTOR)
+
+
+@pytest.mark.parametrize("offset_m", [-4.2, 0.0, 1.374, 9.5])
+def test_the_path_offset_of_a_node_is_found_to_a_millimetre(offset_m):
+    transfer, predicted = fly(np.random.default_rng(1), offset_m=offset_m, snr_db=20)
+    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert found.offset_m == pytest.approx(offset_m, abs=0.002)
+    assert found.std_m < 0.001
+    assert found.flags == {}
+
+
+@pytest.mark.parametrize(("snr_db", "clutter", "wobble_m"), [(-15, 0.0, 0.0), (10, 0.05, 0.0), (10, 0.0, 0.01)])
+def test_the_stated_deviation_is_the_one_over_many_flights(snr_db, clutter, wobble_m):
+    flights = [
+        estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+        for transfer, predicted in (
+            fly(np.random.default_rng(seed), snr_db=snr_db, clutter=clutter, wobble_m=wobble_m) for seed in range(16)
+        )
+    ]
+    errors = np.array([flight.offset_m - 1.374 for flight in flights])
+    stated = np.sqrt(np.mean([flight.std_m**2 for flight in flights]))
+    assert stated / 4 < np.sqrt(np.mean(errors**2)) < stated * 2  # clutter errs to both sides: stated too large
+
+
+def test_clutter_as_strong_in_sum_as_the_reflector_does_not_move_it():
+    transfer, predicted = fly(np.random.default_rng(3), clutter=0.1)
+    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert found.offset_m == pytest.approx(1.374, abs=0.03)
+
+
+@pytest.mark.parametrize(("level", "visible"), [(0.0, False), (0.01, False), (0.06, True)])
+def test_a_reflector_that_does_not_stand_out_is_refused(level, visible):
+    transfer, predicted = fly(np.random.default_rng(4), level=level)
+    if visible:
+        assert estimate_path_offset(transfer, FREQUENCY, path_m=predicted).offset_m == pytest.approx(1.374, abs=0.1)
+        return
+    with pytest.raises(CampaignError, match="f01: no reflector: the highest echo within 10 m"):
+        estimate_path_offset(transfer, FREQUENCY, path_m=predicted, where="f01")
+
+
+def test_noise_alone_is_rarely_taken_for_a_reflector():
+    seen = 0
+    for seed in range(100):
+        try:
+            estimate_path_offset(*fly(np.random.default_rng(seed), level=0.0)[:1], FREQUENCY, path_m=np.full(96, 30.0))
+        except CampaignError:
+            continue
+        seen += 1
+    assert seen <= 1
+
+
+@pytest.mark.parametrize(("search_m", "visible"), [(1.2, False), (1.7, True)])
+def test_a_reflector_outside_the_search_is_refused(search_m, visible):
+    transfer, predicted = fly(np.random.default_rng(5), snr_db=20)
+    if visible:
+        estimate_path_offset(transfer, FREQUENCY, path_m=predicted, search_m=search_m)
+        return
+    with pytest.raises(CampaignError, match="edge of the search"):
+        estimate_path_offset(transfer, FREQUENCY, path_m=predicted, search_m=search_m)
+
+
+@pytest.mark.parametrize(("rival", "flagged"), [(0.45, False), (0.56, True)])
+def test_a_second_reflector_as_strong_is_flagged(rival, flagged):
+    transfer, predicted = fly(np.random.default_rng(6), snr_db=20, rival=rival)
+    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert found.offset_m == pytest.approx(1.374, abs=0.01)
+    assert ("calibration_ambiguous" in found.flags) == flagged
+
+
+@pytest.mark.parametrize(("wobble_m", "flagged"), [(0.01, False), (0.2, True)])
+def test_an_offset_known_too_poorly_is_flagged(wobble_m, flagged):
+    transfer, predicted = fly(np.random.default_rng(7), snr_db=20, wobble_m=wobble_m)
+    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert (found.std_m > NEEDED_STD_M) == flagged
+    assert ("calibration_uncertain" in found.flags) == flagged
+
+
+def test_a_single_pulse_gives_an_offset_without_a_deviation():
+    transfer, predicted = fly(np.random.default_rng(8), snr_db=20)
+    found = estimate_path_offset(transfer[:1], FREQUENCY, path_m=predicted[:1])
+    assert found.offset_m == pytest.approx(1.374, abs=0.02)
+    assert found.std_m == np.inf
+    assert "calibration_uncertain" in found.flags
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.4])
+def test_phases_of_a_static_recording_follow_the_clock_and_nothing_else(offset_m):
+    """200 pulses at rest: random phase per pulse comes back as it was put in, and a corrected one is coherent."""
+    rng = np.random.default_rng(9)
+    phase = rng.uniform(-np.pi, np.pi, 200)
+    still = np.exp(-2j * np.pi * FREQUENCY * (31.0 + offset_m) / C)
+    history = reflector_history(
+        (still * np.exp(1j * phase[:, None])).astype(np.complex64), FREQUENCY, path_m=np.full(200, 31.0 + offset_m)
+    )
+    assert np.angle(history * np.exp(-1j * phase)) == pytest.approx(0, abs=1e-4)
+    assert np.abs(history) == pytest.approx(1, abs=1e-4)
