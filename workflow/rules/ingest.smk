@@ -13,6 +13,7 @@ rule raw:
     resources:
         mem_mb=lambda wildcards, input: 300 + int(3 * input.size_mb),
     params:
+        settings=campaign.relevant("raw"),
         code=code_sha256("apertura.steps.ingest"),
     message:
         "{wildcards.flight}: reading the recording of {wildcards.node}"

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,101 @@ from apertura.errors import CampaignError
 _BYTES_PER_SAMPLE = 4  # ci16_le: two int16
 
 
+@dataclass(frozen=True)
+class Recording:
+    """An opened SigMF recording.
+
+    Attributes
+    ----------
+    samples
+        (sample, channel, 2) int16, memory-mapped.
+    channels
+        Names of the channels.
+    meta, meta_path, data_path
+        Metadata and files.
+    """
+
+    samples: NDArray[np.int16]
+    channels: list[str]
+    meta: dict[str, Any]
+    meta_path: Path
+    data_path: Path
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Complex samples per second."""
+        return float(self.meta["global"]["core:sample_rate"])
+
+    @property
+    def framing(self) -> dict[str, Any] | None:
+        """What was sent before each symbol, where the recorder ran through instead of being triggered; else None."""
+        described = self.meta["global"].get("apertura:framing")
+        return dict(described) if described and len(self.meta["captures"]) == 1 else None
+
+    def captures(self) -> "Captures":
+        """Return the capture segments that the metadata describe."""
+        starts, length = _segments(self.meta["captures"], len(self.samples), self.meta_path)
+        numbers = np.array([capture.get("apertura:frame", -1) for capture in self.meta["captures"]], np.int64)
+        return Captures(np.array(starts), length, _times(self.meta["captures"], self.meta_path), numbers)
+
+    def captures_at(self, starts: NDArray[np.int64], length: int, frame: NDArray[np.int64]) -> "Captures":
+        """Return capture segments of a recording that never stopped, timed by their first samples."""
+        begun = _times(self.meta["captures"], self.meta_path)[0]
+        elapsed = np.round(starts / self.sample_rate_hz * 1e9).astype(np.int64).astype("timedelta64[ns]")
+        return Captures(starts, length, begun + elapsed, frame)
+
+
+@dataclass(frozen=True)
+class Captures:
+    """Segments of a recording: first samples, one length, UTC time tags, frame numbers (-1 without)."""
+
+    starts: NDArray[np.int64]
+    length: int
+    time: NDArray[np.datetime64]
+    frame: NDArray[np.int64]
+
+
 def read_sigmf(meta_path: Path, data_path: Path, *, node: str) -> xr.Dataset:
-    """Return the `raw` stage of a SigMF recording, memory-mapped.
+    """Return the `raw` stage of a triggered SigMF recording: `open_sigmf`, then `cut` at its captures."""
+    recording = open_sigmf(meta_path, data_path)
+    return cut(recording, recording.captures(), node=node)
+
+
+def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
+    """Open a SigMF recording after checking its metadata, size and hash.
 
     Parameters
     ----------
     meta_path, data_path
         ``.sigmf-meta`` and ``.sigmf-data``, datatype ci16_le.
+
+    Raises
+    ------
+    CampaignError
+        If the metadata break the SigMF schema, the data are truncated, not those hashed, or a capture lies past
+        their end.
+
+    Notes
+    -----
+    Source: SigMF specification 1.2, section "Captures Array".
+    """
+    meta = _read_meta(meta_path)
+    channels = _channels(meta["global"], meta_path)
+    recording = Recording(_map(data_path, len(channels), meta, meta_path), channels, meta, meta_path, data_path)
+    recording.captures()
+    _check_hash(meta["global"], data_path)
+    return recording
+
+
+def cut(recording: Recording, captures: Captures, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of some captures of a recording.
+
+    Parameters
+    ----------
+    recording
+        From `open_sigmf`.
+    captures
+        Where to cut.
     node
         Name of the node that recorded.
 
@@ -34,31 +123,21 @@ def read_sigmf(meta_path: Path, data_path: Path, *, node: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If the metadata break the SigMF schema, the data are truncated or not those hashed, a capture lies
-        past the end, or a capture holds only zeros.
-
-    Notes
-    -----
-    Source: SigMF specification 1.2, section "Captures Array".
+        If a capture holds only zeros.
     """
-    meta = _read_meta(meta_path)
-    channels = _channels(meta["global"], meta_path)
-    frames = _map(data_path, len(channels), meta, meta_path)
-    starts, length = _segments(meta["captures"], len(frames), meta_path)
-    _check_hash(meta["global"], data_path)
-    iq = np.stack([frames[start : start + length] for start in starts])
-    _check_alive(iq, channels, data_path)
+    iq = np.stack([recording.samples[start : start + captures.length] for start in captures.starts])
+    _check_alive(iq, recording.channels, recording.data_path)
     return xr.Dataset(
         {
             "iq": (("channel", "pulse", "sample", "component"), np.moveaxis(iq, 2, 0)),
-            "time": ("pulse", _times(meta["captures"], meta_path)),
-            "frame": ("pulse", np.array([c.get("apertura:frame", -1) for c in meta["captures"]], np.int64)),
+            "time": ("pulse", captures.time),
+            "frame": ("pulse", captures.frame),
         },
         attrs={
             "node": node,
-            "channels": channels,
-            "sample_rate_hz": float(meta["global"]["core:sample_rate"]),
-            "frequency_hz": float(meta["captures"][0].get("core:frequency", 0.0)),
+            "channels": recording.channels,
+            "sample_rate_hz": recording.sample_rate_hz,
+            "frequency_hz": float(recording.meta["captures"][0].get("core:frequency", 0.0)),
         },
     )
 

@@ -4,20 +4,32 @@ from pathlib import Path
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.ingest import TRACKS, read_sigmf
+from apertura.ingest import TRACKS, cut, open_sigmf
 from apertura.provenance import sha256_file
 from apertura.steps.stamping import stamped
+from apertura.steps.triggering import triggered
 from apertura.store import save_stage
 
 
 def raw(campaign: Campaign, flight: str, node: str) -> Path:
-    """Write results/<flight>/<node>/raw.zarr from the node's SigMF recording."""
+    """Write results/<flight>/<node>/raw.zarr from the node's SigMF recording; a continuous one is triggered first."""
     meta, data = (campaign.raw_file(flight, node, suffix) for suffix in (".sigmf-meta", ".sigmf-data"))
-    dataset = stamped(
-        read_sigmf(meta, data, node=node), "raw", module=__name__, inputs=_hashes(campaign.root, meta, data)
+    recording = open_sigmf(meta, data)
+    files = [meta, data]
+    if recording.framing is None:
+        dataset = cut(recording, recording.captures(), node=node)
+    else:
+        files.append(campaign.root / recording.framing["preamble"])
+        dataset = triggered(recording, campaign, node=node)
+    stamp = stamped(
+        dataset,
+        "raw",
+        module=__name__,
+        settings=campaign.relevant("raw") if recording.framing else {},
+        inputs=_hashes(campaign.root, *files),
     )
     folder = campaign.stage("raw", flight, node)
-    save_stage(dataset, folder, chunks={"channel": 1, "pulse": 256})
+    save_stage(stamp, folder, chunks={"channel": 1, "pulse": 256})
     return folder
 
 
