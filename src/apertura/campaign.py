@@ -79,11 +79,28 @@ class Campaign:
             return []
         return [self.manifest("echo", first.name, pair) for pair in first.pairs]
 
+    def terrain_sources(self) -> list[str]:
+        """Return the stage of pixel heights, or nothing where the ground is flat."""
+        return [self.manifest("terrain")] if self.settings.scene.dem else []
+
+    def height_files(self) -> dict[str, Path]:
+        """Return role → file of the DEM and of the grid of the geoid, where the config names them."""
+        scene = self.settings.scene
+        return {role: self.root / name for role, name in (("dem", scene.dem), ("geoid", scene.geoid)) if name}
+
     def check_files(self) -> None:
         """Raise CampaignError unless every file that flights.tsv promises is there."""
         for flight in self.flights:
             for node in flight.nodes:
                 self.raw_files(flight.name, node)
+        for role, path in self.height_files().items():
+            if not path.is_file():
+                raise CampaignError(
+                    "no such file",
+                    where=path,
+                    expected=f"the file of config/config.yaml: scene.{role}",
+                    remedy=f"Copy it there, or correct scene.{role}.",
+                )
         waveform = self.settings.waveform
         if isinstance(waveform, OfdmWaveform) and not (self.root / waveform.codes).is_file():
             raise CampaignError(
@@ -103,9 +120,11 @@ class Campaign:
                 "nodes": nodes,
                 **{key: processing[key] for key in ("sidelink", "accuracy_db")},
             },
+            "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
             "scene": {"scene": settings["scene"]},
+            "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
             "profile": {"window": processing["window"]},
-            "image": {name: value for name, value in processing.items() if name not in {"window", "sidelink"}},
+            "image": {name: value for name, value in processing.items() if name not in {"window", "sidelink", "false_alarms_per_s"}},
         }
         return chosen.get(stage, {})
 

@@ -123,9 +123,7 @@ class Scene(Section):
     )
     spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
     height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
-    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field(
-        "ellipsoid", description="what height_m counts from"
-    )
+    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
     dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
     dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(
         None, description="what the heights of dem count from; carried: its own CRS says it"
@@ -145,7 +143,9 @@ class Scene(Section):
             raise ValueError(f"dem_datum={self.dem_datum} is given without dem")
         stated = {self.dem_datum, self.height_datum}
         if self.crs == "local" and stated & {"egm96", "egm2008"}:
-            raise ValueError("heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid")
+            raise ValueError(
+                "heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid"
+            )
         return self
 
     @model_validator(mode="after")
@@ -180,6 +180,9 @@ class Processing(Section):
     engine: Literal["auto", "native", "numba", "reference"] = Field("auto", description="backprojection engine")
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+    )
+    false_alarms_per_s: float = Field(
+        1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
     tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
     table_degree: Annotated[int, Field(ge=1, le=2)] | Literal["auto"] = Field(
