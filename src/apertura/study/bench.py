@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.simulate.impairments import Impairments
 from apertura.simulate.observation import Observation, observe
 from apertura.simulate.presets import paper_scene, paper_waveform
-from apertura.simulate.radar import Waveform, qpsk_codes
+from apertura.simulate.radar import Waveform, newman_codes, qpsk_codes
 from apertura.simulate.recording import Geometry, digitize, full_scale
 from apertura.simulate.scene import Scatterers
 from apertura.simulate.synthesis import transfer_functions
@@ -84,7 +84,7 @@ def paper_bench(
     """
     waveform = paper_waveform(prf_hz=pulses * speed_m_s / length_m)
     every = len(waveform.codes) // subcarriers
-    codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else waveform.codes[::every]
+    codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else newman_codes(subcarriers)
     waveform = replace(waveform, codes=codes, subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz)
     scatterers, geometry = paper_scene(pulses=pulses, length_m=length_m, rx_ahead_m=rx_ahead_m)
     return Bench(waveform, scatterers, geometry)

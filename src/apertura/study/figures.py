@@ -17,6 +17,9 @@ SHOWN = {"carrier_phase": 1.0, "timing": 0.5, "cfo": 50.0, "sfo": 400.0, "locali
 """Size of each error that is drawn, in its unit."""
 
 RANGE_DB = 50.0
+PULSES = 600
+"""At least: fewer show grating lobes beside the track."""
+
 _CROSS_M = np.linspace(-7, 7, 351)
 _GROUND_M = np.linspace(2, 28, 261)
 
@@ -34,7 +37,7 @@ def draw_error(name: str, path: Path, *, seed: int = 1) -> Path:
         Of what is random.
     """
     error = ERRORS[name]
-    bench = error.bench()
+    bench = error.bench(max(error.pulses, PULSES))
     figure = Figure(figsize=(12, 9), layout="constrained")
     axes = figure.subplots(2, 2)
     cases = ((Case(transmitter=error.case(0.0).transmitter), "no error"), (error.case(SHOWN[name]), _label(name)))
@@ -65,7 +68,7 @@ def _seen(bench: Bench, case: Case, *, divided: bool, seed: int) -> tuple[numba.
 def _draw_data(axes: Axes, bench: Bench, data: numba.Tables, peak: float, words: str) -> None:
     """Draw the profiles on one axis of total path, which begins elsewhere in each pulse."""
     every = max(1, len(data.samples) // 400)
-    path_m = np.arange(24.0, 66.0, 0.1)
+    path_m = np.arange(20.0, 66.0, 0.1)
     levels = [_level_at(data, pulse, path_m) for pulse in range(0, len(data.samples), every)]
     along = bench.geometry.radar_tx[:, 0]
     extent = (along[0], along[-1], path_m[0] / 2, path_m[-1] / 2)

@@ -202,7 +202,7 @@ SWEEPS: Mapping[str, Sweep] = {
         lambda size: {"missed_fraction": size}, logarithmic=False, draws=4,
     ),
     "doppler": Sweep(
-        "Speed of both nodes within the pulse", "m/s", (1, 3, 10, 30, 100, 300, 1000), lambda _: {},
+        "Speed of both nodes within the pulse", "m/s", (1, 3, 10, 30, 100, 300, 1000), lambda _: {"doppler": True},
         subcarriers=4096, sampled=True, draws=1, moving=True,
     ),
 }  # fmt: skip

@@ -1,0 +1,344 @@
+"""The studies: the paper's claims computed, the loss table met, thinning that changes nothing, jobs that resume."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from typer.testing import CliRunner
+
+from apertura.simulate.impairments import Clock, Impairments, Localization, Timing, UniformPhase
+from apertura.simulate.observation import observe
+from apertura.simulate.synthesis import samples
+from apertura.study import commands, formulas
+from apertura.study.atlas import edge_of, join_parts, part_path, read_outcomes, write_outcomes
+from apertura.study.bench import Case, paper_bench, receive_pair
+from apertura.study.charts import draw_impairment
+from apertura.study.claims import Claim, compare, read_claims, write_claims
+from apertura.study.coherence import coherence_claims
+from apertura.study.corrected import clock_claims, corrected_claims
+from apertura.study.focus import coherence_factors, decibels, find_peaks, half_power_widths, history, range_tables
+from apertura.study.losses import DESTROYED_DB, ERRORS, loss_claims
+from apertura.study.parameters import parameter_claims
+from apertura.study.resolution import simulated_table, uav_table
+from apertura.study.stability import Outcome, correct, crossing, run_sweep
+from apertura.study.sweeps import CHOICES, SWEEPS
+from apertura.study.window import demodulated, window_samples
+
+
+def by_claim(claims):
+    return {claim.claim: claim for claim in claims}
+
+
+def outcome(size, loss_db, *, impairment="timing", method="none"):
+    return Outcome(impairment, "ns", size, method, loss_db, 0.0, 0.9, 0.3, 0.07, -40.0, 1.0, method, 1, 1)
+
+
+def test_what_follows_from_parameters_is_what_the_paper_says():
+    found = by_claim(parameter_claims())
+    assert found["bandwidth N·Δf"].computed == "409.6"
+    assert found["mean data rate at 100 Hz"].computed == "44.8"
+    assert found["SFO limit f_s(1 − 1/(1 + 1/BT))"].computed == "199.96"
+    assert found["timing of the samples 2δR/c, δR = 2 cm"].computed == "133.4"
+    assert all(claim.verdict.startswith("agrees") for claim in found.values() if claim.claimed not in ("", "12.5"))
+
+
+def test_contradictions_of_the_paper_are_noted_where_they_stand():
+    found = by_claim([*parameter_claims(), *uav_table(pulses=60)])
+    for name in (
+        "OFDM symbol T against 1/Δf",
+        "CFO of a clock off by 10 ppb",
+        "UAV flight: cross-range width as printed",
+    ):
+        assert "contradicts itself" in found[name].verdict
+    assert found["UAV flight: cross-range width as printed"].verdict.startswith("differs")
+
+
+def test_limits_are_where_orthogonality_ends():
+    # at the limit the sampling clock slips by one turn of the last subcarrier over the symbol
+    limit_hz = formulas.sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6)
+    slip_s = 12.5e-6 * limit_hz / (1.024e9 - limit_hz)
+    assert slip_s * 409.6e6 == pytest.approx(1, rel=1e-9)
+    assert 20 * np.log10(np.sinc(formulas.cfo_limit_hz(100e3) / 100e3)) == pytest.approx(-0.143, abs=1e-3)
+
+
+def test_coherence_follows_from_snr_and_back():
+    for coherence in (0.3, 0.986, 0.9999):
+        snr = formulas.snr_of_coherence_factor(coherence, 200)
+        assert formulas.expected_coherence_factor(snr, 200) == pytest.approx(coherence, rel=1e-12)
+
+
+def test_five_targets_are_as_wide_as_the_table_says():
+    claims = simulated_table(pulses=150)
+    assert len(claims) == 10
+    assert [claim.claim for claim in claims if not claim.verdict.startswith("agrees")] == []
+
+
+def test_uav_flight_and_fusion_are_as_wide_as_the_table_says():
+    found = by_claim(uav_table(pulses=60))
+    assert float(found["UAV flight: fused cross-range width"].computed) == pytest.approx(11, rel=0.05)
+    assert float(found["UAV flight: fused ground-range width"].computed) == pytest.approx(49, rel=0.05)
+
+
+def test_coherence_is_one_over_m_without_correction_and_that_of_the_noise_with_it():
+    claims = coherence_claims(draws=12)
+    assert [claim.claim for claim in claims if not claim.verdict.startswith("agrees")] == []
+    assert float(claims[0].computed) == pytest.approx(1 / 200, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "case"),
+    [
+        ("carrier_phase", 0.5, Case(Impairments(carrier_phase=UniformPhase(np.pi / 2)))),
+        ("timing", 0.2, Case(Impairments(timing=Timing(half_width_s=0.2e-9)))),
+        ("cfo", 50, Case(Impairments(clock=Clock(cfo_hz=50e3)), sampled=True)),
+        ("sfo", 200, ERRORS["sfo"].case(200)),
+    ],
+)
+def test_one_size_of_each_error_costs_what_the_independent_model_says(name, size, case):
+    error = ERRORS[name]
+    bench = error.bench(600 if name in ("carrier_phase", "timing") else 150)
+    targets = bench.scatterers.position_m
+    peaks = [
+        find_peaks(range_tables(history(bench, radar), targets), targets, reach_m=error.reach_m)[1]
+        for radar in (receive_pair(bench, one, np.random.default_rng(5))[0] for one in (Case(), case))
+    ]
+    assert decibels(peaks[1] / peaks[0]).mean() == pytest.approx(error.claimed_db[size], abs=0.5)
+
+
+def test_localization_costs_what_the_independent_model_says(monkeypatch):
+    error = ERRORS["localization"]
+    monkeypatch.setitem(ERRORS, "localization", replace(error, claimed_db={1: -1.24}, pulses=300))
+    (claim,) = loss_claims("localization", draws=6)
+    assert claim.verdict.startswith("agrees within 1 dB; mean of 6 draws, spread")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ERRORS)
+def test_the_whole_loss_table_is_met(name):
+    claims = loss_claims(name)
+    assert [(c.claim, c.verdict) for c in claims if not c.verdict.startswith("agrees")] == []
+    deep = [claim for claim, loss in zip(claims, ERRORS[name].claimed_db.values(), strict=True) if loss < DESTROYED_DB]
+    assert all("destroyed" in claim.verdict for claim in deep)
+
+
+@pytest.mark.slow
+def test_phase_and_timing_inside_the_prefix_cost_nothing_after_any_correction():
+    claims = corrected_claims()
+    assert len(claims) == 4
+    assert all(float(claim.computed) < 0.01 for claim in claims)
+
+
+@pytest.mark.slow
+def test_correcting_an_8_ppm_clock_in_the_samples_lowers_the_floor_by_20_db():
+    (claim,) = clock_claims(pulses=20)
+    assert float(claim.computed) > 20
+
+
+def test_fewer_pulses_and_subcarriers_do_not_change_a_loss():
+    # one random walk of the phase, seen by four times as many pulses and by thrice as many subcarriers
+    losses = []
+    for pulses, subcarriers in ((150, 128), (600, 128), (150, 512)):
+        bench = paper_bench(pulses=pulses, subcarriers=subcarriers)
+        targets = bench.scatterers.position_m
+        radar, _, _ = receive_pair(bench, Case(), np.random.default_rng(0))
+        along = bench.geometry.radar_tx[:, :1] / 15
+        wrong = (radar * np.exp(1.5j * np.cos(7 * along) + 1j * along**2)).astype(np.complex64)
+        clean, dirty = (find_peaks(range_tables(history(bench, one), targets), targets)[1] for one in (radar, wrong))
+        losses.append(decibels(dirty / clean))
+    assert losses[0].mean() < -1.5
+    assert_allclose(losses[1], losses[0], atol=0.05)
+    assert_allclose(losses[2], losses[0], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "impairments",
+    [
+        Impairments(clock=Clock(2e4, 3e4), timing=Timing(offset_s=3e-9)),
+        Impairments(carrier_phase=UniformPhase(), timing=Timing(offset_s=-1e-6)),
+        Impairments(doppler=True, clock=Clock(cfo_hz=5e3)),
+    ],
+)
+def test_the_window_of_many_pulses_is_that_of_the_simulated_captures(impairments):
+    bench = paper_bench(pulses=3, subcarriers=4096, rx_ahead_m=4.7, qpsk=True)
+    fast = np.tile([100.0, 0.0, 0.0], (3, 1))
+    geometry = replace(bench.geometry, tx_velocity=fast, rx_velocity=-fast)
+    seen = observe(bench.waveform, bench.scatterers, geometry, np.random.default_rng(1), receiver=impairments)
+    channel = seen.channels["radar"]
+    expected = samples(channel, None)[:, 3200:13440]
+    assert_allclose(window_samples(channel, None), expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_symbols_of_window_samples_are_the_transfer_functions():
+    bench = paper_bench(pulses=3, subcarriers=512)
+    exact, _, seen = receive_pair(bench, Case(), np.random.default_rng(0))
+    through = demodulated(window_samples(seen.channels["radar"], None), bench.waveform)
+    assert_allclose(through, exact, atol=1e-6 * np.abs(exact).max())
+
+
+def test_a_quantised_channel_keeps_its_scale_and_loses_what_bits_lose():
+    bench = paper_bench(pulses=3, subcarriers=512)
+    exact, _, _ = receive_pair(bench, Case(), np.random.default_rng(0))
+    coarse, _, _ = receive_pair(bench, Case(sampled=True, quantised=True), np.random.default_rng(0))
+    error = np.sqrt(np.mean(np.abs(coarse - exact) ** 2) / np.mean(np.abs(exact) ** 2))
+    steps = 0.41 / (2**13 * 10 ** (-14 / 20)) * np.sqrt(512 / 1280)  # rounding, in the band, against I and Q
+    assert error == pytest.approx(steps, rel=0.5)
+
+
+def test_peaks_widths_and_coherence_agree_with_their_definitions():
+    bench = paper_bench(pulses=150, subcarriers=128)
+    targets = bench.scatterers.position_m
+    one = replace(bench, scatterers=replace(bench.scatterers, position_m=targets[2:3], amplitude=np.ones(1)))
+    radar, _, _ = receive_pair(one, Case(), np.random.default_rng(0))
+    seen = history(one, radar)
+    tables = range_tables(seen, targets[2:3])
+    places, levels = find_peaks(tables, targets[2:3] + [0.013, -0.04, 0])
+    amplitude = 1 / np.linalg.norm(one.geometry.radar_tx - targets[2], axis=1) ** 2
+    assert_allclose(places[0], targets[2], atol=2e-3)
+    assert levels[0] == pytest.approx(amplitude.mean(), rel=1e-3)
+    expected = amplitude.sum() ** 2 / (amplitude.size * (amplitude**2).sum())
+    assert coherence_factors(seen, places)[0] == pytest.approx(expected, abs=1e-3)
+    ground, cross = half_power_widths(tables, places[0])
+    assert (ground, cross) == (pytest.approx(0.32, rel=0.05), pytest.approx(0.0712, rel=0.05))
+
+
+def test_a_loss_table_row_says_destroyed_only_where_both_are(monkeypatch):
+    assert compare("x", -20.0, -5.0, "dB", within=0.5, relative=False).verdict == "differs by +15 dB"
+    error = ERRORS["carrier_phase"]
+    monkeypatch.setitem(ERRORS, "carrier_phase", replace(error, claimed_db={1.0: -30.0, 0.9: 0.0}, pulses=300))
+    claim, other = loss_claims("carrier_phase", draws=1)
+    assert other.verdict.startswith("differs")
+    assert claim.verdict.startswith("agrees: destroyed")
+
+
+def test_claims_survive_their_file(tmp_path):
+    rows = [Claim("a, b", "1", "2", "dB", 'differs; says "so"'), Claim("c", "", "3", "1", "computed")]
+    write_claims(tmp_path / "deep" / "claims.csv", rows)
+    assert read_claims(tmp_path / "deep" / "claims.csv") == rows
+    assert (tmp_path / "deep" / "claims.csv").read_text().splitlines()[0] == "claim,claimed,computed,unit,verdict"
+    assert list((tmp_path / "deep").iterdir()) == [tmp_path / "deep" / "claims.csv"]
+
+
+def test_a_loss_is_crossed_between_the_sizes_that_enclose_it():
+    sizes, losses = np.array([1.0, 2.0, 4.0, 8.0]), np.array([0.0, 0.5, 2.5, 9.0])
+    assert crossing(sizes, losses, 1.0, logarithmic=False) == pytest.approx(2.5)
+    assert crossing(sizes, losses, 1.0, logarithmic=True) == pytest.approx(2 * 2**0.25)
+    assert crossing(sizes[::-1], losses, 1.0, logarithmic=False) == pytest.approx(3.5)
+    assert crossing(sizes, losses + 5, 1.0, logarithmic=False) == 1.0
+    assert np.isnan(crossing(sizes, losses, 10.0, logarithmic=True))
+
+
+def test_every_impairment_of_the_simulator_is_swept():
+    swept = set()
+    for sweep in SWEEPS.values():
+        receiver, perfect = sweep.receiver(sweep.sizes[-1]), Impairments()
+        swept |= set(receiver)
+        sender = sweep.transmitter(sweep.sizes[-1])
+        swept |= {name for name in vars(perfect) if getattr(sender, name) != getattr(perfect, name)}
+        swept |= {"time_tag"} if sweep.tagged else set()
+    assert swept == set(vars(Impairments()))
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_sizes_of_a_sweep_go_one_way(name):
+    steps = np.diff(SWEEPS[name].sizes)
+    assert (steps > 0).all() or (steps < 0).all()
+    assert not SWEEPS[name].logarithmic or min(SWEEPS[name].sizes) > 0
+
+
+def short(monkeypatch, name, *sizes):
+    monkeypatch.setitem(SWEEPS, name, replace(SWEEPS[name], sizes=sizes, draws=1, subcarriers=512))
+
+
+def test_wild_phases_destroy_the_image_and_every_correction_restores_it(monkeypatch):
+    short(monkeypatch, "carrier_phase", 1.0)
+    losses = {method: next(run_sweep("carrier_phase", method)).loss_db for method in CHOICES}
+    assert losses.pop("none") > 12
+    assert max(map(abs, losses.values())) < 0.05
+
+
+def test_moving_while_the_pulse_lasts_costs_nothing_below_10_m_s_and_something_at_3000(monkeypatch):
+    monkeypatch.setitem(SWEEPS, "doppler", replace(SWEEPS["doppler"], sizes=(10.0, 3000.0), subcarriers=512))
+    slow, fast = run_sweep("doppler", "none")
+    assert abs(slow.loss_db) < 0.01
+    assert fast.floor_db > slow.floor_db + 8
+
+
+def test_wrong_time_tags_misplace_the_receiver_by_speed_times_error(monkeypatch):
+    short(monkeypatch, "time_tag", 1.0, 100.0)
+    harmless, ruinous = run_sweep("time_tag", "divide")
+    assert abs(harmless.loss_db) < 0.1
+    assert ruinous.loss_db > 3
+
+
+def test_a_sidelink_that_never_locks_is_refused_not_imaged(monkeypatch):
+    short(monkeypatch, "sidelink_gain", -70.0)
+    for method in ("divide", "auto"):
+        (row,) = run_sweep("sidelink_gain", method)
+        assert (row.chosen, row.pulses_used, row.loss_db) == ("refused", 0.0, 40.0)
+
+
+def test_blocked_pulses_are_dropped_by_every_method_alike():
+    bench = paper_bench(pulses=60, subcarriers=512, rx_ahead_m=4.7)
+    sweep = SWEEPS["sidelink_blockage"]
+    radar, sidelink, seen = receive_pair(bench, sweep.case(0.4), np.random.default_rng(3))
+    everything = np.ones(60, bool)
+    for method in CHOICES[1:]:
+        kept, transfer, _ = correct(method, radar, sidelink, everything)
+        assert (kept == ~seen.hidden.blocked).all()
+        assert len(transfer) == kept.sum() < 60
+    assert correct("none", radar, sidelink, everything)[0].all()
+
+
+@pytest.mark.slow
+def test_auto_is_within_a_fifth_of_a_decibel_of_the_best_at_every_snr(monkeypatch):
+    monkeypatch.setitem(
+        SWEEPS, "sidelink_noise", replace(SWEEPS["sidelink_noise"], sizes=(30, 10, 5, 0, -10, -20), draws=1)
+    )
+    loss = {method: [abs(one.loss_db) for one in run_sweep("sidelink_noise", method)] for method in CHOICES[1:]}
+    best = np.min([loss[method] for method in CHOICES[1:-1]], axis=0)
+    assert (np.array(loss["auto"]) - best).max() < 0.2
+
+
+def test_outcomes_survive_their_file_and_give_an_edge(tmp_path):
+    rows = [outcome(0.1, 0.0), outcome(1.0, float("nan")), outcome(10.0, 4.0)]
+    write_outcomes(tmp_path / "a.csv", rows)
+    again = read_outcomes(tmp_path / "a.csv")
+    assert again[0] == rows[0]
+    assert np.isnan(again[1].loss_db)
+    edge = edge_of([outcome(0.1, 0.0), outcome(1.0, 0.5), outcome(10.0, 1.5)])
+    assert edge.size_at_1_db == pytest.approx(10**0.5, rel=1e-5)
+    assert np.isnan(edge.size_at_3_db)
+
+
+def test_a_chart_is_the_same_bytes_for_the_same_rows(tmp_path):
+    for method in CHOICES:
+        write_outcomes(part_path(tmp_path, "timing", method), [outcome(s, s, method=method) for s in (0.1, 1.0, 10.0)])
+    rows = join_parts(tmp_path, "timing")
+    assert len(read_outcomes(tmp_path / "timing.csv")) == 3 * len(CHOICES)
+    for name in ("a.png", "b.png"):
+        draw_impairment("timing", rows, tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_parts_of_the_claims_are_the_errors_of_the_table():
+    parts = [part.removeprefix("loss_") for part in commands.PAPER_PARTS if part.startswith("loss_")]
+    assert parts == list(ERRORS)
+
+
+def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
+    short(monkeypatch, "missed_triggers", 0.1, 0.5)
+    run = CliRunner().invoke(commands.app, ["stability-sweep", "missed_triggers", "divide", "--folder", str(tmp_path)])
+    assert run.exit_code == 0, run.output
+    rows = read_outcomes(part_path(tmp_path, "missed_triggers", "divide"))
+    assert [row.size for row in rows] == [0.1, 0.5]
+    assert rows[1].pulses_used < 0.7 < rows[0].pulses_used
+    CliRunner().invoke(commands.app, ["paper-part", "parameters", "--folder", str(tmp_path)])
+    assert len(read_claims(tmp_path / "parts" / "parameters.csv")) > 10
+
+
+def test_a_localization_error_moves_antennas_and_not_the_logs():
+    wrong = Impairments(localization=Localization(0.02))
+    bench = paper_bench(pulses=150, subcarriers=128, rx_ahead_m=4.7)
+    _, _, seen = receive_pair(bench, Case(wrong, wrong), np.random.default_rng(0))
+    assert np.std(seen.truth.radar_rx - bench.geometry.radar_rx) == pytest.approx(0.02, rel=0.3)
