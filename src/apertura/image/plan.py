@@ -40,6 +40,9 @@ class Job:
         (row, column) float64 of a DEM at the places of the net; None without one.
     path_limit_m
         Longest total path inside the cyclic prefix.
+    content_db
+        How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
+        errors of tables weigh that much more. None before anything was recorded.
     """
 
     tx_position_m: NDArray[np.float64]
@@ -56,6 +59,7 @@ class Job:
     threads: int = 1
     heights_m: NDArray[np.float64] | None = None
     path_limit_m: float = np.inf
+    content_db: float | None = None
 
     @property
     def load(self) -> Load:

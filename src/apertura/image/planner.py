@@ -15,7 +15,10 @@ from apertura.image.thinning import Presum, design, presum_error_db
 from apertura.image.view import View, look
 
 MARGIN_DB = 3.0
-"""Predicted errors lie this far below what is asked: random pixels of a sparse scene err more than a flat spectrum."""
+"""Predicted errors lie this far below what is asked."""
+
+UNSEEN_DB = 3.0
+"""And this much further before the echo is there: at random pixels of a sparse scene errors weigh more."""
 
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 _NET_PULSES = 48
@@ -59,7 +62,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     )
     some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
     desk = _Desk(job, look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m), costs, asked)
-    whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
+    whole = desk.cheapest(len(job.tx_position_m), desk.target_db(accuracy_db))
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
     models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
@@ -68,7 +71,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         setting=chosen,
         better=desk.ladder(chosen.error_db, chosen.engine),
         decisions=(*_setting_decisions(chosen, asked, accuracy_db, costs), thinning, midpoint, _decide_terrain(desk)),
-        predicted_error_db=power_sum_db(chosen.error_db, *models),
+        predicted_error_db=power_sum_db(chosen.error_db, *models) + max(0.0, job.content_db or 0.0),
         predicted_seconds=_wall_seconds(chosen, job),
         memory_bytes=memory,
         disk_bytes=disk,
@@ -92,6 +95,11 @@ class _Desk:
     view: View
     costs: Costs
     asked: Mapping[str, Any]
+
+    def target_db(self, accuracy_db: float) -> float:
+        """Return the error that a flat spectrum of incoherent pixels may show for the accuracy to be met."""
+        unseen = UNSEEN_DB if self.job.content_db is None else max(0.0, self.job.content_db)
+        return accuracy_db - MARGIN_DB - unseen
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
         """Return the cheapest setting that meets the target, or the best there is."""
@@ -134,7 +142,7 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
         return keep("asked for in config/config.yaml")
     if whole.engine == "reference":
         return keep("the double sum takes every pulse")
-    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, accuracy_db - 2 * MARGIN_DB)
+    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, desk.target_db(accuracy_db) - 3)
     if found is None and asked:
         raise CampaignError(
             f"pulse_thinning is {asked}",
@@ -144,11 +152,11 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
         )
     if found is None:
         return keep(
-            f"fewer pulses would err by more than {accuracy_db - 2 * MARGIN_DB:.0f} dB even after a low-pass sum"
+            f"fewer pulses would err by more than {desk.target_db(accuracy_db) - 3:.0f} dB even after a low-pass sum"
         )
     presum, error_db = found
     spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
-    less = desk.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
+    less = desk.cheapest(len(presum.at), desk.target_db(accuracy_db) - 1)
     if not asked and spent + less.seconds > 0.9 * whole.seconds:
         return keep(
             f"a low-pass sum {presum.factor}:1 takes {spent:.2g} s and saves {whole.seconds - less.seconds:.2g} s"

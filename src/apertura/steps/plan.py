@@ -14,14 +14,17 @@ from rich.table import Table
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import centre_frequency, range_step
+from apertura.echo.compression import centre_frequency, range_step, window_weights
 from apertura.echo.demodulate import subcarrier_numbers
 from apertura.echo.geometry import phase_centres
 from apertura.errors import CampaignError
 from apertura.image.candidates import Signal
 from apertura.image.cost import read_costs
+from apertura.image.engines import reference
 from apertura.image.extent import swath
 from apertura.image.grid import LOCAL, SceneGrid
+from apertura.image.history import Spectra
+from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
 from apertura.ingest import PHASE_HISTORIES, TRACKS
@@ -43,14 +46,18 @@ OVERRIDES = (
 _NET = 9
 
 
+_CONTENT_PIXELS = 128
+
+
 @dataclass(frozen=True)
 class Outlook:
-    """What is known of a pair's echo before it is formed, or after: phase centres (pulse, 3), band, prefix."""
+    """What is known of a pair's echo before it is formed, or after: phase centres (pulse, 3), band, prefix, spectra."""
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     frequency_hz: NDArray[np.float64]
     path_limit_m: float
+    spectra: Spectra | None = None
 
 
 def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
@@ -104,7 +111,16 @@ def job_of(outlook: Outlook, grid: SceneGrid, *, tile_px: int, threads: int) -> 
         tile_px=tile_px,
         threads=threads,
         path_limit_m=outlook.path_limit_m,
+        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid),
     )
+
+
+def _content_db(spectra: Spectra, grid: SceneGrid) -> float:
+    """Return how much errors weigh at some random pixels of the scene."""
+    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
+    places = grid.positions_at(rows, columns)
+    parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
+    return content_loss_db(np.concatenate([reference.terms(spectra, places, pulses=part) for part in parts]))
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:
@@ -185,7 +201,7 @@ def _grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
     asked = campaign.settings.scene
     if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
         return scene_grid(campaign)
-    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m)[0]
+    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
 
 
 def _outlook(campaign: Campaign, flight: str, pair: str) -> Outlook:
@@ -198,9 +214,10 @@ def _outlook(campaign: Campaign, flight: str, pair: str) -> Outlook:
         echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
     else:
         return _expected(campaign, flight, pair, waveform)
-    return Outlook(
-        echo.tx_position.values, echo.rx_position.values, echo.frequency.values, float(echo.path_limit.values.min())
-    )
+    tx, rx, frequency = echo.tx_position.values, echo.rx_position.values, echo.frequency.values
+    weight = window_weights(campaign.settings.processing.window, len(frequency))
+    spectra = Spectra(echo.transfer.values, frequency, weight, echo.reference_delay.values, tx, rx)
+    return Outlook(tx, rx, frequency, float(echo.path_limit.values.min()), spectra)
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:

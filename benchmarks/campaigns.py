@@ -1,0 +1,126 @@
+"""Random small campaigns as arrays: what a planner must cope with, from 30 m to 10 km and 0.4 to 10 GHz."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
+from apertura.image.extent import swath
+from apertura.image.grid import SceneGrid
+from apertura.image.history import Profiles, Spectra
+from apertura.image.plan import Job
+from apertura.steps.plan import Outlook, job_of
+from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A campaign: what was recorded, where it is imaged, how exact that has to be."""
+
+    name: str
+    spectra: Spectra
+    profiles: Profiles
+    grid: SceneGrid
+    job: Job
+    accuracy_db: float
+
+
+def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160) -> Drawn:
+    """Return one campaign; everything about it is drawn."""
+
+    def between(low: float, high: float) -> float:
+        return float(np.exp(generator.uniform(np.log(low), np.log(high))))
+
+    carrier, range_m = between(0.4e9, 10e9), between(30, 10e3)
+    bandwidth = min(between(50e6, 600e6), 0.4 * carrier)
+    wavelength = C / carrier
+    spacing = min(between(wavelength / 8, 1.0), range_m / pixels)
+    grid = SceneGrid("local", 0.0, pixels * spacing, spacing, (pixels, pixels - 7), 0.0)
+    tx, rx = _fly(
+        generator, grid, range_m, wavelength, pulses=pulses, step_m=between(wavelength / 60, range_m / pulses)
+    )
+    window = str(generator.choice(["hann", "none"]))
+    spectra = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
+    accuracy = float(generator.choice([-50.0, -60.0, -70.0, -80.0]))
+    profiles = _compressed(spectra, grid, window)
+    outlook = Outlook(tx, rx, spectra.frequency_hz, np.inf, spectra)
+    name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
+    return Drawn(name, spectra, profiles, grid, job_of(outlook, grid, tile_px=256, threads=1), accuracy)
+
+
+def _fly(
+    generator: np.random.Generator,
+    grid: SceneGrid,
+    range_m: float,
+    wavelength_m: float,
+    *,
+    pulses: int,
+    step_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    look, heading = np.radians(generator.uniform(25, 70)), generator.uniform(0, 2 * np.pi)
+    middle = np.array([grid.x_m.mean(), grid.y_m.mean(), 0.0])
+    away = np.array([np.cos(heading), np.sin(heading), 0.0])
+    ahead = np.array([-away[1], away[0], 0.0])
+    start = middle - range_m * np.sin(look) * away + [0.0, 0.0, range_m * np.cos(look)]
+    along = step_m * (np.arange(pulses) - pulses / 2 + generator.uniform(-0.2, 0.2) * pulses)
+
+    def wobble() -> NDArray[np.float64]:
+        turns = generator.uniform(0.5, 3, (3, 3)) * np.linspace(0, 2 * np.pi, pulses)[:, None, None]
+        size = generator.uniform(0, 0.2) * wavelength_m
+        return size * np.sin(turns + generator.uniform(0, 6, (3, 3))).sum(-1)
+
+    tx = start + along[:, None] * ahead + wobble()
+    if generator.random() < 0.4:
+        return tx, tx
+    apart = generator.uniform(-0.3, 0.3, 3) * range_m * [1, 1, 0.2]
+    return tx, start + apart + 0.9 * along[:, None] * ahead + wobble()
+
+
+def _record(
+    generator: np.random.Generator,
+    grid: SceneGrid,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    *,
+    carrier_hz: float,
+    bandwidth_hz: float,
+    window: str,
+) -> Spectra:
+    near, far = swath(grid, tx, rx)
+    cells = (far - near).max() * bandwidth_hz / C + 2 * GUARD_SAMPLES / OVERSAMPLING
+    count = int(np.ceil(1.2 * cells)) + 16
+    frequency = carrier_hz + bandwidth_hz * (np.arange(count) / count - 0.5)
+    targets = generator.integers(1, 25)
+    rows, columns = (generator.uniform(0, size - 1, targets) for size in grid.shape)
+    places = grid.positions_at(rows, columns)
+    gains = generator.standard_normal(targets) + 1j * generator.standard_normal(targets)
+    path = sum(np.linalg.norm(places - antenna[:, None], axis=-1) for antenna in (tx, rx))
+    reference = near / C
+    transfer = np.zeros((len(tx), count), np.complex128)
+    for delay, gain in zip((path / C - reference[:, None]).T, gains, strict=True):
+        transfer += gain * np.exp(-2j * np.pi * frequency * delay[:, None])
+    noise = 10 ** (generator.uniform(-60, 10) / 20)
+    transfer += noise * (generator.standard_normal(transfer.shape) + 1j * generator.standard_normal(transfer.shape))
+    weights = window_weights(window, count)
+    return Spectra(transfer.astype(np.complex64), frequency, weights, reference, tx, rx)
+
+
+def _compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
+    near, far = swath(grid, spectra.tx_position_m, spectra.rx_position_m)
+    frequency = spectra.frequency_hz
+    step, length = range_step(frequency, oversampling=OVERSAMPLING)
+    start = near - GUARD_SAMPLES * step
+    count = int(np.ceil((far - near).max() / step)) + 2 * GUARD_SAMPLES + 1
+    samples = compress(
+        spectra.transfer,
+        frequency,
+        weight=window_weights(window, len(frequency)),
+        reference_delay_s=spectra.reference_delay_s,
+        start_m=start,
+        count=count,
+        oversampling=OVERSAMPLING,
+    )
+    centre, oversampling = centre_frequency(frequency), length / len(frequency)
+    return Profiles(samples, start, step, centre, oversampling, spectra.tx_position_m, spectra.rx_position_m)

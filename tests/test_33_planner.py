@@ -1,0 +1,393 @@
+"""The planner: each rule on both sides of its edge, what it predicts against what is certified, and its thrift."""
+
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.errors import CampaignError
+from apertura.image.candidates import Signal, candidates
+from apertura.image.cost import Costs, default_costs, read_costs, write_costs
+from apertura.image.edges import crossed_edges, finest_cell_m
+from apertura.image.engines import ENGINES, native, reference
+from apertura.image.history import Profiles
+from apertura.image.models import decide_midpoint, decide_terrain, midpoint_error, phase_rates
+from apertura.image.plan import Job
+from apertura.image.planner import ladder, make_plan
+from apertura.image.quality import numerical_error
+from apertura.image.thinning import design, presum_error_db, thin
+from apertura.image.view import forms, look
+from apertura.steps.plan import check_fits
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+from campaigns import draw
+
+COSTS = default_costs("avx512")
+WAVELENGTH = C / 1.2e9
+compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
+
+
+def net(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5) -> np.ndarray:
+    """Places on flat ground north of the track, rows going south."""
+    east, north = np.meshgrid(np.linspace(-size_m / 2, size_m / 2, count), north_m + np.linspace(size_m, 0, count))
+    return np.stack([east, north, 0 * east], -1)
+
+
+def track(pulses: int = 300, *, length_m: float = 6.0, height_m: float = 10.0, wobble_m: float = 0.0) -> np.ndarray:
+    """Eastward at north 0; the wobble is an amplitude, up and down."""
+    along = np.linspace(-length_m / 2, length_m / 2, pulses)
+    return np.stack([along, 0 * along, height_m + wobble_m * np.sin(2 * np.pi * along / length_m * 3)], -1)
+
+
+def job(**changes) -> Job:
+    tx = track()
+    plain = Job(tx, tx, net(), (200, 200), 0.05, 1.2e9, 400e6, 512, Signal(1.2e9, 2.0, C / 800e6, 120), frame="local")
+    return replace(plain, **changes)
+
+
+def plan(accuracy_db: float = -60.0, *, overrides=None, **changes):
+    return make_plan(job(**changes), accuracy_db=accuracy_db, costs=COSTS, overrides=overrides)
+
+
+def random_values(spectra, grid, image):
+    rows, columns = np.random.default_rng(1).integers(0, grid.shape, (200, 2)).T
+    exact = reference.form(spectra, grid.positions()[rows, columns])
+    return numerical_error(image[rows, columns].astype(np.complex64), exact).rms_db
+
+
+def formed(drawn, setting, profiles):
+    engine = ENGINES[setting.engine]
+    history = {"echo": drawn.spectra, "profile": profiles}[engine.reads]
+    return engine.form(engine.prepare(history, **setting.options), drawn.grid.positions(), **setting.form_options)
+
+
+def certified(drawn) -> tuple[float, int]:
+    """Return the certified error and how often a better setting was needed, as the image step goes about it."""
+    found = make_plan(drawn.job, accuracy_db=drawn.accuracy_db, costs=COSTS)
+    error = random_values(drawn.spectra, drawn.grid, formed(drawn, found.setting, found.history(drawn.profiles)))
+    for redone, better in enumerate(ladder(found)):
+        if error <= drawn.accuracy_db:
+            return error, redone
+        error = random_values(drawn.spectra, drawn.grid, formed(drawn, better, drawn.profiles))
+    return error, len(ladder(found))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_certified_error_is_met_and_the_first_setting_does(seed):
+    drawn = draw(np.random.default_rng(seed), pixels=48, pulses=90)
+    error, redone = certified(drawn)
+    assert error <= drawn.accuracy_db
+    assert redone == 0
+
+
+@pytest.mark.slow
+def test_over_30_random_campaigns_the_certified_error_is_met():
+    redone = 0
+    for seed in range(30):
+        drawn = draw(np.random.default_rng(seed), pixels=80, pulses=160)
+        error, tries = certified(drawn)
+        assert error <= drawn.accuracy_db, drawn.name
+        redone += tries
+    assert redone <= 1
+
+
+def test_the_same_job_and_costs_give_the_same_plan():
+    first, second = plan(), plan()
+    assert first.setting == second.setting
+    assert first.reasons == second.reasons
+    assert plan(threads=4).setting == first.setting  # what is chosen may not depend on who computes
+
+
+def test_predictions_fall_as_more_is_asked_and_cost_does_not():
+    plans = [plan(accuracy) for accuracy in (-40.0, -50.0, -60.0, -70.0, -80.0, -90.0)]
+    errors, seconds = [p.predicted_error_db for p in plans], [p.predicted_seconds for p in plans]
+    assert all(
+        p.predicted_error_db <= accuracy for p, accuracy in zip(plans, (-40, -50, -60, -70, -80, -90), strict=True)
+    )
+    assert errors == sorted(errors, reverse=True)
+    assert seconds == sorted(seconds)
+
+
+def test_what_no_table_can_give_is_left_to_the_double_sum():
+    assert plan(-120.0).engine == "reference"
+    assert plan(-120.0).presum is None
+
+
+@compiled
+def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was_not(monkeypatch):
+    assert plan().engine == "native"
+    monkeypatch.setitem(ENGINES, "native", replace(ENGINES["native"], available=lambda: False))
+    assert plan().engine == "numba"
+    with pytest.raises(CampaignError, match="was not built"):
+        plan(overrides={"engine": "native"})
+
+
+@compiled
+def test_a_machine_on_which_numba_is_fast_gets_numba():
+    slow = Costs({**COSTS.seconds, **{n: 1e-6 for n in COSTS.seconds if n.startswith("native")}}, "made up")
+    assert make_plan(job(), accuracy_db=-60.0, costs=slow).engine == "numba"
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("engine", "numba"),
+        ("engine", "reference"),
+        ("table_degree", 1),
+        ("table_oversampling", 9),
+        ("phase_tolerance_rad", 2e-4),
+        ("accumulate", "complex128"),
+        ("terrain", "dem"),
+        ("midpoint", True),
+    ],
+)
+def test_each_choice_can_be_overridden_and_the_plan_says_so(key, value):
+    apart = track() + np.array([0.1, 0.0, 0.0])
+    found = plan(overrides={key: value}, rx_position_m=apart)
+    decision = next(decision for decision in found.decisions if decision.name == key)
+    assert decision.value == value
+    assert "asked for" in decision.reason
+
+
+def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
+    found = plan(overrides={"engine": "numba", "table_oversampling": 2})
+    assert found.options == {"oversampling": 2}
+    assert found.predicted_error_db > -60
+    assert "does not meet" in found.reasons["engine"]
+    assert ladder(found)[-1].engine == "reference"
+
+
+def test_each_rung_of_the_ladder_errs_6_db_less_than_the_last():
+    found = plan()
+    errors = [found.setting.error_db, *(rung.error_db for rung in ladder(found))]
+    assert all(after <= before - 6 for before, after in pairwise(errors))
+    assert ladder(found)[-1].engine == "reference"
+
+
+@pytest.mark.parametrize(("baseline_m", "allowed"), [(2.4, True), (2.6, False)])
+def test_midpoint_keeps_to_a_sixteenth_of_a_wavelength(baseline_m, allowed):
+    """b²/4R < λ/16 at R = 100 m and λ = 0.25 m: b < 2.5 m."""
+    tx = np.array([[-baseline_m / 2, 0.0, 0.0]])
+    rx, place = -tx, np.array([[0.0, 100.0, 0.0]])
+    assert (midpoint_error(tx, rx, place)[0, 0] < WAVELENGTH / 16) == allowed
+    found = decide_midpoint(tx, rx, place, wavelength_m=WAVELENGTH, accuracy_db=-60, bistatic_costs=True)
+    assert ("rule forbids" in found.reason) != allowed
+
+
+def test_midpoint_pays_only_where_two_legs_cost_more_than_one():
+    tx = track()
+    near = tx + np.array([0.002, 0.0, 0.0])
+    places = net().reshape(-1, 3)
+    decide = [
+        decide_midpoint(tx, near, places, wavelength_m=WAVELENGTH, accuracy_db=-60, bistatic_costs=costs).value
+        for costs in (True, False)
+    ]
+    assert decide == [True, False]
+
+
+def test_midpoint_puts_both_antennas_in_the_middle():
+    drawn = draw(np.random.default_rng(3), pixels=32, pulses=60)
+    moved = drawn.job.tx_position_m + np.array([0.003, 0.004, 0.0]) * np.linspace(-1, 3, 60)[:, None]
+    found = make_plan(
+        replace(drawn.job, rx_position_m=moved), accuracy_db=-60, costs=COSTS, overrides={"midpoint": True}
+    )
+    applied = found.history(replace(drawn.profiles, rx_position_m=moved))
+    np.testing.assert_allclose(applied.tx_position_m, (drawn.job.tx_position_m + moved) / 2)
+    np.testing.assert_array_equal(applied.tx_position_m, applied.rx_position_m)
+
+
+def terrain(height_m: float, *, slope: float = 0.0, wobble_m: float = 0.1, spacing_m: float = 10.0):
+    heights = np.tile(slope * np.arange(5.0)[:, None], 5)
+    heights[2, 2] += height_m
+    return decide_terrain(
+        heights,
+        track_m=track(wobble_m=wobble_m),
+        place_m=net().reshape(-1, 3),
+        up=np.array([0.0, 0, 1]),
+        wavelength_m=WAVELENGTH,
+        spacing_m=spacing_m,
+    ).value
+
+
+def test_ground_is_flat_as_long_as_focus_bears_it():
+    """4πd·Δθ/(√2λ) < 0.4 with d the wobble's amplitude 0.1 m and Δθ = δh/20 m: δh < 2.25 m."""
+    limit_m = 0.4 * np.sqrt(2) * WAVELENGTH * 20 / (4 * np.pi * 0.1)
+    assert terrain(0.97 * limit_m) == "plane"
+    assert terrain(1.1 * limit_m) == "dem"
+    assert terrain(1.1 * limit_m, wobble_m=0.05) == "plane"
+
+
+def test_ground_is_flat_as_long_as_places_bear_it():
+    """Half a pixel of 0.2 m at height 10 m over ground range 20 m: δh < 0.2 m."""
+    assert terrain(0.15, wobble_m=0.0, spacing_m=0.2) == "plane"
+    assert terrain(0.25, wobble_m=0.0, spacing_m=0.2) == "dem"
+
+
+def test_a_slope_is_a_tilted_plane():
+    assert terrain(0.0, slope=1.5) == "tilted_plane"
+    assert terrain(0.0, slope=0.3) == "plane"
+
+
+def test_without_a_dem_the_plan_says_what_height_error_is_borne():
+    assert "no DEM; height may be wrong by" in plan().reasons["terrain"]
+
+
+def test_phase_rates_are_those_of_a_passing_antenna():
+    """Rates of places at ±θ from abeam differ by 2·2·sin θ·step/λ cycles per pulse."""
+    step, angle = 0.02, np.radians(20)
+    antenna = np.array([[-step / 2, 0.0, 0.0], [step / 2, 0.0, 0.0]])
+    places = 50 * np.array([[np.sin(a), np.cos(a), 0] for a in (-angle, 0, angle)])
+    spread, widest = phase_rates(antenna, antenna, places, wavelength_m=WAVELENGTH)
+    assert spread == pytest.approx(4 * np.sin(angle) * step / WAVELENGTH, rel=1e-4)
+    assert widest == pytest.approx(spread / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(("step_m", "thinned"), [(0.002, True), (0.1, False)])
+def test_pulses_are_thinned_only_where_the_aperture_is_oversampled(step_m, thinned):
+    tx = track(2000, length_m=2000 * step_m)
+    found = plan(tx_position_m=tx, rx_position_m=tx, shape=(2000, 2000), spacing_m=0.005)
+    assert (found.presum is not None) == thinned
+    if thinned:
+        assert found.presum.factor >= 4
+        assert plan(tx_position_m=tx, rx_position_m=tx, overrides={"pulse_thinning": 1}).presum is None
+
+
+def test_thinning_a_wide_scene_by_more_than_it_bears_is_refused():
+    with pytest.raises(CampaignError, match="pulse_thinning is 32"):
+        plan(overrides={"pulse_thinning": 32}, tx_position_m=track(length_m=30), rx_position_m=track(length_m=30))
+
+
+def oversampled(noise: float = 1.0):
+    """Noise everywhere, a few targets, an aperture sampled ten times too finely."""
+    for seed in range(100):
+        drawn = draw(np.random.default_rng(seed), pixels=40, pulses=400)
+        _, widest = phase_rates(
+            drawn.job.tx_position_m, drawn.job.rx_position_m, drawn.job.place_m, wavelength_m=C / drawn.job.band_hz[1]
+        )
+        if 0.01 < widest < 0.03:
+            return drawn, widest
+    raise AssertionError("no campaign is oversampled")
+
+
+@compiled
+def test_a_thinned_image_equals_that_of_all_pulses_where_leaving_pulses_out_does_not():
+    drawn, widest = oversampled()
+    presum = design(400, 4, widest_cycles=widest)
+    predicted = presum_error_db(
+        presum, drawn.job.tx_position_m, drawn.job.rx_position_m, drawn.job.place_m, highest_hz=drawn.job.band_hz[1]
+    )
+    thinned = thin(drawn.profiles, presum, drawn.job.place_m[len(drawn.job.place_m) // 2])
+    assert len(thinned.samples) < 0.4 * 400
+    images = [
+        native.form(native.prepare(profiles, oversampling=16), drawn.grid.positions(), tolerance_rad=1e-5)
+        for profiles in (drawn.profiles, thinned, every_fourth(drawn.profiles))
+    ]
+    error, left_out = (numerical_error(image.ravel(), images[0].ravel()).rms_db for image in images[1:])
+    assert error <= predicted + 3 <= -65
+    assert left_out > -45
+
+
+def every_fourth(profiles: Profiles) -> Profiles:
+    part = slice(None, None, 4)
+    return replace(
+        profiles,
+        samples=profiles.samples[part],
+        start_m=profiles.start_m[part],
+        tx_position_m=profiles.tx_position_m[part],
+        rx_position_m=profiles.rx_position_m[part],
+    )
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("spacing_m", "range_m", "way"), [(0.05, 12, 0), (0.05, 60, 0), (0.02, 0.6, 2), (0.6, 60, 2), (2.0, 60, 2)]
+)
+def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeypatch):
+    """Shared and wide forms count together in the kernel's tally; the exact way apart."""
+    pixels = spacing_m * np.stack(np.meshgrid(np.arange(48.0), -np.arange(48.0)), -1)
+    places = np.concatenate([pixels - pixels.mean((0, 1)) + [0, range_m], np.zeros((48, 48, 1))], -1)
+    tx = track(64, length_m=range_m, height_m=range_m)
+    near = np.linalg.norm(places[None, ::8, ::8] - tx[:, None, None], axis=-1)
+    step = C / 800e6
+    start = 2 * near.min((1, 2)) - 40 * step
+    count = int(np.ceil((2 * near.max() - start.min()) / step)) + 80
+    profiles = Profiles(np.ones((64, count), np.complex64), start, step, 1.2e9, 2.0, tx, tx)
+    tally = np.zeros(4, np.int64)
+    native.form(native.prepare(profiles), places, counts=tally)
+    view = look(tx, tx, places[::6, ::6], spacing_m)
+    shares, _ = forms(view, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
+    assert shares[2] == pytest.approx(tally[2] / tally.sum(), abs=0.15)
+    assert (shares[2] > 0.5) == (way == 2)
+
+
+@compiled
+def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
+    view = look(track()[::6], track()[::6], 20 * net(), 0.35)
+    found = candidates(view, job().signal, job().load, COSTS)
+    cheapest = next(setting for setting in found if setting.engine == "native" and setting.error_db < -50)
+    fine = next(s for s in found if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
+    assert cheapest.options["oversampling"] < 6
+    assert fine.shares[2] > 0.9
+    assert cheapest.seconds < fine.seconds / 3
+
+
+def test_a_spacing_coarser_than_the_cell_is_flagged_with_the_number():
+    tx = track()
+    band = (1.0e9, 1.4e9)
+    cell_m = finest_cell_m(tx, tx, net(), band_hz=band)
+    assert 0.2 < cell_m < 0.5  # λ/(4 sin(θ/2)) for 6 m of aperture at 22 m: 0.43 m
+    finer, coarser = (crossed_edges(tx, tx, net(), spacing_m=factor * cell_m, band_hz=band) for factor in (0.98, 1.02))
+    assert "spacing_coarse" not in finer
+    assert f"{cell_m:.3g} m" in coarser["spacing_coarse"]
+
+
+def test_a_platform_over_the_scene_is_flagged_and_one_below_the_ground_is_refused():
+    over = track() + np.array([0.0, 25.0, 0.0])
+    assert "300 of 300 pulses" in plan(tx_position_m=over, rx_position_m=over).flags["platform_inside_scene"]
+    assert "platform_inside_scene" not in plan().flags
+    sunk = track(height_m=-0.5)
+    with pytest.raises(CampaignError, match=r"receiver is -0.50 m above the ground at pulse"):
+        plan(rx_position_m=sunk)
+
+
+def test_no_pulses_and_pulses_without_a_place_are_refused():
+    with pytest.raises(CampaignError, match="zero pulses"):
+        plan(tx_position_m=np.zeros((0, 3)), rx_position_m=np.zeros((0, 3)))
+    lost = track()
+    lost[7, 1] = np.nan
+    with pytest.raises(CampaignError, match="1 of 300 phase centres are not finite, first at pulse 7"):
+        plan(tx_position_m=lost)
+    with pytest.raises(CampaignError, match="zero pulses see the scene"):
+        plan(path_limit_m=30.0)
+    assert "places_unseen" in plan(path_limit_m=55.0).flags
+
+
+def test_a_sparse_aperture_is_flagged():
+    sparse = track(20, length_m=30)
+    assert "pulses_sparse" in plan(tx_position_m=sparse, rx_position_m=sparse).flags
+    assert "pulses_sparse" not in plan().flags
+
+
+def test_a_job_that_does_not_fit_is_refused_with_the_numbers():
+    found = plan(shape=(20000, 20000))
+    check_fits(found, free_disk=found.disk_bytes, where="f01/a-b", memory=found.memory_bytes)
+    with pytest.raises(CampaignError, match=r"f01/a-b: imaging needs .* of memory; expected at most the 1 MB"):
+        check_fits(found, free_disk=None, where="f01/a-b", memory=1_000_000)
+    with pytest.raises(CampaignError, match=r"the results need 24 GB on disk; expected at most the 5 GB"):
+        check_fits(found, free_disk=5_000_000_000, where="f01/a-b", memory=found.memory_bytes)
+
+
+def test_measured_costs_are_used_and_unfit_ones_are_not(tmp_path):
+    path = tmp_path / "cost.json"
+    shipped = read_costs(path)
+    assert shipped.source.startswith("shipped")
+    mine = Costs({name: 2 * value for name, value in shipped.seconds.items()}, "")
+    assert read_costs(write_costs(mine, path)).seconds == mine.seconds
+    for spoilt in ("", "[]", '{"machine": "abacus", "seconds": {}}', path.read_text().replace("e-", "e+")):
+        path.write_text(spoilt)
+        assert read_costs(path).source.startswith("shipped")
