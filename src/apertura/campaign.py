@@ -65,12 +65,19 @@ class Campaign:
     def echo_sources(self, flight: str, pair: str) -> list[str]:
         """Return what the echo of a pair is made from: stages of its nodes, or recorded phase history."""
         tx, rx = pair.split("-")
+        calibration = self.settings.calibration
         if isinstance(self.settings.waveform, OfdmWaveform):
+            used = calibration is not None and self.flight(flight).kind == "image"
+            offsets = [self.calibration_file(calibration.flight)] if calibration is not None and used else []
             stages = [
                 self.manifest(stage, flight, node) for node in dict.fromkeys((tx, rx)) for stage in ("raw", "track")
             ]
-            return [self.settings.waveform.codes, *stages]
+            return [self.settings.waveform.codes, *stages, *offsets]
         return [path.relative_to(self.root).as_posix() for path in self.raw_files(flight, rx).values()]
+
+    def calibration_file(self, flight: str) -> str:
+        """Return where the path offsets of a calibration flight lie."""
+        return f"results/{flight}/calibration.json"
 
     def scene_sources(self) -> list[str]:
         """Return what the grid is settled from: nothing, or the first image flight where something is `auto`."""
@@ -120,11 +127,16 @@ class Campaign:
                 "nodes": nodes,
                 **{key: processing[key] for key in ("sidelink", "accuracy_db")},
             },
+            "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
             "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
             "scene": {"scene": settings["scene"]},
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
             "profile": {"window": processing["window"]},
-            "image": {name: value for name, value in processing.items() if name not in {"window", "sidelink", "false_alarms_per_s"}},
+            "image": {
+                name: value
+                for name, value in processing.items()
+                if name not in {"window", "sidelink", "false_alarms_per_s"}
+            },
         }
         return chosen.get(stage, {})
 

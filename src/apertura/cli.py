@@ -138,6 +138,14 @@ def echo(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 
 @step.command()
+def calibrate(flight: str, campaign: Directory = HERE) -> None:
+    """Estimate the path offsets of a calibration flight's pairs, calibration.json."""
+    from apertura.steps import calibration as steps
+
+    print(steps.calibrate(Campaign.load(campaign), flight))
+
+
+@step.command()
 def scene(campaign: Directory = HERE) -> None:
     """Settle the campaign's grid, scene.json."""
     from apertura.steps import scene as steps

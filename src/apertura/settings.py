@@ -208,6 +208,14 @@ class Processing(Section):
     )
 
 
+class Calibration(Section):
+    """Which flight the path offsets come from."""
+
+    flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
+    reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
+    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
+
+
 class Settings(Section):
     """config/config.yaml."""
 
@@ -216,3 +224,12 @@ class Settings(Section):
     nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
     processing: Processing = Field(default_factory=Processing, description="how to compute")
+    calibration: Calibration | None = Field(
+        None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+    )
+
+    @model_validator(mode="after")
+    def _calibration_needs_a_place(self) -> Self:
+        if self.calibration is not None and self.scene.crs == "auto":
+            raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+        return self

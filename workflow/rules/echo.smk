@@ -21,10 +21,36 @@ rule echo:
         "apertura step echo {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
 
+rule calibrate:
+    input:
+        lambda wildcards: [
+            campaign.manifest("echo", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
+        ],
+    output:
+        "results/{flight}/calibration.json",
+    log:
+        "results/logs/{flight}/calibrate.log",
+    benchmark:
+        "results/benchmarks/{flight}/calibrate.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        settings=campaign.relevant("calibration"),
+        code=code_sha256("apertura.steps.calibration"),
+    message:
+        "{wildcards.flight}: estimating path offsets from the reflector"
+    shell:
+        "apertura step calibrate {wildcards.flight} > {log} 2>&1"
+
+
 rule profile:
     input:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/scene.json",
+        campaign.terrain_sources(),
     output:
         "results/{flight}/{pair}/profile.manifest.json",
     log:

@@ -1,6 +1,7 @@
 rule scene:
     input:
         campaign.scene_sources(),
+        list(campaign.height_files().values()),
     output:
         "results/scene.json",
     log:
@@ -21,11 +22,60 @@ rule scene:
         "apertura step scene > {log} 2>&1"
 
 
+rule terrain:
+    input:
+        "results/scene.json",
+        list(campaign.height_files().values()),
+    output:
+        "results/terrain.manifest.json",
+    log:
+        "results/logs/terrain.log",
+    benchmark:
+        "results/benchmarks/terrain.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1000 * attempt,
+    params:
+        settings=campaign.relevant("terrain"),
+        code=code_sha256("apertura.steps.terrain"),
+    message:
+        "bringing the DEM onto the campaign's grid"
+    shell:
+        "apertura step terrain > {log} 2>&1"
+
+
+rule layers:
+    input:
+        [campaign.manifest("echo", campaign.image_flights[0].name, pair) for pair in campaign.image_flights[0].pairs],
+        "results/scene.json",
+        campaign.terrain_sources(),
+    output:
+        multiext("results/layers/", "incidence.tif", "bistatic_angle.tif", "mask.tif"),
+    log:
+        "results/logs/layers.log",
+    benchmark:
+        "results/benchmarks/layers.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+    params:
+        code=code_sha256("apertura.steps.layers"),
+    message:
+        "drawing how the scene is seen"
+    shell:
+        "apertura step layers --threads {threads} > {log} 2>&1"
+
+
 rule image:
     input:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
+        campaign.terrain_sources(),
     output:
         "results/{flight}/{pair}/image.manifest.json",
         "results/{flight}/{pair}/image.json",

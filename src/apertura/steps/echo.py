@@ -18,8 +18,9 @@ from apertura.echo.sidelink import METHODS, choose, edges, measure
 from apertura.echo.sidelink_state import SidelinkState
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES
-from apertura.provenance import sha256_file
-from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
+from apertura.provenance import merged, sha256_file
+from apertura.settings import OfdmWaveform, PathOffsets, PhaseHistoryWaveform, Processing
+from apertura.steps.calibration import calibrated, calibration_spec
 from apertura.steps.recording import Recording, open_recording
 from apertura.steps.stamping import stamped
 from apertura.store import save_stage
@@ -30,6 +31,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     tx, rx = pair.split("-")
     waveform = campaign.settings.waveform
     parents: list[xr.Dataset] = []
+    offset = calibrated(campaign, flight, pair)
     if isinstance(waveform, PhaseHistoryWaveform):
         files = list(campaign.raw_files(flight, rx).values())
         dataset = PHASE_HISTORIES[waveform.format](files, pair=pair)
@@ -38,9 +40,11 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         codes = _read_codes(files[0], waveform.subcarriers)
         recordings = {node: open_recording(campaign, flight, node, waveform) for node in {tx, rx}}
         parents = [stage for node in recordings.values() for stage in (node.raw, node.track)]
-        dataset = _ofdm(recordings[tx], recordings[rx], codes, waveform, campaign.settings.processing)
+        dataset = _ofdm(recordings[tx], recordings[rx], codes, waveform, campaign.settings.processing, offset)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
-    relevant = campaign.relevant("echo", pair)
+    if offset:
+        inputs = merged(inputs, offset["inputs"])
+    relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(offset)}
     folder = campaign.stage("echo", flight, pair)
     save_stage(stamped(dataset, "echo", module=__name__, parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
@@ -77,15 +81,22 @@ def _pulses(tx: Recording, rx: Recording, prf_hz: float) -> Association:
 
 
 def _ofdm(
-    tx: Recording, rx: Recording, codes: NDArray[np.complex64], waveform: OfdmWaveform, processing: Processing
+    tx: Recording,
+    rx: Recording,
+    codes: NDArray[np.complex64],
+    waveform: OfdmWaveform,
+    processing: Processing,
+    calibration: dict[str, Any] | None,
 ) -> xr.Dataset:
     pulses = _pulses(tx, rx, waveform.prf_hz)
     tx_index, rx_index = pulses.tx_index, pulses.rx_index
     symbol = round((waveform.cyclic_prefix_s + waveform.symbol_s) * waveform.sample_rate_hz)
     iq = {name: rx.captures(name, rx_index) for name in (["radar"] if tx.name == rx.name else ["radar", "sidelink"])}
-    flags, attrs = {**pulses.flags, **_saturation(iq)}, {}
+    flags: dict[str, str] = {**pulses.flags, **_saturation(iq)}
+    attrs: dict[str, Any] = {}
     captured = {name: _complex(samples[:, :symbol]) for name, samples in iq.items()}
-    beyond_m = np.full(len(rx_index), rx.settings.path_offset_m.radar)  # path of an echo beyond tx → scene → rx
+    offset_m = _offset_m(rx.settings.path_offset_m, monostatic=tx.name == rx.name, calibration=calibration)
+    beyond_m = np.full(len(rx_index), offset_m)  # path of an echo beyond tx → scene → rx
     if tx.name == rx.name:
         transfer = rx.symbols(captured["radar"]) / codes
         flags |= _code_fits(transfer, waveform)
@@ -99,11 +110,18 @@ def _ofdm(
         flags |= crossed
         locked = state.locked
         transfer = METHODS[attrs["sidelink"]["method"]](transfer[locked], direct[locked])
-        beyond_m = (beyond_m - rx.settings.path_offset_m.sidelink - length_m)[locked]
+        beyond_m = (beyond_m - length_m)[locked]
         tx_index, rx_index = tx_index[locked], rx_index[locked]
     frequency = np.asarray(waveform.carrier_hz + rx.waveform.numbers * waveform.subcarrier_spacing_hz, np.float64)
     sent = len(tx.raw.time)
-    attrs |= {"flags": flags, "pulses": {"used": len(rx_index), "dropped": sent - len(rx_index)}}
+    if calibration:
+        flags |= calibration["flags"]
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    attrs |= {
+        "stated_offset_m": offset_m,
+        "flags": flags,
+        "pulses": {"used": len(rx_index), "dropped": sent - len(rx_index)},
+    }
     return xr.Dataset(
         {
             "time": ("pulse", tx.raw.time.values[tx_index]),
@@ -119,6 +137,12 @@ def _ofdm(
         },
         attrs={"frame": "ecef", "pair": f"{tx.name}-{rx.name}", **attrs},
     )
+
+
+def _offset_m(stated: PathOffsets, *, monostatic: bool, calibration: dict[str, Any] | None) -> float:
+    if calibration:
+        return float(calibration["offset_m"])
+    return stated.radar if monostatic else stated.radar - stated.sidelink
 
 
 def _complex(iq: NDArray[np.int16]) -> NDArray[np.complex64]:

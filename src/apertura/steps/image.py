@@ -8,12 +8,10 @@ import numpy as np
 import xarray as xr
 import zarr
 from numpy.typing import NDArray
-from rasterio.crs import CRS
 
 from apertura.campaign import Campaign
 from apertura.echo.compression import window_weights
 from apertura.errors import CampaignError
-from apertura.geodesy import local_crs
 from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import LOCAL, SceneGrid
@@ -21,8 +19,9 @@ from apertura.image.history import Profiles, Spectra
 from apertura.image.peaks import cut_through, find_peak, ground_position
 from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import Window, form_tiles
-from apertura.steps.scene import grid_spec, scene_grid
+from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
+from apertura.steps.terrain import Heights, open_heights
 from apertura.store import finish, open_stage, tiles_missing, write_json, writing
 
 CERTIFIED_PIXELS = 256
@@ -35,14 +34,14 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     """Write results/<flight>/<pair>/image.zarr and image.json, tile by tile; finished tiles are kept after a kill."""
     folder = campaign.stage("image", flight, pair)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-    grid, processing = scene_grid(campaign), campaign.settings.processing
+    grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
     history = {"echo": _spectra(echo, processing.window), "profile": _profiles(profile)}
     ladder = _ladder(processing.engine)
     empty = stamped(
         _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
         "image",
         module=__name__,
-        parents=[echo, profile],
+        parents=[echo, profile, *heights.parents],
         settings={**campaign.relevant("image"), "grid": grid_spec(grid), "engine": asdict(ladder[0])},
     )
     windows = list(grid.tiles(processing.tile_px))
@@ -50,14 +49,15 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         missing = tiles_missing(wip, empty, "image", windows)
         print(f"{pair}: {len(missing)} of {len(windows)} tiles to form with {ladder[0].line}", flush=True)
         target = zarr.open_array(wip / "image", mode="r+")
-        work = Work(history, grid, target, threads)
+        work = Work(history, grid, heights, target, threads)
         work.form(ladder[0], missing)
         quality = {
             "engine": ladder[0].engine,
             "models": {"engine": f"{ladder[0].line}: {ladder[0].reason}"},
             **_certified(work, windows, ladder, processing.accuracy_db),
             **_measures(work, windows),
-            **{name: echo.attrs[name] for name in ("pulses", "sidelink", "clock") if name in echo.attrs},
+            **{name: echo.attrs[name] for name in ("pulses", "sidelink", "clock", "calibration") if name in echo.attrs},
+            **heights.report,
         }
         quality["flags"] = echo.attrs["flags"] | quality.pop("crossed")
         zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
@@ -109,6 +109,7 @@ class Work:
 
     history: dict[str, Any]
     grid: SceneGrid
+    heights: Heights
     target: Any
     threads: int
 
@@ -123,14 +124,20 @@ class Work:
         def mean(pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
             return np.asarray(engine.form(prepared, pixels) / pulses, np.complex64)
 
-        form_tiles(mean, self.grid, windows, write=self.target.__setitem__, threads=self.threads)
+        form_tiles(
+            mean, self.grid, windows, write=self.target.__setitem__, threads=self.threads, heights=self.heights.of
+        )
+
+    def places(self, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np.float64]:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the ground."""
+        return self.grid.positions_at(row, column, self.heights.at(row, column))
 
 
 def _certified(work: Work, windows: list[Window], ladder: list[Choice], accuracy_db: float) -> dict[str, Any]:
     """Measure the error; redo tiles that are worse than asked with the next better settings."""
     spectra = work.history["echo"]
     pixels = certified_pixels(work.target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
-    exact = reference.form(spectra, work.grid.positions_at(*pixels.T)) / len(spectra.transfer)
+    exact = reference.form(spectra, work.places(*pixels.T)) / len(spectra.transfer)
     certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
     redone: list[dict[str, Any]] = []
     for choice in ladder[1:]:
@@ -159,7 +166,7 @@ def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
     peak = find_peak(work.target, found.row, found.column)
     x, y = ground_position(grid, peak)
     spectra: Spectra = work.history["echo"]
-    terms = reference.terms(spectra, grid.positions_at(np.array([peak.row]), np.array([peak.column])))
+    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])))
     along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)
     cuts = {
         name: cut_through(work.target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
@@ -206,18 +213,8 @@ def _profiles(profile: xr.Dataset) -> Profiles:
 
 
 def _empty(grid: SceneGrid, pair: str, flags: dict[str, str], name: str) -> xr.Dataset:
-    wkt = local_crs(name) if grid.crs == LOCAL else grid.crs
     return xr.Dataset(
         {"image": (("y", "x"), np.broadcast_to(np.complex64(0), grid.shape))},
-        coords={"y": grid.y_m, "x": grid.x_m, "spatial_ref": ((), 0, spatial_reference(wkt, grid.transform))},
+        coords=grid_coordinates(grid, name),
         attrs={"frame": "local" if grid.crs == LOCAL else "ecef", "pair": pair, "flags": flags, "quality": {}},
     )
-
-
-def spatial_reference(crs: str, transform: tuple[float, ...]) -> dict[str, Any]:
-    """Return the attributes of a CF grid mapping variable that GDAL and xarray read."""
-    west, north = transform[2], transform[5]
-    return {
-        "crs_wkt": CRS.from_user_input(crs).to_wkt(),
-        "GeoTransform": f"{west} {transform[0]} 0 {north} 0 {transform[4]}",
-    }

@@ -1,0 +1,103 @@
+"""Rule `calibrate`: path offsets of a flight's pairs, from a reflector at a known place."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.contracts import canonical_json
+from apertura.echo.calibration import estimate_path_offset, reflector_history
+from apertura.errors import CampaignError
+from apertura.geodesy import ecef_from_projected
+from apertura.image.grid import LOCAL
+from apertura.image.quality import coherence_factor
+from apertura.provenance import chained_sha256, code_sha256
+from apertura.settings import Calibration
+from apertura.store import open_stage, write_json
+
+
+def calibrate(campaign: Campaign, flight: str) -> Path:
+    """Write results/<flight>/calibration.json: offset, deviation and coherence of every pair.
+
+    Raises
+    ------
+    CampaignError
+        If config/config.yaml has no calibration section, or no reflector stands out.
+    """
+    asked = _asked(campaign)
+    report: dict[str, Any] = {"flight": flight, "reflector_m": list(asked.reflector_m), "pairs": {}}
+    codes = []
+    for pair in campaign.flight(flight).pairs:
+        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
+        codes.append(echo.attrs["code_sha256"])
+        report["pairs"][pair] = _pair(campaign, echo, asked, where=f"flight {flight}, pair {pair}") | {
+            "inputs": echo.attrs["inputs"]
+        }
+    report["code_sha256"] = chained_sha256(code_sha256(__name__), codes)
+    path = campaign.root / campaign.calibration_file(flight)
+    write_json(path, report)
+    return path
+
+
+def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | None:
+    """Return what an imaging flight takes from the calibration flight for a pair, or None to use the config's offsets."""
+    asked = campaign.settings.calibration
+    if asked is None or campaign.flight(flight).kind == "calibration":
+        return None
+    path = campaign.root / campaign.calibration_file(asked.flight)
+    found = json.loads(path.read_text(encoding="utf-8"))["pairs"]
+    if pair not in found:
+        raise CampaignError(
+            f"no offset of pair {pair}",
+            where=path,
+            expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(found)}",
+            remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
+        )
+    return {"flight": asked.flight, **{name: found[pair][name] for name in ("offset_m", "std_m", "inputs", "flags")}}
+
+
+def _asked(campaign: Campaign) -> Calibration:
+    if campaign.settings.calibration is None:
+        raise CampaignError(
+            "no section calibration",
+            where="config/config.yaml",
+            expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
+            remedy="Say where the reflector stands.",
+        )
+    return campaign.settings.calibration
+
+
+def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: str) -> dict[str, Any]:
+    reflector = _place(campaign.settings.scene.crs, asked.reflector_m)
+    path_m = np.asarray(
+        sum(np.linalg.norm(echo[name].values - reflector, axis=1) for name in ("tx_position", "rx_position"))
+    )
+    transfer, frequency = echo.transfer.values, echo.frequency.values
+    found = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=asked.search_m, where=where)
+    history = reflector_history(transfer, frequency, path_m=path_m + found.offset_m)
+    phase = np.unwrap(np.angle(history))
+    return {
+        "offset_m": round(echo.attrs["stated_offset_m"] + found.offset_m, 6),
+        "std_m": found.std_m if np.isfinite(found.std_m) else None,
+        "stated_offset_m": echo.attrs["stated_offset_m"],
+        "contrast_db": round(found.contrast_db, 2),
+        "pulses": found.pulses,
+        "coherence_factor": coherence_factor(history),
+        "phase_rad": [round(float(value), 4) for value in phase],
+        "phase_std_rad": round(float(np.std(phase)), 4),
+        "flags": {**echo.attrs["flags"], **found.flags},
+    }
+
+
+def _place(crs: str, reflector_m: tuple[float, float, float]) -> NDArray[np.float64]:
+    x, y, height = (np.array(value) for value in reflector_m)
+    return np.array(reflector_m) if crs == LOCAL else ecef_from_projected(crs, x, y, height)
+
+
+def calibration_spec(found: dict[str, Any] | None) -> str:
+    """Return what was taken from a calibration flight as one line for provenance."""
+    return canonical_json({name: found[name] for name in ("flight", "offset_m", "std_m")} if found else None)

@@ -1,0 +1,100 @@
+"""Path offsets from a calibration flight over a reflector at a known place, used by the imaging flights by reference."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from test_41_bad_input import complaint, edit_config
+
+from apertura.campaign import Campaign
+from apertura.simulate.campaign import write_campaign
+from apertura.simulate.plan import grid_around
+from apertura.simulate.presets import DEMO_ORIGIN, tandem
+from apertura.simulate.scene import PointTarget
+from apertura.steps import calibration, echo, ingest
+from apertura.store import open_stage
+
+PAIRS = ("uav1-uav1", "uav1-uav2")
+
+
+def flown(folder, *, reflector=True):
+    """Nodes whose config states offsets off by decimetres; one flight over a reflector, one over the scene."""
+    generator = np.random.default_rng(21)
+    plan = replace(tandem(generator, pulses=60), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
+    nodes = tuple(replace(node, stated_path_offset_m={"radar": 1.0, "sidelink": 0.5}) for node in plan.nodes)
+    if not reflector:
+        quiet = replace(plan.nodes[0].impairments, radar_snr_db=-60.0)
+        nodes = (replace(nodes[0], impairments=quiet), *nodes[1:])
+    target = PointTarget((0.0, 0.0, 0.0), 5.0)
+    over = replace(plan.flights[0], name="c01", kind="calibration", targets=(target,))
+    later = replace(plan.flights[0], start_utc="2025-05-14T10:00:00")
+    root = write_campaign(folder / "campaign", replace(plan, nodes=nodes, flights=(over, later)), generator)
+    truth = json.loads((root / "truth.json").read_text())["targets"][0]
+    place = [truth["x"], truth["y"], truth["height_m"]]
+    edit_config(root, lambda document: document.update(calibration={"flight": "c01", "reflector_m": place}))
+    campaign = Campaign.load(root)
+    for flight in ("c01", "f01"):
+        for node in ("uav1", "uav2"):
+            ingest.raw(campaign, flight, node)
+            ingest.track(campaign, flight, node)
+    for pair in PAIRS:
+        echo.echo(campaign, "c01", pair)
+    return campaign
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    campaign = flown(tmp_path_factory.mktemp("calibration"))
+    calibration.calibrate(campaign, "c01")
+    return campaign
+
+
+def report(campaign):
+    return json.loads((campaign.results / "c01" / "calibration.json").read_text())["pairs"]
+
+
+@pytest.mark.parametrize(("pair", "true_m"), [("uav1-uav1", 1.374), ("uav1-uav2", 0.911 - 0.402)])
+def test_the_true_offset_is_found_within_its_deviation(calibrated, pair, true_m):
+    found = report(calibrated)[pair]
+    assert found["std_m"] < 0.02
+    assert abs(found["offset_m"] - true_m) < max(4 * found["std_m"], 0.01)
+
+
+def test_a_reflector_alone_is_coherent(calibrated):
+    for pair in PAIRS:
+        assert report(calibrated)[pair]["coherence_factor"] > 0.9
+        assert len(report(calibrated)[pair]["phase_rad"]) == report(calibrated)[pair]["pulses"]
+
+
+def test_imaging_flights_take_the_offset_by_reference_and_say_so(calibrated):
+    echo.echo(calibrated, "f01", "uav1-uav2")
+    dataset = open_stage(calibrated.stage("echo", "f01", "uav1-uav2"), "echo")
+    found = report(calibrated)["uav1-uav2"]
+    assert dataset.attrs["calibration"] == {name: found.get(name, "c01") for name in ("flight", "offset_m", "std_m")}
+    assert "raw/c01/uav2.sigmf-data" in dataset.attrs["inputs"]
+    assert str(found["offset_m"]) in dataset.attrs["runspec"]
+    limit = 299792458 * 7.8125e-7
+    assert (np.abs(dataset.path_limit.values - limit) < 10).all()
+
+
+def test_the_workflow_knows_what_an_echo_stands_on(calibrated):
+    assert "results/c01/calibration.json" in calibrated.echo_sources("f01", "uav1-uav2")
+    assert "results/c01/calibration.json" not in calibrated.echo_sources("c01", "uav1-uav2")
+
+
+def test_a_flight_without_a_visible_reflector_is_refused(tmp_path):
+    campaign = flown(tmp_path, reflector=False)
+    message = complaint(lambda: calibration.calibrate(campaign, "c01"))
+    assert "no reflector" in message
+    assert "flight c01" in message
+    assert not (campaign.results / "c01" / "calibration.json").exists()
+
+
+def test_a_reflector_needs_a_crs(calibrated, tmp_path):
+    document = yaml.safe_load((calibrated.root / "config" / "config.yaml").read_text())
+    document["scene"]["crs"] = "auto"
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "config.yaml").write_text(yaml.safe_dump(document))
+    assert "give the CRS" in complaint(lambda: Campaign.load(tmp_path))
