@@ -1,4 +1,4 @@
-"""Path offsets from a calibration flight over a reflector at a known place, used by the imaging flights by reference."""
+"""Path offsets from a calibration flight over a known reflector, used by the imaging flights by reference."""
 
 import json
 from dataclasses import replace

@@ -44,7 +44,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
 
 
 def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | None:
-    """Return what an imaging flight takes from the calibration flight for a pair, or None to use the config's offsets."""
+    """Return what an imaging flight takes from the calibration flight for a pair; None: the config's offsets."""
     asked = campaign.settings.calibration
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
