@@ -91,6 +91,10 @@ STAGES: Mapping[str, Stage] = {
             "window": "weighting over the subcarriers",
         },
     ),
+    "terrain": Stage(
+        {"height": Variable(("y", "x"), "float64", "m", "ground at the pixel: above the ellipsoid, or z of the frame")},
+        {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest ground"},
+    ),
     "image": Stage(
         {"image": Variable(("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude")},
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},

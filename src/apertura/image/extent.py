@@ -1,5 +1,7 @@
 """Where `auto` puts the scene: UTM zone, bounds and spacing from the flight and the waveform."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pyproj.aoi import AreaOfInterest
@@ -8,6 +10,8 @@ from pyproj.database import query_utm_crs_info
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.image.grid import LOCAL, SceneGrid
+
+Window = tuple[slice, slice]
 
 GRAZING_LIMIT_DEG = 10.0
 """Ground seen at a lower grazing angle than this is left out of automatic bounds."""
@@ -120,12 +124,16 @@ def _one_two_five(value: float) -> float:
 
 
 def swath(
-    grid: SceneGrid, tx: NDArray[np.float64], rx: NDArray[np.float64]
+    grid: SceneGrid,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    *,
+    heights: Callable[[Window], NDArray[np.float64]] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the shortest and longest total path from each pulse to the scene.
 
-    A net of at most 33 × 33 points, widened by what the total path can change between them: twice the
-    distance to the nearest one.
+    At most 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
+    total path changes by at most twice the radius.
 
     Parameters
     ----------
@@ -133,6 +141,8 @@ def swath(
         The scene.
     tx, rx
         (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
+    heights
+        Gives the pixel heights (m) of a window; flat ground at `grid.height_m` if None.
 
     Returns
     -------
@@ -143,12 +153,58 @@ def swath(
     --------
     >>> grid = SceneGrid("local", 0.0, 10.0, 1.0, (10, 10), 0.0)
     >>> near, far = swath(grid, *2 * [np.array([[-20.0, 5.0, 0.0]])])
-    >>> bool(near[0] <= 41.0), bool(far[0] >= 59.0)
+    >>> bool(near[0] <= 41.02), bool(far[0] >= 59.0)
     (True, True)
     """
-    rows, columns = (np.linspace(0, size - 1, min(size, 33)) for size in grid.shape)
-    net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-    down, right = ((size - 1) / max(1, min(size, 33) - 1) for size in grid.shape)
-    apart = grid.spacing_m * float(np.hypot(down, right))
-    path = sum(np.linalg.norm(net - centre[:, None], axis=-1) for centre in (tx, rx))
-    return np.asarray(path.min(axis=1) - apart), np.asarray(path.max(axis=1) + apart)
+    blocks = list(grid.tiles(-(-max(grid.shape) // 33)))
+    centre = np.array([[(part.start + part.stop - 1) / 2 for part in block] for block in blocks])
+    across = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in block] for block in blocks])
+    low, high = np.full((2, len(blocks)), grid.height_m)
+    if heights is not None:
+        low, high = np.array([[(height := heights(block)).min(), height.max()] for block in blocks]).T
+    radius = np.sqrt((across**2).sum(axis=1) + ((high - low) / 2) ** 2)
+    net = grid.positions_at(centre[:, 0], centre[:, 1], (low + high) / 2)
+    path = sum(np.linalg.norm(net - antenna[:, None], axis=-1) for antenna in (tx, rx))
+    return np.asarray((path - 2 * radius).min(axis=1)), np.asarray((path + 2 * radius).max(axis=1))
+
+
+def clearance(
+    grid: SceneGrid,
+    antenna: NDArray[np.float64],
+    *,
+    heights: Callable[[Window], NDArray[np.float64]] | None = None,
+) -> NDArray[np.float64]:
+    """Return how high each phase centre is above the pixel under it.
+
+    Parameters
+    ----------
+    grid
+        The scene.
+    antenna
+        (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
+    heights
+        As in `swath`.
+
+    Returns
+    -------
+    ndarray
+        (pulse,) float64 metres; NaN beside the scene.
+
+    Examples
+    --------
+    >>> grid = SceneGrid("local", 0.0, 10.0, 1.0, (10, 10), 3.0)
+    >>> clearance(grid, np.array([[5.0, 5.0, 7.0], [-20.0, 5.0, 7.0]]))
+    array([ 4., nan])
+    """
+    place = antenna if grid.crs == LOCAL else projected_from_ecef(grid.crs, antenna)
+    west, _, _, north = grid.bounds_m
+    row, column = (np.floor(side / grid.spacing_m).astype(int) for side in (north - place[:, 1], place[:, 0] - west))
+    above = np.full(len(antenna), np.nan)
+    for window in grid.tiles(512):
+        inside = (row >= window[0].start) & (row < window[0].stop)
+        inside &= (column >= window[1].start) & (column < window[1].stop)
+        if inside.any():
+            ground = np.full(grid[window].shape, grid.height_m) if heights is None else heights(window)
+            under = ground[row[inside] - window[0].start, column[inside] - window[1].start]
+            above[inside] = place[inside, 2] - under
+    return above

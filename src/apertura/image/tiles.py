@@ -21,6 +21,7 @@ def form_tiles(
     *,
     write: Callable[[Window, NDArray[np.complex64]], None],
     threads: int,
+    heights: Callable[[Window], NDArray[np.float64]] | None = None,
     seconds_between_reports: float = 0.25,
 ) -> None:
     """Form each window of `grid` and write it as soon as it is done.
@@ -37,6 +38,8 @@ def form_tiles(
         Takes each finished tile; called from several threads, for windows that do not overlap.
     threads
         How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
+    heights
+        Gives the pixel heights (m) of a window, from several threads; flat ground at `grid.height_m` if None.
     seconds_between_reports
         How often the progress bar is redrawn.
 
@@ -51,7 +54,8 @@ def form_tiles(
     """
 
     def work(window: Window) -> None:
-        write(window, np.asarray(form(grid[window].positions()), np.complex64))
+        height_m = None if heights is None else heights(window)
+        write(window, np.asarray(form(grid[window].positions(height_m)), np.complex64))
 
     tasks: list[Any] = [delayed(work)(window) for window in windows]
     with ProgressBar(dt=seconds_between_reports):

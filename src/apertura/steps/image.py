@@ -1,6 +1,6 @@
 """Rules of the image wing: a focused image of one pair, with its measured error."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.echo.compression import window_weights
-from apertura.errors import CampaignError
+from apertura.image.candidates import Setting
 from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.history import Profiles, Spectra
 from apertura.image.peaks import cut_through, find_peak, ground_position
+from apertura.image.plan import Plan
+from apertura.image.planner import ladder
 from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import Window, form_tiles
+from apertura.steps.plan import plan_pair
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
 from apertura.steps.terrain import Heights, open_heights
@@ -36,71 +39,35 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
     history = {"echo": _spectra(echo, processing.window), "profile": _profiles(profile)}
-    ladder = _ladder(processing.engine)
+    plan = plan_pair(campaign, flight, pair, threads=threads)
     empty = stamped(
         _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
         "image",
         module=__name__,
         parents=[echo, profile, *heights.parents],
-        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "engine": asdict(ladder[0])},
+        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": plan.reasons},
     )
     windows = list(grid.tiles(processing.tile_px))
     with writing(folder) as wip:
         missing = tiles_missing(wip, empty, "image", windows)
-        print(f"{pair}: {len(missing)} of {len(windows)} tiles to form with {ladder[0].line}", flush=True)
+        print(f"{pair}: {len(missing)} of {len(windows)} tiles to form with {plan.setting.line}", flush=True)
         target = zarr.open_array(wip / "image", mode="r+")
         work = Work(history, grid, heights, target, threads)
-        work.form(ladder[0], missing)
+        work.form(plan.setting, missing, prepared_for=plan)
         quality = {
-            "engine": ladder[0].engine,
-            "models": {"engine": f"{ladder[0].line}: {ladder[0].reason}"},
-            **_certified(work, windows, ladder, processing.accuracy_db),
+            "engine": plan.engine,
+            "models": plan.reasons,
+            "predicted_error_db": round(plan.predicted_error_db, 2),
+            **_certified(work, windows, ladder(plan), processing.accuracy_db),
             **_measures(work, windows),
             **{name: echo.attrs[name] for name in ("pulses", "sidelink", "clock", "calibration") if name in echo.attrs},
             **heights.report,
         }
-        quality["flags"] = echo.attrs["flags"] | quality.pop("crossed")
+        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}
         zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
         write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
         finish(wip, folder)
     return folder
-
-
-@dataclass(frozen=True)
-class Choice:
-    """An engine and how it is set."""
-
-    engine: str
-    options: dict[str, Any]
-    reason: str
-
-    @property
-    def line(self) -> str:
-        """The engine and its options in a few words."""
-        return " ".join([self.engine, *(f"{name}={value}" for name, value in self.options.items())])
-
-
-def _ladder(asked: str) -> list[Choice]:
-    """Return the setting to begin with and the next better ones, for tiles that miss the accuracy asked."""
-    rungs = [
-        Choice("native", {"degree": 2, "oversampling": 6}, "the cheapest that errs below the accuracy asked"),
-        Choice("native", {"degree": 2, "oversampling": 10}, "a finer table"),
-        Choice("numba", {"oversampling": 8}, "no compiled kernel here"),
-        Choice("numba", {"oversampling": 32}, "a finer table and float64 phases"),
-        Choice("reference", {}, "the double sum itself"),
-    ]
-    rungs = [rung for rung in rungs if ENGINES[rung.engine].available()]
-    if asked == "auto":
-        return rungs
-    first = next((rung for rung in rungs if rung.engine == asked), None)
-    if first is None:
-        raise CampaignError(
-            f"engine {asked} was not built when apertura was installed",
-            where="config/config.yaml: processing.engine",
-            expected=f"one of {sorted({rung.engine for rung in rungs})}",
-            remedy="Install with a C++ compiler, or choose another engine.",
-        )
-    return [replace(first, reason="asked for in config/config.yaml"), *rungs[rungs.index(first) + 1 :]]
 
 
 @dataclass(frozen=True)
@@ -113,16 +80,21 @@ class Work:
     target: Any
     threads: int
 
-    def form(self, choice: Choice, windows: list[Window]) -> None:
-        """Form and write tiles with an engine; the image is the mean over the pulses."""
+    def form(self, setting: Setting, windows: list[Window], *, prepared_for: Plan | None = None) -> None:
+        """Form and write tiles with an engine; the image is the mean over the pulses.
+
+        A plan's own setting is given the profiles as the plan wants them: thinned, or with a pair's midpoint.
+        """
         if not windows:
             return
-        engine = ENGINES[choice.engine]
-        prepared = engine.prepare(self.history[engine.reads], **choice.options)
+        engine, history = ENGINES[setting.engine], dict(self.history)
+        if prepared_for is not None:
+            history["profile"] = prepared_for.history(history["profile"])
+        prepared = engine.prepare(history[engine.reads], **setting.options)
         pulses = np.float32(len(self.history["echo"].transfer))
 
         def mean(pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
-            return np.asarray(engine.form(prepared, pixels) / pulses, np.complex64)
+            return np.asarray(engine.form(prepared, pixels, **setting.form_options) / pulses, np.complex64)
 
         form_tiles(
             mean, self.grid, windows, write=self.target.__setitem__, threads=self.threads, heights=self.heights.of
@@ -133,14 +105,14 @@ class Work:
         return self.grid.positions_at(row, column, self.heights.at(row, column))
 
 
-def _certified(work: Work, windows: list[Window], ladder: list[Choice], accuracy_db: float) -> dict[str, Any]:
+def _certified(work: Work, windows: list[Window], better: tuple[Setting, ...], accuracy_db: float) -> dict[str, Any]:
     """Measure the error; redo tiles that are worse than asked with the next better settings."""
     spectra = work.history["echo"]
     pixels = certified_pixels(work.target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
     exact = reference.form(spectra, work.places(*pixels.T)) / len(spectra.transfer)
     certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
     redone: list[dict[str, Any]] = []
-    for choice in ladder[1:]:
+    for choice in better:
         uncertified, worse = certificate.failing(work.target, windows, accuracy_db)
         if not worse:
             break

@@ -75,8 +75,8 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     CampaignError
         If the job cannot fit in memory or on the disk, or its geometry is impossible.
     """
-    outlook = _outlook(campaign, flight, pair)
-    grid = _grid(campaign, outlook)
+    outlook = outlook_of(campaign, flight, pair)
+    grid = campaign_grid(campaign, outlook)
     processing = campaign.settings.processing
     plan = make_plan(
         job_of(outlook, grid, tile_px=processing.tile_px, threads=threads),
@@ -197,14 +197,16 @@ def _size(count: float) -> str:
     return f"{count:.3g} {unit}"
 
 
-def _grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
+def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
+    """Return the campaign's grid, settled or as it will be."""
     asked = campaign.settings.scene
     if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
         return scene_grid(campaign)
     return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
 
 
-def _outlook(campaign: Campaign, flight: str, pair: str) -> Outlook:
+def outlook_of(campaign: Campaign, flight: str, pair: str) -> Outlook:
+    """Return what is known of a pair: its echo where it is formed, else what the logs promise."""
     folder = campaign.stage("echo", flight, pair)
     waveform = campaign.settings.waveform
     if manifest_of(folder).is_file():

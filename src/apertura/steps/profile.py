@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.image.extent import swath
-from apertura.steps.scene import grid_spec, scene_grid
+from apertura.image.extent import clearance, swath
+from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
 from apertura.steps.stamping import stamped
+from apertura.steps.terrain import open_heights
 from apertura.store import open_stage, save_stage
 
 GUARD_SAMPLES = 32
@@ -23,7 +24,10 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr."""
     source, grid = open_stage(campaign.stage("echo", flight, pair), "echo"), scene_grid(campaign)
     window, frequency = campaign.settings.processing.window, source.frequency.values
-    nearest, farthest = swath(grid, source.tx_position.values, source.rx_position.values)
+    ground, places = open_heights(campaign), (source.tx_position.values, source.rx_position.values)
+    for position, which in zip(places, ("transmitter", "receiver"), strict=True):
+        _check_clearance(clearance(grid, position, heights=ground.of), which, where=f"flight {flight}, pair {pair}")
+    nearest, farthest = swath(grid, *places, heights=ground.of)
     _check_prefix(farthest, source.path_limit.values, where=f"flight {flight}, pair {pair}")
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
     start = nearest - GUARD_SAMPLES * step
@@ -49,8 +53,21 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     }
     folder = campaign.stage("profile", flight, pair)
     settings = {**campaign.relevant("profile"), "grid": grid_spec(grid)}
-    save_stage(stamped(dataset, "profile", module=__name__, parents=[source], settings=settings), folder)
+    parents, inputs = [source, *ground.parents], scene_inputs(campaign)
+    save_stage(stamped(dataset, "profile", module=__name__, parents=parents, settings=settings, inputs=inputs), folder)
     return folder
+
+
+def _check_clearance(above: NDArray[np.float64], which: str, *, where: str) -> None:
+    if (above <= 0).any():
+        pulse = int(np.nanargmin(above))
+        raise CampaignError(
+            f"at {int((above <= 0).sum())} pulses the {which} is in or below the ground of the scene, worst at pulse "
+            f"{pulse}: {above[pulse]:.2f} m above it",
+            where=where,
+            expected="an antenna above the ground",
+            remedy="Check scene.height_m or scene.dem, their datums (logs may count from the geoid), and the track.",
+        )
 
 
 def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:

@@ -3,15 +3,19 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.crs import CRS
 
 from apertura.campaign import Campaign
 from apertura.contracts import canonical_json
+from apertura.geodesy import local_crs, projected_from_ecef
 from apertura.image.extent import auto_bounds, auto_spacing, utm_crs
-from apertura.image.grid import SceneGrid
+from apertura.image.grid import LOCAL, SceneGrid
 from apertura.settings import Scene
+from apertura.steps.ground import Ground, on_the_ground
 from apertura.store import open_stage, write_json
 
 PATH = Path("results/scene.json")
@@ -21,12 +25,13 @@ def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for, with every `auto` settled and why."""
     asked = campaign.settings.scene
     if asked.crs == "auto" or asked.bounds_m == "auto" or asked.spacing_m == "auto":
-        grid, chosen = settle(asked, *_first_flight(campaign))
+        grid, chosen = settle(asked, *_first_flight(campaign), root=campaign.root)
     else:
         grid = SceneGrid.from_bounds(asked.crs, asked.bounds_m, spacing_m=asked.spacing_m, height_m=asked.height_m)
-        chosen = {}
+        grid, chosen = on_the_ground(grid, Ground.of(asked, campaign.root, crs=asked.crs))
     path = campaign.root / PATH
-    write_json(path, {"grid": asdict(grid), "chosen": chosen})
+    inputs = Ground.of(asked, campaign.root, crs=grid.crs).inputs
+    write_json(path, {"grid": asdict(grid), "chosen": chosen, "inputs": inputs})
     return path
 
 
@@ -36,6 +41,8 @@ def settle(
     rx: NDArray[np.float64],
     frequency_hz: NDArray[np.float64],
     path_limit_m: float,
+    *,
+    root: Path,
 ) -> tuple[SceneGrid, dict[str, str]]:
     """Return the grid that is asked for, every `auto` settled from a flight's phase centres, and why.
 
@@ -49,20 +56,27 @@ def settle(
         (subcarrier,) float64.
     path_limit_m
         Longest total path inside the cyclic prefix, metres.
+    root
+        Campaign folder, where the DEM and the grid of the geoid are looked for.
     """
     chosen: dict[str, str] = {}
     crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
+    middle = np.median(np.concatenate([tx, rx]), axis=0)
     if crs == "auto":
-        crs = utm_crs(np.median(np.concatenate([tx, rx]), axis=0))
+        crs = utm_crs(middle)
         chosen["crs"] = "UTM zone of the first image flight"
+    ground = Ground.of(asked, root, crs=crs)
+    east, north = (middle if crs == LOCAL else projected_from_ecef(crs, middle))[:2]
+    height_m = ground.height_under(float(east), float(north))
     if bounds == "auto":
-        bounds = auto_bounds(tx, rx, crs=crs, height_m=asked.height_m, path_limit_m=path_limit_m)
+        bounds = auto_bounds(tx, rx, crs=crs, height_m=height_m, path_limit_m=path_limit_m)
         chosen["bounds_m"] = "ground that the first image flight sees well (docs/theory.md, eq. 8)"
     if spacing == "auto":
-        spacing = auto_spacing(tx, rx, frequency_hz, crs=crs, bounds_m=bounds, height_m=asked.height_m)
+        spacing = auto_spacing(tx, rx, frequency_hz, crs=crs, bounds_m=bounds, height_m=height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
     whole = bounds if asked.bounds_m != "auto" and asked.spacing_m != "auto" else _whole(bounds, spacing)
-    return SceneGrid.from_bounds(crs, whole, spacing_m=spacing, height_m=asked.height_m), chosen
+    grid, why = on_the_ground(SceneGrid.from_bounds(crs, whole, spacing_m=spacing, height_m=height_m), ground)
+    return grid, chosen | why
 
 
 def scene_grid(campaign: Campaign) -> SceneGrid:
@@ -71,9 +85,23 @@ def scene_grid(campaign: Campaign) -> SceneGrid:
     return SceneGrid(**{**found, "shape": tuple(found["shape"]), "first": tuple(found["first"])})
 
 
+def scene_inputs(campaign: Campaign) -> dict[str, str]:
+    """Return role → sha256 of the files that the grid's height came from."""
+    inputs: dict[str, str] = json.loads((campaign.root / PATH).read_text(encoding="utf-8"))["inputs"]
+    return inputs
+
+
 def grid_spec(grid: SceneGrid) -> str:
     """Return the grid as one line for provenance."""
     return canonical_json(asdict(grid))
+
+
+def grid_coordinates(grid: SceneGrid, name: str) -> dict[str, Any]:
+    """Return the coordinates y, x and spatial_ref of a raster stage; `name` is that of a local frame."""
+    crs = CRS.from_user_input(local_crs(name) if grid.crs == LOCAL else grid.crs)
+    step, _, west, _, _, north = grid.transform
+    reference = {"crs_wkt": crs.to_wkt(), "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+    return {"y": grid.y_m, "x": grid.x_m, "spatial_ref": ((), 0, reference)}
 
 
 def _first_flight(

@@ -1,0 +1,136 @@
+"""From heights above a geoid to heights above the ellipsoid, through a grid file that must be there."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
+from pyproj.exceptions import ProjError
+
+from apertura.errors import CampaignError
+
+GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
+"""Datum → names of its grid of undulations, as PROJ ships them."""
+
+EPSG = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
+"""Vertical CRS → datum."""
+
+_MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
+
+
+def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> Path:
+    """Return the grid of undulations of a datum: the one given, else the one on PROJ's search path.
+
+    Parameters
+    ----------
+    datum
+        What heights count from, for the message and to check that the file is not another datum's.
+    given
+        What scene.geoid says, as a path that opens here.
+    names
+        File names to look for; `GRIDS` of the datum by default.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such file: a height is never taken for ellipsoidal for want of a grid.
+
+    Examples
+    --------
+    >>> geoid_file("egm96", Path("nowhere.gtx"))
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: nowhere.gtx: no such file; expected the undulations of egm96, such as ...
+    """
+    names = tuple(names) or GRIDS.get(datum, ())
+    wanted = f"the undulations of {datum}" + (f", such as {' or '.join(names)}" if names else "")
+    if given is None:
+        found = [folder / name for folder in _proj_folders() for name in names if (folder / name).is_file()]
+        if found:
+            return found[0]
+        raise CampaignError(
+            f"heights count from {datum}, but its geoid grid is not here",
+            where="config/config.yaml: scene.geoid",
+            expected=wanted,
+            remedy=f"Get {names[0] if names else 'that grid'} from PROJ's grid collection (`projsync`), "
+            "put it beside the DEM, and name it in scene.geoid.",
+        )
+    others = [mark for other, marks in _MARKS.items() if other != datum for mark in marks]
+    wrong = "no such file" if not given.is_file() else None
+    if any(mark in given.name.lower() for mark in others):
+        wrong = f"the grid of another geoid than {datum}"
+    if any(mark in str(given) for mark in '",'):
+        wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
+    if wrong:
+        raise CampaignError(wrong, where=given, expected=wanted, remedy="Get that file, or correct scene.geoid.")
+    return given
+
+
+def _proj_folders() -> list[Path]:
+    listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
+    return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
+
+
+def undulation(
+    grid: Path, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how high the geoid lies above the ellipsoid.
+
+    Parameters
+    ----------
+    grid
+        A grid that PROJ reads (.gtx, .tif).
+    longitude_deg, latitude_deg
+        (...,) float64, degrees, in the geodetic CRS of the grid.
+
+    Returns
+    -------
+    ndarray
+        (...,) float64, metres, bilinear in the grid: ellipsoidal height = height above the geoid + undulation.
+
+    Raises
+    ------
+    CampaignError
+        If PROJ cannot read the grid or it does not reach a place.
+
+    Notes
+    -----
+    Source: PROJ, operation vgridshift. The grid is named in the operation itself, because PROJ skips one that it has to
+    look for and does not find.
+    """
+    steps = f'+step +proj=vgridshift +grids="{grid}" +multiplier=1'
+    try:
+        shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
+    except ProjError as error:
+        raise CampaignError(
+            "not readable as a vertical grid", where=grid, expected="a .gtx or .tif of PROJ", remedy="Get it again."
+        ) from error
+    height = np.asarray(shift.transform(longitude_deg, latitude_deg, np.zeros_like(longitude_deg))[2], np.float64)
+    lost = ~np.isfinite(height)
+    if lost.any():
+        longitude, latitude = (np.ravel(angle)[lost.argmax()] for angle in (longitude_deg, latitude_deg))
+        raise CampaignError(
+            f"has no undulation at longitude {longitude:.4f}, latitude {latitude:.4f}",
+            where=grid,
+            expected="a grid that reaches over the scene",
+            remedy="Get a grid of the region and name it in scene.geoid.",
+        )
+    return height
+
+
+def carried_datum(crs: CRS) -> str | None:
+    """Return what a CRS says of its heights: 'ellipsoid', 'egm96', 'egm2008', the name of another datum, or None.
+
+    Examples
+    --------
+    >>> [carried_datum(CRS(code)) for code in ("EPSG:4326", "EPSG:4979", "EPSG:4326+5773", "EPSG:25832+7837")]
+    [None, 'ellipsoid', 'egm96', 'DHHN2016 height']
+    """
+    vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None)
+    if vertical is None:
+        return "ellipsoid" if len(crs.axis_info) == 3 else None
+    authority = vertical.to_authority() or ("", "")
+    return EPSG.get(":".join(authority), vertical.name)

@@ -1,0 +1,137 @@
+"""Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.image.grid import LOCAL, SceneGrid
+from apertura.image.terrain import Terrain
+from apertura.steps.ground import Ground
+from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
+from apertura.steps.stamping import stamped
+from apertura.store import Window, finish, open_stage, tiles_missing, writing
+
+
+def terrain(campaign: Campaign) -> Path:
+    """Write results/terrain.zarr: ellipsoidal height (y, x) of the grid, tile by tile.
+
+    Raises
+    ------
+    CampaignError
+        If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
+    """
+    grid, folder = scene_grid(campaign), campaign.stage("terrain")
+    ground = Ground.of(campaign.settings.scene, campaign.root, crs=grid.crs)
+    if ground.terrain is None:
+        raise CampaignError(
+            "no DEM",
+            where="config/config.yaml: scene.dem",
+            expected="a GeoTIFF of heights",
+            remedy="Flat ground needs no terrain; name a DEM and its dem_datum, or leave this step out.",
+        )
+    ground.terrain.check_cover(grid)
+    empty = stamped(
+        xr.Dataset(
+            {"height": (("y", "x"), np.broadcast_to(np.float64(0), grid.shape))},
+            coords=grid_coordinates(grid, campaign.settings.campaign),
+            attrs={"frame": "local" if grid.crs == LOCAL else "ecef", "terrain": {}},
+        ),
+        "terrain",
+        module=__name__,
+        settings={**campaign.relevant("terrain"), "grid": grid_spec(grid)},
+        inputs=ground.inputs,
+    )
+    windows = list(grid.tiles(campaign.settings.processing.tile_px))
+    with writing(folder) as wip:
+        missing = tiles_missing(wip, empty, "height", windows)
+        print(f"{len(missing)} of {len(windows)} tiles to read from {ground.terrain.path.name}", flush=True)
+        target = zarr.open_array(wip / "height", mode="r+")
+        for window in missing:
+            target[window] = ground.terrain.heights(grid[window])
+        report = _report(target, windows, grid, ground.terrain)
+        zarr.open_group(wip, mode="r+").attrs["terrain"] = report | {"datum": campaign.settings.scene.dem_datum}
+        finish(wip, folder)
+    return folder
+
+
+def _report(target: Any, windows: list[Window], grid: SceneGrid, source: Terrain) -> dict[str, Any]:
+    """Return what image.json may say of the terrain; raise where a pixel has no height."""
+    voids, first, low, high = 0, "", np.inf, -np.inf
+    for window in windows:
+        heights = np.asarray(target[window])
+        void = np.isnan(heights)
+        if void.any() and not voids:
+            row, column = np.argwhere(void)[0]
+            x, y = grid[window].map_at(row, column)
+            first = f"x {x:.2f}, y {y:.2f}"
+        voids += int(void.sum())
+        if not void.all():
+            low, high = min(low, float(np.nanmin(heights))), max(high, float(np.nanmax(heights)))
+    if voids:
+        total = grid.shape[0] * grid.shape[1]
+        raise CampaignError(
+            f"no height at {voids} of {total} pixels of the scene ({100 * voids / total:.2f} %), first at {first}",
+            where=source.path,
+            expected="a height at every post under the scene",
+            remedy="Fill the voids (NaN or nodata) of the DEM with a GIS, or make scene.bounds_m smaller.",
+        )
+    return {
+        "dem": source.path.name,
+        "geoid": source.geoid.name if source.geoid else None,
+        "lowest_m": low,
+        "highest_m": high,
+    }
+
+
+@dataclass(frozen=True)
+class Heights:
+    """The ground that imaging sees.
+
+    Attributes
+    ----------
+    parents
+        The stage `terrain`, or nothing: what was made with it inherits its provenance.
+    of
+        Window → (row, column) float64 metres; None: flat ground at the grid's height.
+    """
+
+    parents: tuple[xr.Dataset, ...]
+    of: Callable[[Window], NDArray[np.float64]] | None
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What image.json says of the terrain; nothing of flat ground."""
+        return {"terrain": self.parents[0].attrs["terrain"]} if self.parents else {}
+
+    def at(self, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np.float64] | None:
+        """Return the heights (m) at fractional pixel indices, bilinear; None where the ground is flat."""
+        if self.of is None:
+            return None
+        pairs = zip(np.ravel(row), np.ravel(column), strict=True)
+        return np.reshape([self._at(float(down), float(right), self.of) for down, right in pairs], np.shape(row))
+
+    def _at(self, row: float, column: float, of: Callable[[Window], NDArray[np.float64]]) -> float:
+        window = (slice(int(row), int(row) + 2), slice(int(column), int(column) + 2))
+        found = of(window)  # one row or column less at the southern and eastern edge
+        share = [
+            np.array([1 - place % 1, place % 1])[:size] for place, size in zip((row, column), found.shape, strict=True)
+        ]
+        return float(share[0] @ found @ share[1] / (share[0].sum() * share[1].sum()))
+
+
+def open_heights(campaign: Campaign) -> Heights:
+    """Return the finished stage `terrain` to be read by windows, or flat ground where there is no DEM."""
+    if campaign.settings.scene.dem is None:
+        return Heights((), None)
+    folder = campaign.stage("terrain")
+    stage = open_stage(folder, "terrain")
+    array = zarr.open_array(folder / "height", mode="r")
+    return Heights((stage,), lambda window: np.asarray(array[window], np.float64))
