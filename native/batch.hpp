@@ -7,9 +7,11 @@
 namespace {
 
 // Fast forms: one look-up window for a group of four blocks (one block with 8 lanes), or a wide one for each block; all
-// blocks bend alike, or each its own way.
+// blocks bend alike, or each its own way. Where antennas weigh, pulses that may go fast all go the one way that holds
+// for all of them.
 constexpr bool kGrouped = kLanes == 16;
-enum Form { kShared, kSharedWide, kOwn, kFast, kExact = kFast, kSkip, kForms };
+// Fast forms but for the first two bend block by block.
+enum Form { kShared, kSharedWide, kOwn, kWeighted, kExact, kSkip, kForms };
 
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the centre, from the window's first cell
@@ -20,6 +22,8 @@ struct Batch {
   alignas(64) float bend[kBatch][16];           // shared curvature over the pixels of any block
   alignas(64) float tilt[kBatch][16];           // shared change of the height slope over them
   float lift[kBatch];                           // shared second derivative along the height
+  alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // of the antennas
+  float weight_h[kBatch];
   const float* row[kBatch];
   int order[kForms][kBatch];
   int count[kForms];
@@ -111,14 +115,14 @@ template <bool kTerrain, Form kForm>
 inline Lanes place_pixels(const Patch& patch, const Batch& batch, int q, int b, int part) {
   const Lanes x = load(kLaneX + part), y = load(kLaneY + part);
   Lanes t;
-  if constexpr (kForm == kOwn)
+  if constexpr (kForm >= kOwn)
     t = batch.path[q][b] + x * (batch.x[q][b] + x * batch.xx[q][b] + y * batch.xy[q][b]) +
         y * (batch.y[q][b] + y * batch.yy[q][b]);
   else
     t = (load(batch.bend[q] + part) + batch.path[q][b]) + x * batch.x[q][b] + y * batch.y[q][b];
   if constexpr (kTerrain) {
     const Lanes rise = load(patch.rise + b * 16 + part);
-    if constexpr (kForm == kOwn)
+    if constexpr (kForm >= kOwn)
       t += rise * (batch.h[q][b] + x * batch.xh[q][b] + y * batch.yh[q][b] + rise * batch.hh[q][b]);
     else
       t += rise * (load(batch.tilt[q] + part) + batch.h[q][b] + rise * batch.lift[q]);
@@ -154,6 +158,12 @@ inline void add_form(const ApertureJob& job, const Patch& patch, const Batch& ba
         Lanes vr = re1[index], vi = im1[index], cosine, sine;
         if constexpr (kDegree == 2) vr += u * re2[index], vi += u * im2[index];
         vr = re0[index] + u * vr, vi = im0[index] + u * vi;
+        if constexpr (kForm == kWeighted) {
+          Lanes weight = load(kLaneX + part) * batch.weight_x[q][b] + load(kLaneY + part) * batch.weight_y[q][b] +
+                         batch.weight[q][b];
+          if constexpr (kTerrain) weight += load(patch.rise + b * 16 + part) * batch.weight_h[q];
+          vr *= weight, vi *= weight;
+        }
         phase(u, cosine, sine);
         re[v] += vr * cosine, im[v] += vr * sine;
         re[v] -= vi * sine, im[v] += vi * cosine;

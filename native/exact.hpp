@@ -30,8 +30,10 @@ inline void path_of(const ApertureJob& job, const Positions& at, int64_t pulse, 
   }
 }
 
+// `weight`: of each pixel, or null for one.
 template <class Phase, int kDegree>
-inline void add_exact(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse, float* sum) {
+inline void add_exact(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
+                      const float* weight, float* sum) {
   const Phase phase(job.phase);
   const float* row = job.cells + pulse * 2 * (kDegree + 1) * job.width;
   alignas(64) double cell[kPixels];
@@ -51,6 +53,7 @@ inline void add_exact(const ApertureJob& job, const Patch& patch, const Position
       if constexpr (kDegree == 2) vr += u * load(taken[4]), vi += u * load(taken[5]);
       vr = load(taken[0]) + u * vr, vi = load(taken[1]) + u * vi;
       phase(u, cosine, sine);
+      if (weight) vr *= load(weight + slot), vi *= load(weight + slot);
       store(sum + slot, load(sum + slot) + vr * cosine - vi * sine);
       store(sum + kPixels + slot, load(sum + kPixels + slot) + vr * sine + vi * cosine);
     }

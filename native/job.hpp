@@ -1,6 +1,15 @@
-// What Python hands over, mirrored field by field in src/apertura/image/engines/native.py.
+// What Python hands over, mirrored field by field in src/apertura/image/engines/binding.py.
 #pragma once
 #include <cstdint>
+
+// The beam of one antenna: gain over azimuth times gain over elevation, about axes that may turn with each pulse.
+struct BeamJob {
+  const double* axes;         // (3 axes, 3, padded): unit vectors of boresight, growing azimuth, growing elevation
+  const float* gain[2];       // over azimuth and over elevation
+  int64_t count[2];           // samples of each, at least 2
+  double first_rad[2], samples_per_rad[2];
+  double peak;                // largest |gain| of the product
+};
 
 // A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".
 struct ApertureJob {
@@ -19,6 +28,7 @@ struct ApertureJob {
   int32_t phase_form;         // index into phase.hpp
   int32_t wide_sum;           // 1: sums over pulses in float64
   float phase[9];             // cosine (4), sine (4), half turns per cell
+  const BeamJob* beam[2];     // of transmitter and receiver; null: the same in all directions
 };
 
 // Range profiles to be turned into tables.

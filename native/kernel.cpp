@@ -1,5 +1,5 @@
 // Compiled once per instruction set; APERTURA_FORM names the copy.
-#include "exact.hpp"
+#include "beam.hpp"
 #include "expand.hpp"
 
 #define APERTURA_JOIN2(a, b) a##b
@@ -11,18 +11,28 @@ template <class Phase, int kDegree, bool kTerrain>
 void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
   Batch batch;
   Positions at;
+  alignas(64) float weight[kPixels];
+  const bool weighted = job.beam[0] || job.beam[1];
   bool gathered = false;
   for (int64_t pulse = begin; pulse < end; pulse += kBatch) {
     const int pulses = int(end - pulse < kBatch ? end - pulse : kBatch);
-    sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
-    if constexpr (kLanes != 4) add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
-    add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
-    add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
+    if (weighted) {
+      sort_weighted<kTerrain>(job, patch, pulse, pulses, batch);
+      add_form<Phase, kDegree, kTerrain, kWeighted>(job, patch, batch, sum);
+    } else {
+      sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
+      if constexpr (kLanes != 4) add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
+      add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
+      add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
+    }
     if (batch.count[kExact] && !gathered) gather(job, patch, at), gathered = true;
-    for (int n = 0; n < batch.count[kExact]; n++)
-      add_exact<Phase, kDegree>(job, patch, at, pulse + batch.order[kExact][n], sum);
+    for (int n = 0; n < batch.count[kExact]; n++) {
+      const int64_t one = pulse + batch.order[kExact][n];
+      if (weighted) weigh_exactly(job, at, one, weight);
+      add_exact<Phase, kDegree>(job, patch, at, one, weighted ? weight : nullptr, sum);
+    }
     job.counts[0] += batch.count[kShared] + batch.count[kSharedWide];
-    job.counts[1] += batch.count[kOwn];
+    job.counts[1] += batch.count[kOwn] + batch.count[kWeighted];
     job.counts[2] += batch.count[kExact];
     job.counts[3] += batch.count[kSkip];
   }

@@ -105,6 +105,7 @@ void describe_block(Patch& patch, int block, const double height[kPixels]) {
     const double rise = height[i * kSide + j] - level;
     patch.rise[block * 16 + lane] = float(rise);
     patch.roughest = std::fmax(patch.roughest, float(std::fabs(rise)));
+    patch.tallest = std::fmax(patch.tallest, float(std::fabs(height[i * kSide + j])));
   }
 }
 

@@ -12,6 +12,9 @@ constexpr int kPixels = kSide * kSide;
 constexpr int top(int block) { return block / 8 * 8 + block / 2 % 2 * 4; }
 constexpr int left(int block) { return block / 4 % 2 * 8 + block % 2 * 4; }
 
+// Half of what `count` pixels span, in pixels.
+constexpr float half(int count) { return count > 1 ? 0.5f * float(count - 1) : 0.5f; }
+
 // Lengths in cells but for `origin`. Lanes are counted row by row of a block.
 struct alignas(64) Patch {
   float along_x[kBlocks], along_y[kBlocks], height[kBlocks];  // centre of each block: pixels, pixels, cells
@@ -20,7 +23,8 @@ struct alignas(64) Patch {
   float rise[kPixels];                                        // height of each pixel above its block's, block by block
   double origin[3], step_x[3], step_y[3], up[3];
   float xx, xy, yy, xh, yh;                                   // products of step_x, step_y and up
-  float reach, inner, roughest;                               // largest centre distance, pixel offset in a block, |rise|
+  float reach, inner, roughest, tallest;                      // largest centre distance, pixel offset in a block, |rise|,
+                                                              // height above the plane
   int64_t row, column;                                        // of the first pixel
   int rows, columns;                                          // pixels present
   bool present[kBlocks];                                      // which blocks hold any

@@ -16,6 +16,19 @@ _int64 = ctypes.c_int64
 _double = ctypes.c_double
 
 
+class BeamJob(ctypes.Structure):
+    """native/job.hpp, BeamJob."""
+
+    _fields_ = [
+        ("axes", _pointer),
+        ("gain", _pointer * 2),
+        ("count", _int64 * 2),
+        ("first_rad", _double * 2),
+        ("samples_per_rad", _double * 2),
+        ("peak", _double),
+    ]
+
+
 class ApertureJob(ctypes.Structure):
     """native/job.hpp, ApertureJob."""
 
@@ -26,6 +39,7 @@ class ApertureJob(ctypes.Structure):
         *((name, _double) for name in ("cells_per_metre", "radians_per_cell", "tolerance_rad")),
         *((name, ctypes.c_int32) for name in ("degree", "phase_form", "wide_sum")),
         ("phase", ctypes.c_float * 9),
+        ("beam", ctypes.POINTER(BeamJob) * 2),
     ]
 
 

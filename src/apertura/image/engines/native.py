@@ -11,12 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.image.engines.binding import INSTRUCTION_SETS, ApertureJob, TableJob, available, call, instruction_set
+from apertura.image.beam import Beam, Beams
+from apertura.image.engines.binding import (
+    INSTRUCTION_SETS,
+    ApertureJob,
+    BeamJob,
+    TableJob,
+    available,
+    call,
+    instruction_set,
+)
 from apertura.image.engines.tables import MARGIN, TAPS, Plan, Tables, plan
 from apertura.image.history import Profiles
 
 __all__ = ["INSTRUCTION_SETS", "PATCH", "available", "form", "instruction_set", "prepare"]
 
+NO_BEAMS = Beams()
 PATCH = 16  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
 
 
@@ -83,6 +93,7 @@ def form(
     tables: Tables,
     pixels: NDArray[np.float64],
     *,
+    beams: Beams = NO_BEAMS,
     accumulate: Literal["complex64", "complex128"] = "complex64",
     tolerance_rad: float = 1.5e-3,
     counts: NDArray[np.int64] | None = None,
@@ -96,6 +107,8 @@ def form(
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local): any surface. A tile of
         a larger grid that begins at multiples of 16 pixels gets the same bits as in the whole.
+    beams
+        Weight of each pulse at each pixel by its antennas; pulses whose beam misses a patch cost little.
     accumulate
         Type of the sum over blocks of pulses.
     tolerance_rad
@@ -114,13 +127,13 @@ def form(
     Raises
     ------
     ValueError
-        If `pixels` has another shape or `accumulate` is unknown.
+        If `pixels` has another shape, `accumulate` is unknown, or a beam is of other pulses.
     MemoryError
         If the kernel found no memory.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "Paths".
+    Source: docs/theory/engine.md, "Paths" and "Antennas".
     """
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
@@ -129,17 +142,45 @@ def form(
     pixels = np.ascontiguousarray(pixels, np.float64)
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
+    padded = tables.first_path_m.size
+    weights = [_weight(beam, len(tables.cells), padded) for beam in (beams.transmit, beams.receive)]
+    pointers = (ctypes.POINTER(BeamJob) * 2)()
+    for leg, weight in enumerate(weights):
+        if weight is not None:
+            pointers[leg] = ctypes.pointer(weight[0])
     job = ApertureJob(
         *(array.ctypes.data for array in (tables.cells, tables.transmitter_m, tables.receiver_m, tables.first_path_m)),
         pixels.ctypes.data, image.ctypes.data, tally.ctypes.data,
-        len(tables.cells), tables.first_path_m.size, tables.cells.shape[2], *image.shape,
+        len(tables.cells), padded, tables.cells.shape[2], *image.shape,
         1 / tables.cell_m, tables.carrier_rad_per_cell, tolerance_rad,
         tables.degree, tables.phase_form, accumulate == "complex128", (ctypes.c_float * 9)(*tables.phase),
+        pointers,
     )  # fmt: skip
     call("apertura_image", job)
     if counts is not None:
         counts += tally
     return image
+
+
+def _weight(beam: Beam | None, pulses: int, padded: int) -> tuple[BeamJob, list[NDArray[np.generic]]] | None:
+    """Return what the kernel reads of a beam, and the arrays that it points into."""
+    if beam is None:
+        return None
+    if len(beam.axes) != pulses:
+        raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+    axes = np.pad(beam.axes, [(0, padded - pulses), (0, 0), (0, 0)], mode="edge")
+    axes = np.ascontiguousarray(np.moveaxis(axes, 0, -1), np.float64)
+    angles = (beam.azimuth_rad, beam.elevation_rad)
+    gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
+    job = BeamJob(
+        axes.ctypes.data,
+        (ctypes.c_void_p * 2)(*(gain.ctypes.data for gain in gains)),
+        (ctypes.c_int64 * 2)(*(gain.size for gain in gains)),
+        (ctypes.c_double * 2)(*(angle[0] for angle in angles)),
+        (ctypes.c_double * 2)(*((angle.size - 1) / (angle[-1] - angle[0]) for angle in angles)),
+        float(np.prod([np.abs(gain).max() for gain in gains])),
+    )
+    return job, [axes, *gains]
 
 
 def _expand(

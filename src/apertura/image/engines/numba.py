@@ -7,9 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.image.beam import Beams
 from apertura.image.history import Profiles
 
 _HALF_TAPS = 10
+_PIXELS_AT_ONCE = 1024  # whose weights are held at once
 _KAISER_BETA = 10.0  # -100 dB, with half the band free for the transition
 
 
@@ -94,7 +96,7 @@ def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]
     return fine.reshape(len(samples), -1)
 
 
-def form(tables: Tables, pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
+def form(tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex64]:
     """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, R the total path.
 
     Parameters
@@ -103,6 +105,8 @@ def form(tables: Tables, pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
         From `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres.
+    beams
+        Weight of each pulse at each pixel by its antennas; none by default.
 
     Returns
     -------
@@ -115,21 +119,25 @@ def form(tables: Tables, pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
     """
     flat = np.ascontiguousarray(pixels.reshape(-1, 3))
     image = np.zeros(len(flat), np.complex128)
-    _accumulate(
-        tables.samples,
-        tables.start_m,
-        tables.step_m,
-        tables.wavenumber_rad_m,
-        tables.tx_position_m,
-        tables.rx_position_m,
-        flat,
-        image,
-    )
+    centres = (tables.tx_position_m, tables.rx_position_m)
+    none, at_once = np.empty((0, 0)), len(flat) if beams is None else _PIXELS_AT_ONCE
+    for first in range(0, len(flat), at_once):
+        part = slice(first, first + at_once)
+        _accumulate(
+            tables.samples,
+            tables.start_m,
+            tables.step_m,
+            tables.wavenumber_rad_m,
+            *centres,
+            flat[part],
+            none if beams is None else beams.weight(*centres, flat[part]),
+            image[part],
+        )
     return image.reshape(pixels.shape[:-1]).astype(np.complex64)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, image):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, weights, image):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     pulses, length = samples.shape
     for i in range(len(pixels)):
         x, y, z = pixels[i, 0], pixels[i, 1], pixels[i, 2]
@@ -150,5 +158,7 @@ def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, image):  # typ
                 + samples[p, k + 2] * ((u + 1) * u * (u - 1) / 6)
             )
             phase = wavenumber * path
+            if weights.size:
+                value *= weights[p, i]
             total += value * (np.cos(phase) + 1j * np.sin(phase))
         image[i] += total

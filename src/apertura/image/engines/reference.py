@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.image.beam import Beams
 from apertura.image.history import Spectra
 
 _PULSES_AT_ONCE = 16
@@ -15,7 +16,7 @@ def prepare(spectra: Spectra) -> Spectra:
     return spectra
 
 
-def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128]:
+def form(spectra: Spectra, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex128]:
     """Return the matched filter ΣΣ w_n H_n exp(+j2πf_n(τ-τ_ref)) over pulses and subcarriers at each pixel.
 
     Parameters
@@ -24,6 +25,8 @@ def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128
         Calibrated transfer functions, subcarriers equally spaced.
     pixels
         (..., 3) float64, metres, in the frame of the phase centres.
+    beams
+        Weight of each pulse at each pixel by its antennas; none by default.
 
     Returns
     -------
@@ -46,7 +49,11 @@ def form(spectra: Spectra, pixels: NDArray[np.float64]) -> NDArray[np.complex128
     flat = pixels.reshape(-1, 3)
     image = np.zeros(len(flat), np.complex128)
     for first in range(0, len(spectra.transfer), _PULSES_AT_ONCE):
-        image += terms(spectra, flat, pulses=slice(first, first + _PULSES_AT_ONCE)).sum(axis=0)
+        pulses = slice(first, first + _PULSES_AT_ONCE)
+        added = terms(spectra, flat, pulses=pulses)
+        if beams is not None:
+            added *= beams.weight(spectra.tx_position_m, spectra.rx_position_m, flat, pulses=pulses)
+        image += added.sum(axis=0)
     return image.reshape(pixels.shape[:-1])
 
 

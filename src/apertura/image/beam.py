@@ -1,0 +1,137 @@
+"""Where an antenna looks: the weight of each pulse at each pixel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A separable pattern about axes that turn with the antenna; zero outside the sampled angles.
+
+    A direction with components (a, b, c) along the axes has azimuth atan2(b, a) and elevation
+    atan2(c, √(a² + b²)); its gain is the product of both patterns, linear between samples.
+
+    Attributes
+    ----------
+    axes
+        (pulse, 3, 3) float64, rows are unit vectors along boresight, growing azimuth and growing elevation,
+        at right angles, in the frame of the pixels.
+    azimuth_rad, elevation_rad
+        (n,) and (m,) float64, equally spaced and growing.
+    azimuth_gain, elevation_gain
+        (n,) and (m,) float64, field (not power) relative to boresight.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, angles are not equally spaced, or axes are no right-angled unit vectors.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Antennas".
+
+    Examples
+    --------
+    >>> angles = np.radians([-20.0, 0.0, 20.0])
+    >>> beam = Beam(np.eye(3)[None], angles, np.array([0.5, 1, 0.5]), angles, np.array([0.5, 1, 0.5]))
+    >>> tilted = np.array([[5.0, 0.0, 0.0], [5.0, 5 * np.tan(np.radians(10)), 0.0], [5.0, 5.0, 0.0]])
+    >>> beam.gain(np.zeros((1, 3)), tilted).round(3)
+    array([[1.  , 0.75, 0.  ]])
+    """
+
+    axes: NDArray[np.float64]
+    azimuth_rad: NDArray[np.float64]
+    azimuth_gain: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    elevation_gain: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.axes.ndim != 3 or self.axes.shape[1:] != (3, 3):
+            raise ValueError(f"{self.axes.shape=}: must be (pulse, 3, 3)")
+        if not np.allclose(self.axes @ self.axes.swapaxes(1, 2), np.eye(3), atol=1e-6):
+            raise ValueError("axes: rows must be unit vectors at right angles")
+        for name, angle, gain in self._patterns():
+            if angle.ndim != 1 or angle.size < 2 or gain.shape != angle.shape:
+                raise ValueError(f"{name}: {angle.shape=} and {gain.shape=} must be equal, with two samples or more")
+            step = (angle[-1] - angle[0]) / (angle.size - 1)
+            if not (step > 0 and np.allclose(np.diff(angle), step, rtol=1e-6, atol=1e-9) and np.isfinite(gain).all()):
+                raise ValueError(f"{name}: angles must grow in equal steps, gains be finite")
+
+    def gain(
+        self, position_m: NDArray[np.float64], pixels: NDArray[np.float64], *, pulses: slice = slice(None)
+    ) -> NDArray[np.float64]:
+        """Return the gain of each pulse towards each pixel.
+
+        Parameters
+        ----------
+        position_m
+            (pulse, 3) float64, phase centres of this antenna, in the frame of the pixels.
+        pixels
+            (pixel, 3) float64, metres.
+        pulses
+            Which pulses; all by default.
+
+        Returns
+        -------
+        ndarray
+            (pulse, pixel) float64.
+        """
+        away = pixels - position_m[pulses, None]
+        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes[pulses]), -1, 0)
+        angles = np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))
+        gains = [
+            np.interp(angle, samples, values, left=0, right=0)
+            for angle, (_, samples, values) in zip(angles, self._patterns(), strict=True)
+        ]
+        return np.asarray(gains[0] * gains[1])
+
+    def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+        return [
+            ("azimuth", self.azimuth_rad, self.azimuth_gain),
+            ("elevation", self.elevation_rad, self.elevation_gain),
+        ]
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Beams of transmitter and receiver; None looks everywhere alike.
+
+    Attributes
+    ----------
+    transmit, receive
+        Each over the pulses that an image is formed from.
+
+    Examples
+    --------
+    >>> Beams().weight(np.zeros((2, 3)), np.zeros((2, 3)), np.ones((4, 3))).shape
+    (2, 4)
+    """
+
+    transmit: Beam | None = None
+    receive: Beam | None = None
+
+    def weight(
+        self,
+        tx_position_m: NDArray[np.float64],
+        rx_position_m: NDArray[np.float64],
+        pixels: NDArray[np.float64],
+        *,
+        pulses: slice = slice(None),
+    ) -> NDArray[np.float64]:
+        """Return (pulse, pixel) float64, the product of both gains; parameters as `Beam.gain`.
+
+        Raises
+        ------
+        ValueError
+            If a beam has not one set of axes for each pulse.
+        """
+        total = np.ones((len(tx_position_m[pulses]), len(pixels)))
+        for beam, position_m in ((self.transmit, tx_position_m), (self.receive, rx_position_m)):
+            if beam is None:
+                continue
+            if len(beam.axes) != len(position_m):
+                raise ValueError(f"{len(beam.axes)=}: must be one for each of {len(position_m)} pulses")
+            total *= beam.gain(position_m, pixels, pulses=pulses)
+        return total
