@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run test test-slow lint format lock clean
+.PHONY: setup demo run paper stability test test-slow lint format lock clean
 
 setup: $(SETUP)
 
@@ -27,6 +27,10 @@ demo: $(SETUP)
 
 run: $(SETUP)
 	$(BIN)/apertura run $(CAMPAIGN)
+
+# The paper's claims and the stability atlas, into results/study/; killed runs go on where they were.
+paper stability: $(SETUP)
+	$(BIN)/snakemake --snakefile workflow/rules/study.smk --workflow-profile profiles/default $@
 
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)

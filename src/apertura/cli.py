@@ -11,10 +11,12 @@ import typer
 from apertura import __version__
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.study.commands import app as study
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="SAR images from campaign folders.")
 step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 app.add_typer(step, name="step")
+app.add_typer(study, name="study")
 
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
 Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
@@ -43,11 +45,16 @@ def run(
     cores: Annotated[int, typer.Option(help="cores to use")] = os.cpu_count() or 1,
 ) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
+    raise SystemExit(_snakemake(campaign, cores, *context.args))
+
+
+def _snakemake(campaign: Path, cores: int, *arguments: str) -> int:
+    """Run the workflow; return its exit status."""
     Campaign.load(campaign).check_files()
     root = _workflow_folder()
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
-    command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *context.args]
-    raise SystemExit(subprocess.run(command, check=False).returncode)
+    command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *arguments]
+    return subprocess.run(command, check=False).returncode
 
 
 def _workflow_folder() -> Path:
@@ -62,6 +69,19 @@ def plan(campaign: Annotated[Path, typer.Argument(help="campaign folder")], thre
     from apertura.steps.plan import print_plan
 
     print_plan(Campaign.load(campaign), threads=threads)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def chart(
+    context: typer.Context,
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    cores: Annotated[int, typer.Option(help="cores to use")] = os.cpu_count() or 1,
+) -> None:
+    """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
+    status = _snakemake(campaign, cores, *context.args, "speed_accuracy")
+    if status == 0:
+        print(*(campaign / f"results/study/speed_accuracy.{suffix}" for suffix in ("png", "html", "csv")), sep="\n")
+    raise SystemExit(status)
 
 
 @app.command("calibrate-cost")
@@ -167,6 +187,14 @@ def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads =
     from apertura.steps import image as steps
 
     print(steps.image(Campaign.load(campaign), flight, pair, threads=threads))
+
+
+@step.command("chart")
+def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
+    """Time and measure every engine and setting on a pair, for at most so many seconds."""
+    from apertura.study.speed_accuracy import speed_accuracy
+
+    print(*speed_accuracy(Campaign.load(campaign), flight, pair, seconds=seconds), sep="\n")
 
 
 @step.command()
