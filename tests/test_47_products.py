@@ -53,10 +53,3 @@ def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
     assert "UTM zone 32N" in cube.spatial_ref.attrs["crs_wkt"]
     slc = rasterio.open(finished_tiny.results / "f01" / "uav1-uav2" / "slc.tif").read(1)
     np.testing.assert_array_equal(cube.image.values[0, cube.attrs["pairs"].index("uav1-uav2")], slc)
-
-
-def test_gdal_reads_the_image_stage(finished_tiny):
-    path = finished_tiny.results / "f01" / "uav1-uav1" / "image.zarr"
-    with rasterio.open(f'ZARR:"{path}":/image') as raster:
-        slc = rasterio.open(finished_tiny.results / "f01" / "uav1-uav1" / "slc.tif").read(1)
-        np.testing.assert_array_equal(raster.read(1), slc)
