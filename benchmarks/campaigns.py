@@ -11,7 +11,8 @@ from apertura.image.extent import swath
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles, Spectra
 from apertura.image.plan import Job
-from apertura.steps.plan import Outlook, job_of
+from apertura.steps.outlook import Outlook
+from apertura.steps.plan import job_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
 
 

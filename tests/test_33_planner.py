@@ -14,6 +14,7 @@ from apertura.image.candidates import Signal, candidates
 from apertura.image.cost import Costs, default_costs, read_costs, write_costs
 from apertura.image.edges import crossed_edges, finest_cell_m
 from apertura.image.engines import ENGINES, native, reference
+from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles
 from apertura.image.models import decide_midpoint, decide_terrain, midpoint_error, phase_rates
 from apertura.image.plan import Job
@@ -21,13 +22,15 @@ from apertura.image.planner import ladder, make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.thinning import design, presum_error_db, thin
 from apertura.image.view import forms, look
-from apertura.steps.plan import check_fits
+from apertura.steps.plan import check_fits, planned_heights
+from apertura.steps.terrain import Heights
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from campaigns import draw
 
 COSTS = default_costs("avx512")
 WAVELENGTH = C / 1.2e9
+DEM = Heights((), lambda _: np.zeros((2, 2)))
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
 
@@ -142,7 +145,6 @@ def test_a_machine_on_which_numba_is_fast_gets_numba():
         ("table_oversampling", 9),
         ("phase_tolerance_rad", 2e-4),
         ("accumulate", "complex128"),
-        ("terrain", "dem"),
         ("midpoint", True),
     ],
 )
@@ -231,6 +233,40 @@ def test_ground_is_flat_as_long_as_places_bear_it():
 def test_a_slope_is_a_tilted_plane():
     assert terrain(0.0, slope=1.5) == "tilted_plane"
     assert terrain(0.0, slope=0.3) == "plane"
+
+
+def test_a_tilted_plane_is_laid_through_the_dem():
+    """1 cm per row and 5 cm per column of pixels, from a DEM in blocks of 10: (row 0, column 0) lies 7 m below flat."""
+    row, column = 10 * np.indices((20, 20)) + 4.5
+    sloped = plan(heights_m=0.01 * row + 0.05 * column - 7.0, heights_step_px=10)
+    assert sloped.choices["terrain"] == "tilted_plane"
+    assert sloped.choices["tilt_m"] == pytest.approx((-7.0, 0.01, 0.05))
+    seen = planned_heights(sloped, DEM, grid_of(200))
+    assert seen.of((slice(100, 102), slice(40, 300))).shape == (2, 160)
+    assert seen.of((slice(100, 102), slice(40, 42)))[1, 0] == pytest.approx(5.0 - 7.0 + 1.01 + 2.0)
+
+
+def test_flat_ground_and_rough_ground_are_taken_as_they_are():
+    flat, rough = plan(heights_m=np.full((9, 9), 1e-4)), plan(heights_m=np.random.default_rng(0).normal(size=(9, 9)))
+    assert planned_heights(flat, DEM, grid_of(200)).of is None
+    assert planned_heights(rough, DEM, grid_of(200)) is DEM
+    asked = plan(heights_m=np.full((9, 9), 1e-4), overrides={"terrain": "dem"})
+    assert planned_heights(asked, DEM, grid_of(200)) is DEM
+    with pytest.raises(CampaignError, match="terrain is dem; expected plane or auto: the scene has no DEM"):
+        plan(overrides={"terrain": "dem"})
+
+
+def grid_of(pixels: int) -> SceneGrid:
+    return SceneGrid("local", 0.0, 10.0, 0.05, (pixels, pixels), 5.0)
+
+
+def test_what_is_chosen_is_told_without_what_it_takes():
+    """Products carry `choices` and `reasons`: the same on a machine with other costs and the same choice."""
+    slower = Costs({name: 2 * value for name, value in COSTS.seconds.items()}, "another machine")
+    first, second = plan(), make_plan(job(), accuracy_db=-60.0, costs=slower)
+    assert first.choices == second.choices
+    assert first.reasons == second.reasons
+    assert second.predicted_seconds == pytest.approx(2 * first.predicted_seconds)
 
 
 def test_without_a_dem_the_plan_says_what_height_error_is_borne():

@@ -203,7 +203,7 @@ def decide_terrain(
     Parameters
     ----------
     heights_m
-        (row, column) float64 of a DEM over the scene, metres, evenly spread; None without one.
+        (row, column) float64 of a DEM over the scene, metres above the flat model, evenly spread; None without one.
     track_m
         (pulse, 3) float64, mean of both phase centres.
     place_m
@@ -232,7 +232,7 @@ def decide_terrain(
     )
     if heights_m is None:
         return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit:.3g} m: {rule}")
-    flat = float(np.abs(heights_m - np.median(heights_m)).max())
+    flat = float(np.abs(heights_m).max())
     if flat < limit:
         return Decision("terrain", "plane", f"relief {flat:.3g} m; {rule}")
     rest = float(np.abs(heights_m - plane_through(heights_m)).max())

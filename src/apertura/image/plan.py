@@ -36,8 +36,8 @@ class Job:
         'ecef' or 'local'.
     tile_px, threads
         Side of a tile; tiles formed at once.
-    heights_m
-        (row, column) float64 of a DEM at the places of the net; None without one.
+    heights_m, heights_step_px
+        (row, column) float64 of a DEM above the flat model, in the middle of blocks of so many pixels; None without.
     path_limit_m
         Longest total path inside the cyclic prefix.
     content_db
@@ -58,6 +58,7 @@ class Job:
     tile_px: int = 256
     threads: int = 1
     heights_m: NDArray[np.float64] | None = None
+    heights_step_px: int = 1
     path_limit_m: float = np.inf
     content_db: float | None = None
 
@@ -99,8 +100,12 @@ class Plan:
         Peak of the imaging step; what it leaves in the results folder.
     flags
         Edges that the job crosses: name → what was found, in one line.
-    presum, midpoint
+    presum, midpoint, middle_m
         What `history` applies.
+    tilt_m
+        Of a tilted plane: height above the flat model at pixel (0, 0), per row and per column, metres.
+    cost_source
+        Where the costs came from.
     """
 
     setting: Setting
@@ -114,6 +119,8 @@ class Plan:
     presum: Presum | None = field(default=None, repr=False)
     midpoint: bool = False
     middle_m: NDArray[np.float64] | None = field(default=None, repr=False)
+    tilt_m: tuple[float, float, float] | None = None
+    cost_source: str = ""
 
     @property
     def engine(self) -> str:
@@ -134,6 +141,11 @@ class Plan:
     def reasons(self) -> dict[str, str]:
         """Choice → value and reason, in one line."""
         return {decision.name: f"{decision.value}: {decision.reason}" for decision in self.decisions}
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """Choice → value: all that the image's pixels depend on, and no prediction."""
+        return {decision.name: decision.value for decision in self.decisions} | {"tilt_m": self.tilt_m}
 
     def history(self, profiles: Profiles) -> Profiles:
         """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same.

@@ -1,15 +1,24 @@
 """The planner: how an image will be formed, why, how exact and how costly, before anything runs."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.image.candidates import WIDE_SUM_DB, Setting, candidates, power_sum_db
+from apertura.image.budget import bytes_needed, setting_decisions, wall_seconds
+from apertura.image.candidates import Setting, candidates, power_sum_db
 from apertura.image.cost import Costs
 from apertura.image.edges import crossed_edges
-from apertura.image.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db, phase_rates, upward
+from apertura.image.models import (
+    Decision,
+    decide_midpoint,
+    decide_terrain,
+    midpoint_error_db,
+    phase_rates,
+    plane_through,
+    upward,
+)
 from apertura.image.plan import Job, Plan
 from apertura.image.thinning import Presum, design, presum_error_db
 from apertura.image.view import View, look
@@ -22,9 +31,6 @@ UNSEEN_DB = 3.0
 
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 _NET_PULSES = 48
-_BASE_BYTES = 300_000_000  # the interpreter and its libraries
-_TILE_BYTES = 150  # per pixel in work: positions, their projection, the sum
-_PRODUCT_BYTES = 60  # per pixel: image, its part of the cube, three rasters with overviews, before compression
 
 
 def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[str, Any] | None = None) -> Plan:
@@ -65,20 +71,23 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     whole = desk.cheapest(len(job.tx_position_m), desk.target_db(accuracy_db))
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
+    terrain = _decide_terrain(desk)
     models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
-    memory, disk = _bytes(job, chosen, presum)
+    memory, disk = bytes_needed(job, chosen, presum)
     return Plan(
         setting=chosen,
         better=desk.ladder(chosen.error_db, chosen.engine),
-        decisions=(*_setting_decisions(chosen, asked, accuracy_db, costs), thinning, midpoint, _decide_terrain(desk)),
+        decisions=(*setting_decisions(chosen, asked, accuracy_db), thinning, midpoint, terrain),
         predicted_error_db=power_sum_db(chosen.error_db, *models) + max(0.0, job.content_db or 0.0),
-        predicted_seconds=_wall_seconds(chosen, job),
+        predicted_seconds=wall_seconds(chosen, job),
         memory_bytes=memory,
         disk_bytes=disk,
         flags=flags,
         presum=presum,
         midpoint=bool(midpoint.value),
         middle_m=job.place_m[len(job.place_m) // 2],
+        tilt_m=_tilt(job) if terrain.value == "tilted_plane" else None,
+        cost_source=costs.source,
     )
 
 
@@ -158,9 +167,7 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
     spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
     less = desk.cheapest(len(presum.at), desk.target_db(accuracy_db) - 1)
     if not asked and spent + less.seconds > 0.9 * whole.seconds:
-        return keep(
-            f"a low-pass sum {presum.factor}:1 takes {spent:.2g} s and saves {whole.seconds - less.seconds:.2g} s"
-        )
+        return keep(f"a low-pass sum {presum.factor}:1 costs more than it saves")
     line = f"{oversampled}; a low-pass sum makes {len(presum.at)} of {pulses} pulses"
     chosen = replace(less, seconds=less.seconds + spent, table_seconds=less.table_seconds + spent)
     return Decision("pulse_thinning", presum.factor, f"{line} and errs by {error_db:.1f} dB", error_db), presum, chosen
@@ -209,44 +216,22 @@ def _decide_terrain(desk: _Desk) -> Decision:
     asked = desk.asked.get("terrain")
     if asked is None or asked == found.value:
         return found
+    if job.heights_m is None:
+        raise CampaignError(
+            f"terrain is {asked}",
+            where="config/config.yaml: processing.terrain",
+            expected="plane or auto: the scene has no DEM",
+            remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
+        )
     return Decision("terrain", asked, f"asked for in config/config.yaml; the rule says {found.value}: {found.reason}")
 
 
-def _setting_decisions(
-    chosen: Setting, asked: Mapping[str, Any], accuracy_db: float, costs: Costs
-) -> Iterator[Decision]:
-    def why(*keys: str) -> str:
-        return "asked for in config/config.yaml; " if any(key in asked for key in keys) else ""
-
-    met = "meets" if chosen.error_db <= accuracy_db else "does not meet"
-    line = f"{chosen.seconds:.3g} s, {met} {accuracy_db:.0f} dB; costs {costs.source}"
-    yield Decision("engine", chosen.engine, f"{why('engine')}{line}", chosen.error_db)
-    if "oversampling" in chosen.options:
-        yield Decision("table_oversampling", chosen.options["oversampling"], why("table_oversampling") + chosen.reason)
-    if chosen.engine == "native":
-        options = {**chosen.options, **chosen.form_options}
-        shared, wide, exact = (100 * share for share in chosen.shares)
-        forms = f"of pixel·pulses {shared:.0f} % share curvature, {wide:.0f} % need their own or wide windows"
-        reasons = {
-            "table_degree": "cheapest with this oversampling",
-            "phase_tolerance_rad": f"{forms}, {exact:.0f} % the exact way",
-            "accumulate": f"sums in float32 err by -115 dB, wider below {WIDE_SUM_DB:.0f} dB; paths start in float64",
-        }
-        names = {"table_degree": "degree", "phase_tolerance_rad": "tolerance_rad", "accumulate": "accumulate"}
-        for name, reason in reasons.items():
-            yield Decision(name, options[names[name]], why(name) + reason)
-
-
-def _wall_seconds(chosen: Setting, job: Job) -> float:
-    """Return the seconds on the job's threads; choices are made on one, so that they do not depend on it."""
-    return chosen.table_seconds + (chosen.seconds - chosen.table_seconds) / min(job.threads, job.load.tiles)
-
-
-def _bytes(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int, int]:
-    """Return peak memory of the imaging step, and what the pair leaves on disk, bytes."""
-    pulses, pixels = len(job.tx_position_m), job.shape[0] * job.shape[1]
-    history = 8 * pulses * (job.subcarriers + job.signal.samples)
-    virtual = 0 if presum is None else 16 * pulses * job.signal.samples + 16 * len(presum.at) * job.signal.samples
-    tiles = min(job.threads, job.load.tiles) * _TILE_BYTES * min(job.tile_px**2, pixels)
-    memory = _BASE_BYTES + 2 * history + virtual + chosen.table_bytes + tiles
-    return memory, history + _PRODUCT_BYTES * pixels
+def _tilt(job: Job) -> tuple[float, float, float]:
+    """Return the plane through the DEM: height above the flat model at pixel (0, 0), per row and per column, metres."""
+    if job.heights_m is None:
+        return (0.0, 0.0, 0.0)
+    plane, step = plane_through(job.heights_m), job.heights_step_px
+    down, right = (
+        float(plane[at] - plane[0, 0]) / step for at in ((min(1, len(plane) - 1), 0), (0, min(1, plane.shape[1] - 1)))
+    )
+    return (float(plane[0, 0]) - (down + right) * (step - 1) / 2, down, right)

@@ -21,7 +21,7 @@ from apertura.image.plan import Plan
 from apertura.image.planner import ladder
 from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import Window, form_tiles
-from apertura.steps.plan import plan_pair
+from apertura.steps.plan import plan_pair, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
 from apertura.steps.terrain import Heights, open_heights
@@ -40,12 +40,13 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
     history = {"echo": _spectra(echo, processing.window), "profile": _profiles(profile)}
     plan = plan_pair(campaign, flight, pair, threads=threads)
+    heights = planned_heights(plan, heights, grid)
     empty = stamped(
         _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
         "image",
         module=__name__,
         parents=[echo, profile, *heights.parents],
-        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": plan.reasons},
+        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": plan.choices},
     )
     windows = list(grid.tiles(processing.tile_px))
     with writing(folder) as wip:

@@ -1,11 +1,9 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
-import json
 import os
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from apertura.campaign import Campaign
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import centre_frequency, range_step, window_weights
-from apertura.echo.demodulate import subcarrier_numbers
-from apertura.echo.geometry import phase_centres
+from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
 from apertura.image.candidates import Signal
 from apertura.image.cost import read_costs
@@ -27,11 +22,11 @@ from apertura.image.history import Spectra
 from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
-from apertura.ingest import PHASE_HISTORIES, TRACKS
-from apertura.settings import OfdmWaveform, PhaseHistoryWaveform
+from apertura.steps.ground import Ground
+from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
-from apertura.steps.scene import PATH, scene_grid, settle
-from apertura.store import manifest_of, open_stage
+from apertura.steps.terrain import Heights
+from apertura.store import Window, manifest_of
 
 OVERRIDES = (
     "engine",
@@ -46,18 +41,8 @@ OVERRIDES = (
 _NET = 9
 
 
+_BLOCKS = 33
 _CONTENT_PIXELS = 128
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """What is known of a pair's echo before it is formed, or after: phase centres (pulse, 3), band, prefix, spectra."""
-
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    frequency_hz: NDArray[np.float64]
-    path_limit_m: float
-    spectra: Spectra | None = None
 
 
 def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
@@ -79,7 +64,7 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     grid = campaign_grid(campaign, outlook)
     processing = campaign.settings.processing
     plan = make_plan(
-        job_of(outlook, grid, tile_px=processing.tile_px, threads=threads),
+        replace(job_of(outlook, grid, tile_px=processing.tile_px, threads=threads), **_relief(campaign, grid)),
         accuracy_db=processing.accuracy_db,
         costs=read_costs(),
         overrides={name: getattr(processing, name) for name in OVERRIDES},
@@ -121,6 +106,44 @@ def _content_db(spectra: Spectra, grid: SceneGrid) -> float:
     places = grid.positions_at(rows, columns)
     parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
     return content_loss_db(np.concatenate([reference.terms(spectra, places, pulses=part) for part in parts]))
+
+
+def _relief(campaign: Campaign, grid: SceneGrid) -> dict[str, Any]:
+    """Return the DEM as the planner's job takes it: above the flat model, in the middle of blocks of pixels."""
+    if campaign.settings.scene.dem is None:
+        return {}
+    terrain = Ground.of(campaign.settings.scene, campaign.root, crs=grid.crs).terrain
+    if terrain is None:
+        return {}
+    side = max(1, max(grid.shape) // _BLOCKS)
+    rows, columns = (max(1, size // side) for size in grid.shape)
+    found = terrain.heights(replace(grid, spacing_m=grid.spacing_m * side, shape=(rows, columns))) - grid.height_m
+    return {"heights_m": np.where(np.isfinite(found), found, 0.0), "heights_step_px": side}
+
+
+def planned_heights(plan: Plan, heights: Heights, grid: SceneGrid) -> Heights:
+    """Return the ground as the plan models it: the DEM itself, a plane through it, or flat.
+
+    Parameters
+    ----------
+    plan
+        Of the pair.
+    heights
+        From `apertura.steps.terrain.open_heights`.
+    grid
+        The campaign's.
+    """
+    if heights.of is None or plan.choices["terrain"] == "dem":
+        return heights
+    if plan.tilt_m is None:
+        return replace(heights, of=None)
+    first, down, right = plan.tilt_m
+
+    def plane(window: Window) -> NDArray[np.float64]:
+        row, column = (np.arange(*part.indices(size)) for part, size in zip(window, grid.shape, strict=True))
+        return np.asarray(grid.height_m + first + down * row[:, None] + right * column)
+
+    return replace(heights, of=plane)
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:
@@ -185,6 +208,7 @@ def _table(plan: Plan, title: str, accuracy_db: float) -> Table:
         table.add_row(decision.name, str(decision.value), decision.reason, error)
     table.add_section()
     line = f"{plan.predicted_seconds:.3g} s, {_size(plan.memory_bytes)} of memory, {_size(plan.disk_bytes)} on disk"
+    line += f"; costs {plan.cost_source}"
     table.add_row("predicted", f"{accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
     return table
 
@@ -195,66 +219,3 @@ def _size(count: float) -> str:
             break
         count /= 1000
     return f"{count:.3g} {unit}"
-
-
-def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
-    """Return the campaign's grid, settled or as it will be."""
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
-        return scene_grid(campaign)
-    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
-
-
-def outlook_of(campaign: Campaign, flight: str, pair: str) -> Outlook:
-    """Return what is known of a pair: its echo where it is formed, else what the logs promise."""
-    folder = campaign.stage("echo", flight, pair)
-    waveform = campaign.settings.waveform
-    if manifest_of(folder).is_file():
-        echo = open_stage(folder, "echo")
-    elif isinstance(waveform, PhaseHistoryWaveform):
-        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
-    else:
-        return _expected(campaign, flight, pair, waveform)
-    tx, rx, frequency = echo.tx_position.values, echo.rx_position.values, echo.frequency.values
-    weight = window_weights(campaign.settings.processing.window, len(frequency))
-    spectra = Spectra(echo.transfer.values, frequency, weight, echo.reference_delay.values, tx, rx)
-    return Outlook(tx, rx, frequency, float(echo.path_limit.values.min()), spectra)
-
-
-def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:
-    """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
-    tx, rx = pair.split("-")
-    logs = {node: campaign.track_file(flight, node) for node in (tx, rx)}
-    tracks = {node: TRACKS[log.suffix](log, node=node) for node, log in logs.items()}
-    first = max(track.time.values[0] for track in tracks.values())
-    last = min(track.time.values[-1] for track in tracks.values())
-    times = _pulse_times(campaign.raw_file(flight, tx, ".sigmf-meta"), first, last, waveform.prf_hz)
-    places = []
-    for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
-        track, settings = tracks[node], campaign.settings.nodes[node]
-        places.append(
-            phase_centres(
-                track.time.values,
-                track.position.values,
-                track.attitude.values,
-                at=times,
-                lever_arm_m=getattr(settings.lever_arms_m, antenna),
-                attitude_from=settings.attitude,
-                where=logs[node],
-            )
-        )
-    numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
-    return Outlook(places[0], places[1], frequency, SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s)
-
-
-def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:
-    """Return the capture times of a recording inside the logs, or a regular series where it has none."""
-    captures: list[Mapping[str, str]] = json.loads(meta.read_text(encoding="utf-8")).get("captures", [])
-    stated = [capture["core:datetime"].removesuffix("Z") for capture in captures if "core:datetime" in capture]
-    times = np.array(stated, "datetime64[ns]")
-    if len(times) < 2:
-        count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
-        times = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
-    return times[(times >= first) & (times <= last)]

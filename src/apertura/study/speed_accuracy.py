@@ -1,0 +1,263 @@
+"""Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.image.candidates import Setting, candidates
+from apertura.image.cost import Costs, Load, read_costs
+from apertura.image.engines import ENGINES, reference
+from apertura.image.grid import SceneGrid
+from apertura.image.history import Profiles, Spectra
+from apertura.image.plan import Job, Plan
+from apertura.image.planner import make_plan
+from apertura.image.quality import numerical_error
+from apertura.image.view import look
+from apertura.steps.outlook import campaign_grid, outlook_of
+from apertura.steps.plan import OVERRIDES, job_of
+from apertura.steps.terrain import Heights, open_heights
+from apertura.store import open_stage
+from apertura.study.interactive import write_page
+from apertura.study.pareto import draw_points
+
+FOLDER = Path("results/study")
+PULSES, SIDE_PX, PIXELS = 1024, 256, 200
+_TOLERANCES_RAD = (1.5e-3, 1.5e-4)
+_SLOW_SECONDS = 0.3
+"""A former slower than this on the window is timed on fewer of its rows."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting: seconds are for the whole image on one thread, from what its part took."""
+
+    engine: str
+    setting: str
+    pulse_thinning: int
+    seconds: float
+    pixel_pulses_per_s: float
+    error_db: float
+    predicted_seconds: float
+    predicted_error_db: float
+    on_front: bool
+    planned: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a campaign that is measured: a block of pulses over a window of the image.
+
+    Attributes
+    ----------
+    spectra, profiles
+        Of the block.
+    pixels
+        (y, x, 3) float64, the window.
+    picked
+        (pixel, 2) int64, rows and columns in the window whose exact values are known.
+    exact
+        (pixel,) complex128.
+    whole
+        What the whole image is: pixels and pulses.
+    """
+
+    spectra: Spectra
+    profiles: Profiles
+    pixels: NDArray[np.float64]
+    picked: NDArray[np.int64]
+    exact: NDArray[np.complex128]
+    whole: Load
+    reference_seconds: float
+
+
+def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> list[Path]:
+    """Write results/study/speed_accuracy.csv, .png and .html.
+
+    Parameters
+    ----------
+    campaign, flight, pair
+        Whose echo and profile stages are used; they must be finished.
+    seconds
+        When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
+    """
+    outlook = outlook_of(campaign, flight, pair)
+    grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
+    profile = open_stage(campaign.stage("profile", flight, pair), "profile")
+    middle = len(outlook.tx) // 2
+    block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
+    spectra = _block(outlook.spectra, block)
+    outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra)
+    job = job_of(outlook, grid, tile_px=processing.tile_px, threads=1)
+    heights = open_heights(campaign)
+    costs = _of_engines(read_costs())
+    overrides = {name: getattr(processing, name) for name in OVERRIDES if name not in {"engine"}}
+    plan = make_plan(job, accuracy_db=processing.accuracy_db, costs=costs, overrides=overrides)
+    profiles = Profiles(
+        profile.profile.values[block],
+        profile.start.values[block],
+        profile.attrs["step_m"],
+        profile.attrs["centre_frequency_hz"],
+        profile.attrs["oversampling"],
+        outlook.tx,
+        outlook.rx,
+    )
+    part = _part(spectra, profiles, grid, heights, whole=job.load)
+    points = measure(part, plan, _settings(job, costs), seconds=seconds)
+    size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
+    title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
+    paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    write_points(points, paths[0])
+    draw_points(points, paths[1], title=title, accuracy_db=processing.accuracy_db)
+    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.accuracy_db)
+    return paths
+
+
+def _block(spectra: Spectra | None, block: slice) -> Spectra:
+    if spectra is None:
+        raise ValueError("the echo stage is not there")
+    return replace(
+        spectra,
+        transfer=spectra.transfer[block],
+        reference_delay_s=spectra.reference_delay_s[block],
+        tx_position_m=spectra.tx_position_m[block],
+        rx_position_m=spectra.rx_position_m[block],
+    )
+
+
+def _part(spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load) -> Part:
+    window = []
+    for size in grid.shape:
+        first = max(0, size - SIDE_PX) // 2 // 16 * 16
+        window.append(slice(first, min(size, first + SIDE_PX)))
+    pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
+    picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
+    begin = perf_counter()
+    exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]])
+    return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin)
+
+
+def _of_engines(costs: Costs) -> Costs:
+    """Return costs without placing pixels and storing tiles, which every engine shares: the chart times engines."""
+    shared = {name: 1e-15 for name in costs.seconds if name == "tile" or name.startswith("place.")}
+    return replace(costs, seconds={**costs.seconds, **shared})
+
+
+def _settings(job: Job, costs: Costs) -> list[Setting]:
+    """Return the settings to measure, cheapest first."""
+    some = slice(None, None, max(1, len(job.tx_position_m) // 48))
+    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m)
+    every = candidates(view, job.signal, job.load, costs)
+    return [
+        setting
+        for setting in every
+        if setting.engine == "numba" or setting.form_options.get("tolerance_rad") in _TOLERANCES_RAD
+    ]
+
+
+def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
+    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
+    begin = perf_counter()
+    points = [_reference_point(part, plan)]
+    if plan.engine != "reference":
+        points.append(_measured(part, plan.setting, plan))
+    unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
+    for setting in unplanned:
+        if perf_counter() - begin > seconds:
+            break
+        points.append(_measured(part, setting, None))
+    return _with_front(sorted(points, key=lambda point: point.seconds))
+
+
+def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
+    engine = ENGINES[setting.engine]
+    thinning = 1 if plan is None or plan.presum is None else plan.presum.factor
+
+    def prepare() -> Any:
+        history = part.profiles if plan is None else plan.history(part.profiles)
+        return engine.prepare(history, **setting.options)
+
+    tables_s, prepared = _least(prepare, repeats=2)
+    rows = len(part.pixels)
+    if setting.engine == "numba":  # any shape of pixels will do, so errors need not wait for the whole window
+        engine.form(prepared, part.pixels[:1, :1])
+        rows = max(
+            1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.whole.pixels / part.pixels.shape[1]))
+        )
+        values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None])[0]
+        form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows]), repeats=2)
+    else:
+        form_s, image = _least(lambda: engine.form(prepared, part.pixels, **setting.form_options), repeats=3)
+        values = image[part.picked[:, 0], part.picked[:, 1]]
+    pixels = rows * part.pixels.shape[1]
+    taken = tables_s + form_s * part.whole.pixels / pixels
+    error_db = numerical_error(values.astype(np.complex64), part.exact).rms_db
+    predicted_db = setting.error_db if plan is None else plan.predicted_error_db
+    return _point(part, setting, thinning, taken, error_db, predicted_db, planned=plan is not None)
+
+
+def _reference_point(part: Part, plan: Plan) -> Point:
+    setting = plan.better[-1] if plan.better else plan.setting
+    taken = part.reference_seconds * part.whole.pixels / PIXELS
+    values = part.exact.astype(np.complex64)
+    error_db = numerical_error(values, part.exact).rms_db
+    return _point(part, setting, 1, taken, error_db, setting.error_db, planned=plan.engine == "reference")
+
+
+def _point(
+    part: Part,
+    setting: Setting,
+    thinning: int,
+    taken: float,
+    error_db: float,
+    predicted_db: float,
+    *,
+    planned: bool,
+) -> Point:
+    return Point(
+        engine=setting.engine,
+        setting=setting.line,
+        pulse_thinning=thinning,
+        seconds=taken,
+        pixel_pulses_per_s=part.whole.pixels * part.whole.pulses / taken,
+        error_db=error_db,
+        predicted_seconds=setting.seconds,
+        predicted_error_db=predicted_db,
+        on_front=False,
+        planned=planned,
+    )
+
+
+def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
+    times = []
+    for _ in range(repeats):
+        begin = perf_counter()
+        result = work()
+        times.append(perf_counter() - begin)
+    return min(times), result
+
+
+def _with_front(points: Sequence[Point]) -> list[Point]:
+    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
+    best, marked = np.inf, []
+    for point in points:
+        marked.append(replace(point, on_front=point.error_db < best))
+        best = min(best, point.error_db)
+    return marked
+
+
+def write_points(points: Sequence[Point], path: Path) -> None:
+    """Write the points as CSV, one line each."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
+        table.writeheader()
+        for point in points:
+            row = asdict(point)
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})

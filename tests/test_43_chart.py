@@ -1,0 +1,62 @@
+"""The speed-accuracy chart: what is on the front, what is marked, and that its page needs nothing from elsewhere."""
+
+import csv
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import copy_writable
+
+from apertura.campaign import Campaign
+from apertura.study.speed_accuracy import Point, _with_front, speed_accuracy, write_points
+
+
+@pytest.fixture(scope="module")
+def charted(finished_tiny, tmp_path_factory):
+    """Files of a chart that had a second for its measurements, and its rows."""
+    root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("charted") / "campaign")
+    paths = speed_accuracy(Campaign.load(root), "f01", "uav1-uav2", seconds=1.0)
+    return paths, list(csv.DictReader(paths[0].open(encoding="utf-8")))
+
+
+def test_the_front_holds_what_nothing_faster_beats(charted):
+    rows = charted[1]
+    seconds = [float(row["seconds"]) for row in rows]
+    assert seconds == sorted(seconds)
+    for number, row in enumerate(rows):
+        beaten = any(float(faster["error_db"]) <= float(row["error_db"]) for faster in rows[:number])
+        assert (row["on_front"] == "True") == (not beaten)
+
+
+def test_the_planners_choice_and_the_reference_are_there_however_short_the_time(charted):
+    rows = charted[1]
+    planned = [row for row in rows if row["planned"] == "True"]
+    assert len(planned) == 1
+    assert float(planned[0]["error_db"]) <= -60
+    exact = next(row for row in rows if row["engine"] == "reference")
+    assert float(exact["error_db"]) < -130
+
+
+def test_measured_errors_are_no_worse_than_predicted(charted):
+    """Predictions hold for a flat spectrum; this one has a window, and a few targets."""
+    for row in charted[1]:
+        if row["engine"] != "reference":
+            assert float(row["error_db"]) <= float(row["predicted_error_db"]) + 9
+
+
+def test_the_page_holds_every_point_and_asks_no_other_machine(charted):
+    paths, rows = charted
+    page = paths[2].read_text(encoding="utf-8")
+    assert page.count('"setting": "') == len(rows)
+    assert set(re.findall(r"https?://[^\"'<> ]+", page)) == {"http://www.w3.org/2000/svg"}
+    assert paths[1].read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
+    point = Point("native", "a", 1, 1.0, 1e9, -60.0, 1.0, -60.0, on_front=False, planned=False)
+    points = [point, replace(point, seconds=2.0), replace(point, seconds=3.0, error_db=-60.1)]
+    marked = _with_front(points)
+    assert [one.on_front for one in marked] == [True, False, True]
+    write_points(marked, tmp_path / "points.csv")
+    assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
