@@ -11,7 +11,7 @@ from apertura.campaign import Campaign
 from apertura.simulate.campaign import write_campaign
 from apertura.simulate.plan import grid_around
 from apertura.simulate.presets import DEMO_ORIGIN, tandem
-from apertura.steps import cube, echo, export, image, ingest, profile, scene
+from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
@@ -44,6 +44,12 @@ def tiny(_tiny, tmp_path):
     return copy_writable(_tiny, tmp_path / "campaign")
 
 
+def ground(campaign: Campaign) -> None:
+    scene.scene(campaign)
+    if campaign.settings.scene.dem:
+        terrain.terrain(campaign)
+
+
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
@@ -54,7 +60,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
                 ingest.track(campaign, flight.name, node)
         for pair in flight.pairs:
             echo.echo(campaign, flight.name, pair)
-    scene.scene(campaign)
+    ground(campaign)
     for flight in campaign.image_flights:
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
@@ -63,6 +69,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
                 export.export(campaign, flight.name, pair)
     cube.cube(campaign)
     if exports:
+        layers.layers(campaign, threads=2)
         for flight in campaign.image_flights:
             export.export_fused(campaign, flight.name)
     return campaign

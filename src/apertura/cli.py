@@ -174,6 +174,22 @@ def scene(campaign: Directory = HERE) -> None:
 
 
 @step.command()
+def terrain(campaign: Directory = HERE) -> None:
+    """Bring the DEM onto the campaign's grid, terrain.zarr."""
+    from apertura.steps import terrain as steps
+
+    print(steps.terrain(Campaign.load(campaign)))
+
+
+@step.command()
+def layers(campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Write incidence, bistatic angle and the mask of shadow and layover as GeoTIFFs."""
+    from apertura.steps import layers as steps
+
+    print(*steps.layers(Campaign.load(campaign), threads=threads), sep="\n")
+
+
+@step.command()
 def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Compress a pair in range over the scene, profile.zarr."""
     from apertura.steps import profile as steps
