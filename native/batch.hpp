@@ -7,11 +7,11 @@
 namespace {
 
 // Fast forms: one look-up window for a group of four blocks (one block with 8 lanes), or a wide one for each block; all
-// blocks bend alike, or each its own way. Where antennas weigh, pulses that may go fast all go the one way that holds
+// blocks bend alike, or each its own way; shallow: heights inside a block need no curvature. Where antennas weigh, pulses that may go fast all go the one way that holds
 // for all of them.
 constexpr bool kGrouped = kLanes == 16;
 // Fast forms but for the first two bend block by block.
-enum Form { kShared, kSharedWide, kOwn, kWeighted, kExact, kSkip, kForms };
+enum Form { kShared, kShallow, kSharedWide, kOwn, kWeighted, kExact, kSkip, kForms };
 
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the centre, from the window's first cell
@@ -86,7 +86,8 @@ inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, in
     if constexpr (kTerrain) store(batch.tilt[q] + lane, x * aim.xh[q] + y * aim.yh[q]);
   }
   batch.lift[q] = aim.hh[q];
-  return shared ? kShared : kSharedWide;
+  if (!shared) return kSharedWide;
+  return kTerrain && aim.shallow[q] ? kShallow : kShared;
 }
 
 // Sorts eight pulses into forms.
@@ -94,7 +95,8 @@ template <bool kTerrain>
 inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
   Aim aim;
   aim_at<kTerrain>(job, patch, pulse, aim);
-  int shared = 0;  // in a register: nearly all pulses take this form
+  constexpr Form kMost = kTerrain ? kShallow : kShared;
+  int most = 0;  // in a register: nearly all pulses take this form
   for (int form = 0; form < kForms; form++) batch.count[form] = 0;
   for (int q = 0; q < pulses; q++) {
     Form form = kExact;
@@ -102,12 +104,12 @@ inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t puls
       form = place<kTerrain, false>(job, patch, aim, pulse, q, batch);
     else if (aim.holds[q] == 1)
       form = place<kTerrain, true>(job, patch, aim, pulse, q, batch);
-    if (form == kShared)
-      batch.order[kShared][shared++] = q;
+    if (form == kMost)
+      batch.order[kMost][most++] = q;
     else
       batch.order[form][batch.count[form]++] = q;
   }
-  batch.count[kShared] = shared;
+  batch.count[kMost] = most;
 }
 
 // Path of a block's pixels, in cells from its window.
@@ -122,7 +124,9 @@ inline Lanes place_pixels(const Patch& patch, const Batch& batch, int q, int b, 
     t = (load(batch.bend[q] + part) + batch.path[q][b]) + x * batch.x[q][b] + y * batch.y[q][b];
   if constexpr (kTerrain) {
     const Lanes rise = load(patch.rise + b * 16 + part);
-    if constexpr (kForm >= kOwn)
+    if constexpr (kForm == kShallow)
+      t += rise * batch.h[q][b];
+    else if constexpr (kForm >= kOwn)
       t += rise * (batch.h[q][b] + x * batch.xh[q][b] + y * batch.yh[q][b] + rise * batch.hh[q][b]);
     else
       t += rise * (load(batch.tilt[q] + part) + batch.h[q][b] + rise * batch.lift[q]);
@@ -133,7 +137,7 @@ inline Lanes place_pixels(const Patch& patch, const Batch& batch, int q, int b, 
 // The pixel loop: for each window's blocks, all pulses of one form. `sum` is re then im, block by block.
 template <class Phase, int kDegree, bool kTerrain, Form kForm>
 inline void add_form(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
-  constexpr bool kWide = kForm != kShared;
+  constexpr bool kWide = kForm != kShared && kForm != kShallow;
   constexpr int kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
   const int count = batch.count[kForm];
   if (count == 0) return;

@@ -22,6 +22,7 @@ void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_
     } else {
       sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
       if constexpr (kLanes != 4) add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
+      if constexpr (kLanes != 4 && kTerrain) add_form<Phase, kDegree, true, kShallow>(job, patch, batch, sum);
       add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
       add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
     }
@@ -31,7 +32,7 @@ void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_
       if (weighted) weigh_exactly(job, at, one, weight);
       add_exact<Phase, kDegree>(job, patch, at, one, weighted ? weight : nullptr, sum);
     }
-    job.counts[0] += batch.count[kShared] + batch.count[kSharedWide];
+    job.counts[0] += batch.count[kShared] + batch.count[kShallow] + batch.count[kSharedWide];
     job.counts[1] += batch.count[kOwn] + batch.count[kWeighted];
     job.counts[2] += batch.count[kExact];
     job.counts[3] += batch.count[kSkip];

@@ -32,6 +32,7 @@ struct Aim {
   alignas(64) float first[kBatch], last[kBatch];      // of the table's windows, from `start`
   alignas(64) float shared[kBatch];                   // largest error in cells if the patch shares one curvature
   alignas(64) float own[kBatch];                      // and if each block has its own
+  alignas(64) int32_t shallow[kBatch];                // heights inside a block need no curvature
   alignas(64) int32_t holds[kBatch];                  // 2: shared curvature will do, 1: own curvature, 0: neither
 };
 
@@ -90,9 +91,12 @@ inline void aim_at(const ApertureJob& job, const Patch& patch, int64_t pulse, Ai
                    int(magnitude(aim.first[q]) < 1e7f);
     // Curvature inside a block is small beside its slope: twice the value at the origin bounds it where fast forms hold.
     aim.margin[q] = 1e-3f + 4.5f * (magnitude(aim.xx[q]) + magnitude(aim.xy[q]) + magnitude(aim.yy[q]));
-    if constexpr (kTerrain)
-      aim.margin[q] += patch.roughest * (3.0f * (magnitude(aim.xh[q]) + magnitude(aim.yh[q])) +
-                                         2.0f * patch.roughest * aim.hh[q]);
+    if constexpr (kTerrain) {
+      const float curved = patch.roughest * (1.5f * (magnitude(aim.xh[q]) + magnitude(aim.yh[q])) +
+                                             patch.roughest * aim.hh[q]);
+      aim.margin[q] += 2 * curved;
+      aim.shallow[q] = aim.shared[q] + curved <= tolerance;
+    }
   }
 }
 

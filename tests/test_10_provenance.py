@@ -47,6 +47,13 @@ def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, ed
     assert touched(copied, edited, f"apertura.steps.{step}") is reruns
 
 
+@pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
+def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
+    digests = copied / "image/engines/_backprojection.sha256"
+    digests.write_text("of other sources")
+    assert touched(copied, digests, f"apertura.steps.{step}") is reruns
+
+
 def test_every_step_stands_on_modules_that_were_found():
     closure = provenance._closure(["apertura.steps.image"])
     loaded = {name for name in closure if name in sys.modules}

@@ -3,6 +3,7 @@
 import ast
 import functools
 import hashlib
+import sysconfig
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def sha256_tree(folder: Path) -> dict[str, str]:
 def code_sha256(*modules: str) -> str:
     """Return the hash of the source of `modules` and of every apertura module they import, however deep.
 
-    A stage's hash therefore changes when, and only when, code it can run has changed.
+    A stage's hash therefore changes when, and only when, code it can run has changed. Compiled code counts by
+    what it was built from: each ``*.sha256`` that was installed beside one of the modules.
 
     Parameters
     ----------
@@ -43,8 +45,11 @@ def code_sha256(*modules: str) -> str:
     True
     """
     digest = hashlib.sha256()
-    for name, path in sorted(_closure(modules).items()):
+    closure = _closure(modules)
+    for name, path in sorted(closure.items()):
         digest.update(f"{name}\0{sha256_file(path)}\n".encode())
+    for path in _compiled(closure):
+        digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
     return digest.hexdigest()
 
 
@@ -80,6 +85,17 @@ def _closure(modules: Iterable[str]) -> dict[str, Path]:
         found[name] = path
         waiting += _imports(path)
     return found
+
+
+def _compiled(closure: Mapping[str, Path]) -> list[Path]:
+    """Return what compiled code beside the modules was built from; an editable install keeps it elsewhere."""
+    found: dict[str, Path] = {}
+    for package in sorted({name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}):
+        relative = Path(*package.split(".")[1:])
+        for folder in (_PACKAGE / relative, Path(sysconfig.get_path("platlib"), _PACKAGE.name, relative)):
+            for path in sorted(folder.glob("*.sha256")):
+                found.setdefault(path.name, path)
+    return [found[name] for name in sorted(found)]
 
 
 def _source(name: str) -> Path | None:

@@ -1,0 +1,11 @@
+# Writes the sha256 of the kernel's sources to OUTPUT, for the hash of the code that makes images.
+file(GLOB sources ${FOLDER}/native/*.cpp ${FOLDER}/native/*.hpp)
+list(SORT sources)
+list(APPEND sources ${FOLDER}/CMakeLists.txt)
+set(digests "")
+foreach(source IN LISTS sources)
+  file(SHA256 ${source} digest)
+  get_filename_component(name ${source} NAME)
+  string(APPEND digests "${digest}  ${name}\n")
+endforeach()
+file(WRITE ${OUTPUT} "${digests}")
