@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run paper stability test test-slow lint format lock clean
+.PHONY: setup demo run bench paper stability test test-slow lint format lock clean
 
 setup: $(SETUP)
 
@@ -31,6 +31,11 @@ run: $(SETUP)
 # The paper's claims and the stability atlas, into results/study/; killed runs go on where they were.
 paper stability: $(SETUP)
 	$(BIN)/snakemake --snakefile workflow/rules/study.smk --workflow-profile profiles/default $@
+
+# Every engine on one job, against fastsar: prints a table and writes benchmarks/latest.json.
+bench: $(SETUP)
+	$(BIN)/uv pip install --quiet --python $(BIN)/python fastsar
+	$(BIN)/python benchmarks/engines.py
 
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
