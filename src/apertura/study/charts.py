@@ -49,7 +49,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[Outcome], path: Path) ->
         axes[0, 0].invert_xaxis()
     for axis in axes[1]:
         axis.set_xlabel(f"{sweep.title}, {sweep.unit}" if sweep.unit != "1" else sweep.title)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(CHOICES))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(CHOICES))
     figure.suptitle(sweep.title)
     save(figure, path)
 
@@ -76,7 +76,7 @@ def _mark_losses(axis: Axes) -> None:
     axis.set_ylim(*LOSS_RANGE_DB)
     for level in LEVELS_DB:
         axis.axhline(level, color="0.5", linewidth=0.8, linestyle=":")
-        axis.annotate(f"{level:g} dB", (1, level), xycoords=("axes fraction", "data"), fontsize=7, color="0.4")
+        axis.annotate(f"{level:g} dB", (0.01, level + 0.1), xycoords=("axes fraction", "data"), fontsize=7, color="0.4")
 
 
 def draw_summary(edges: Sequence[Edge], path: Path) -> None:
