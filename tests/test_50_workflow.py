@@ -123,3 +123,13 @@ def test_a_failing_step_shows_its_message_in_the_run(tiny):
     assert code != 0
     assert "error: raw/f01/uav1.sigmf-meta: capture" in output
     assert "Traceback" not in output
+
+
+@pytest.mark.slow
+def test_an_installed_apertura_runs_a_campaign_from_any_folder_and_any_path(tiny, tmp_path):
+    """As the README says it: by the path of the command alone, without an active environment."""
+    command = [str(Path(sys.executable).parent / "apertura"), "run", str(tiny)]
+    plain = {**os.environ, "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(command, cwd=tmp_path, env=plain, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()

@@ -229,7 +229,7 @@ def validated(document: object, *, where: object) -> Settings:
         raise CampaignError(
             "; ".join(sorted(wrong, key=lambda line: "unknown key" not in line)),
             where=where,
-            expected="the keys and values config/README.md lists",
+            expected="the keys and values of config/config.yaml as `apertura init` writes it",
             remedy="Correct what is named.",
         ) from error
 

@@ -54,7 +54,9 @@ def _snakemake(campaign: Path, cores: int, *arguments: str) -> int:
     root = _workflow_folder()
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
     command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *arguments]
-    return subprocess.run(command, check=False).returncode
+    here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
+    environment = {**os.environ, "PATH": f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"}
+    return subprocess.run(command, check=False, env=environment).returncode
 
 
 def _workflow_folder() -> Path:

@@ -200,7 +200,7 @@ def _segments(captures: list[dict[str, Any]], total: int, path: Path) -> tuple[l
     if short.size:
         pulse = int(short[0])
         raise CampaignError(
-            f"capture {pulse} holds {lengths[pulse]} samples",
+            f"capture {pulse} holds {lengths[pulse]} samples (the data end at sample {total})",
             path,
             f"{length}, as most captures do",
             "The data are truncated (copy them again) or core:sample_start is wrong.",

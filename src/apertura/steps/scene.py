@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 
 from apertura.campaign import Campaign
-from apertura.contracts import canonical_json
 from apertura.geodesy import local_crs, projected_from_ecef
 from apertura.image.extent import auto_bounds, auto_spacing, utm_crs
 from apertura.image.grid import LOCAL, SceneGrid
@@ -91,9 +90,9 @@ def scene_inputs(campaign: Campaign) -> dict[str, str]:
     return inputs
 
 
-def grid_spec(grid: SceneGrid) -> str:
-    """Return the grid as one line for provenance."""
-    return canonical_json(asdict(grid))
+def grid_spec(grid: SceneGrid) -> dict[str, Any]:
+    """Return the grid as JSON values for provenance."""
+    return asdict(grid)
 
 
 def grid_coordinates(grid: SceneGrid, name: str) -> dict[str, Any]:
