@@ -109,9 +109,9 @@ def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
     return history.astype(np.complex64)
 
 
-def exact(job: Job, places: NDArray[np.float64]) -> NDArray[np.complex128]:
+def exact(job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ) -> NDArray[np.complex128]:
     """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
-    wavenumber = 2 * np.pi * CENTRE_HZ / C
+    wavenumber = 2 * np.pi * carrier_hz / C
     here = total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, places)
     image = np.zeros(len(places), np.complex128)
     for place, gain in zip(job.scatterers, job.amplitude, strict=True):

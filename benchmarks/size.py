@@ -1,0 +1,115 @@
+"""Forms 8192 × 8192 pixels from 4096 pulses, tile by tile into zarr: `python benchmarks/size.py`.
+
+Peak memory is that of the process; the rate is compared with the kernel's own on tiles spread over the same image, on
+as many threads, timed after each block of pulses. Samples are random: neither time nor memory depends on them. Prints
+both and writes benchmarks/size.json.
+"""
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.image.engines import native
+from apertura.image.engines.tables import Tables
+from apertura.image.grid import SceneGrid
+from apertura.image.history import Profiles
+from apertura.image.tiles import form_tiles
+
+BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
+
+
+def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
+    """Return random samples over the swath of a straight flight beside the grid, aperture equal to its side."""
+    generator = np.random.default_rng(1)
+    west, south, east, north = grid.bounds_m
+    along = np.linspace(south, north, pulses)
+    tx = np.stack([np.full(pulses, west - 200.0), along, np.full(pulses, height_m)], 1)
+    rx = tx + [0.0, 5.0, 1.0]
+    step_m = C / BANDWIDTH_HZ / 2
+    edge = np.array([[x, y, 0.0] for x in (west, east) for y in np.linspace(south, north, 33)])
+    nearest = np.hypot(200.0, height_m) * 2 - 20
+    farthest = max(np.linalg.norm(edge - antenna, axis=1).max() for antenna in (tx[0], tx[-1])) * 2 + 20
+    shape = (pulses, int((farthest - nearest) / step_m))
+    samples = np.empty(shape, np.complex64)
+    for part in np.array_split(samples, 32):
+        part.real, part.imag = generator.standard_normal((2, *part.shape), np.float32)
+    return Profiles(samples, np.full(pulses, nearest), step_m, CENTRE_HZ, 2.0, tx, rx)
+
+
+def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
+    """Return seconds of the whole image by the kernel alone, from tiles on its diagonal."""
+    corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // native.PATCH * native.PATCH
+    tiles = [grid[c : c + TILE, c : c + TILE].positions() for c in corners]
+    begin = time.perf_counter()
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda pixels: native.form(tables, pixels), tiles))
+    return (time.perf_counter() - begin) * grid.shape[0] * grid.shape[1] / (TILE * TILE * len(tiles))
+
+
+def image_seconds(parts: list[slice], history: Profiles, grid: SceneGrid, threads: int) -> tuple[float, float]:
+    """Return seconds of forming into zarr, tables and all, and of the kernel alone, blocks of pulses one by one."""
+    spent = alone = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        array = zarr.create_array(folder, shape=grid.shape, chunks=(TILE, TILE), dtype="complex64")
+
+        def write(window: tuple[slice, slice], image: NDArray[np.complex64]) -> None:
+            array[window] = image if part is parts[0] else array[window] + image
+
+        for part in parts:
+            begin = time.perf_counter()
+            tables = native.prepare(history, pulses=part)
+            form_tiles(
+                partial(native.form, tables),
+                grid,
+                grid.tiles(TILE),
+                write=write,
+                threads=threads,
+                seconds_between_reports=10,
+            )
+            spent += time.perf_counter() - begin
+            alone += kernel_seconds(tables, grid, threads)
+    return spent, alone
+
+
+def main() -> None:
+    """Run once, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=8192)
+    parser.add_argument("--pulses", type=int, default=4096)
+    parser.add_argument("--at-once", type=int, default=2048, help="pulses whose tables are held at once")
+    parser.add_argument("--threads", type=int, default=2)
+    asked = parser.parse_args()
+    grid = SceneGrid("local", 0.0, asked.size * SPACING_M, SPACING_M, (asked.size, asked.size), 0.0)
+    history = profiles(grid, asked.pulses)
+    parts = [slice(at, at + asked.at_once) for at in range(0, asked.pulses, asked.at_once)]
+    spent, alone = image_seconds(parts, history, grid, asked.threads)
+    found = {
+        "pixels": asked.size**2,
+        "pulses": asked.pulses,
+        "threads": asked.threads,
+        "seconds": round(spent, 1),
+        "kernel_seconds": round(alone, 1),
+        "ratio_to_kernel": round(spent / alone, 3),
+        "pixel_pulses_per_s_per_core": float(f"{asked.size**2 * asked.pulses / spent / asked.threads:.3g}"),
+        "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+    }
+    print(json.dumps(found, indent=1))
+    Path(__file__).with_name("size.json").write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
