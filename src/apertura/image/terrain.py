@@ -93,7 +93,8 @@ class Terrain:
         if not outside.any():
             return
         edges = {"north": outside[0], "south": outside[-1], "west": outside[:, 0], "east": outside[:, -1]}
-        sides = [name for name, edge in edges.items() if edge.any()]
+        sides = [name for name, edge in edges.items() if edge.all()]
+        sides = sides or [name for name, edge in edges.items() if edge.any()]
         rows, columns = self.shape
         raise CampaignError(
             f"{100 * outside.mean():.1f} % of the scene lies outside the DEM, to the {', '.join(sides) or 'inside'}: "

@@ -1,0 +1,210 @@
+"""A campaign on terrain, from its folder to its products: DEM, datum and provenance by the same steps as any other."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+import yaml
+from conftest import copy_writable, ground, run_steps
+from rasterio.transform import from_origin
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.geodesy import projected_from_ecef
+from apertura.simulate.campaign import write_campaign
+from apertura.simulate.plan import grid_around
+from apertura.simulate.presets import DEMO_ORIGIN, tandem
+from apertura.simulate.scene import PointTarget, Scene
+from apertura.steps import profile, scene, terrain
+from apertura.steps.scene import scene_grid
+from apertura.steps.verify import verify
+from apertura.store import open_stage
+
+UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
+SLOPE = np.tan(np.radians(20.0))
+ALONG = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0))])
+UPHILL = np.array([ALONG[1], -ALONG[0]]) * 0.8 + ALONG * 0.6  # away from the track and along it
+
+
+def edit_scene(root, **keys):
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["scene"] |= keys
+    path.write_text(yaml.safe_dump(document))
+    return Campaign.load(root)
+
+
+def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=False):
+    """A DEM of the plane through the demo's origin, posts every metre, 20 m around."""
+    east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
+    west, top = np.floor(east) - 20, np.ceil(north) + 20
+    x, y = np.meshgrid(west + 0.5 + np.arange(40), top - 0.5 - np.arange(40))
+    heights = height_m + slope * ((x - east) * UPHILL[0] + (y - north) * UPHILL[1])
+    if void:
+        heights[20, 20] = np.nan
+    with rasterio.open(
+        root / name, "w", "GTiff", width=40, height=40, count=1, dtype="float64", crs="EPSG:32632",
+        transform=from_origin(west, top, 1, 1),
+    ) as raster:  # fmt: skip
+        raster.write(heights, 1)
+    return root / name
+
+
+@pytest.fixture(scope="module")
+def hillside(tmp_path_factory):
+    """The tiny campaign with three targets on a plane tilted by 20°, imaged with its DEM."""
+    generator = np.random.default_rng(7)
+    plan = replace(tandem(generator, pulses=60), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
+    right = np.array([ALONG[1], -ALONG[0]])  # apart in range, so that a short aperture does not mix them
+    places = [across * right + along * ALONG for across, along in ((0.0, 0.0), (2.0, 0.8), (-2.0, -0.6))]
+    targets = tuple(PointTarget((x, y, SLOPE * float(UPHILL @ (x, y)))) for x, y in places)
+    plan = replace(plan, scene=Scene(DEMO_ORIGIN, targets))
+    root = write_campaign(tmp_path_factory.mktemp("hillside") / "campaign", plan, generator)
+    write_plane(root)
+    edit_scene(root, dem="dem.tif", dem_datum="ellipsoid")
+    return run_steps(root)
+
+
+def test_every_target_on_a_hillside_is_where_it_stands(hillside):
+    found = verify(hillside)
+    assert len(found) == 9
+    assert max(finding.error_m for finding in found) < 0.03
+
+
+@pytest.mark.slow
+def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
+    root = copy_writable(hillside.root, tmp_path / "campaign")
+    shutil.rmtree(root / "results")
+    edit_scene(root, dem=None, dem_datum=None)
+    found = verify(run_steps(root))
+    off = [finding.error_m for finding in found if finding.target and finding.image == "uav1-uav1"]
+    assert min(off) > 0.1
+
+
+def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
+    report = json.loads((hillside.results / "f01" / "uav1-uav2" / "image.json").read_text())
+    assert report["terrain"]["dem"] == "dem.tif"
+    assert report["terrain"]["datum"] == "ellipsoid"
+    assert report["numerical_error_db"] < -50
+    grid = scene_grid(hillside)
+    assert report["terrain"]["lowest_m"] < grid.height_m < report["terrain"]["highest_m"]
+    digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
+    for name in ("f01/uav1-uav2/slc.tif", "f01/fused/coherent_db.tif", "layers/mask.tif"):
+        with rasterio.open(hillside.results / name) as raster:
+            assert json.loads(raster.tags()["APERTURA_INPUTS"])["dem"] == digest
+            runspec = json.loads(raster.tags()["APERTURA_RUNSPEC"])
+            assert (runspec["dem"], runspec["dem_datum"]) == ("dem.tif", "ellipsoid")
+
+
+def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
+    grid = scene_grid(hillside)
+    heights = open_stage(hillside.stage("terrain"), "terrain").height.values
+    values = {}
+    for name in ("incidence", "bistatic_angle", "mask"):
+        with rasterio.open(hillside.results / "layers" / f"{name}.tif") as raster:
+            assert tuple(raster.transform)[:6] == grid.transform
+            assert raster.crs.to_epsg() == 32632
+            values[name] = raster.read(1)
+    echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
+    tx, rx = (echo[name].values[len(echo.pulse) // 2] for name in ("tx_position", "rx_position"))
+    middle = tuple(size // 2 for size in grid.shape)
+    place = grid.positions_at(*middle, heights[middle])
+    to_tx, to_rx = ((leg - place) / np.linalg.norm(leg - place) for leg in (tx, rx))
+    east, north, up = DEMO_ORIGIN.enu(to_tx + DEMO_ORIGIN.ecef(np.zeros(3)))
+    normal = np.array([-SLOPE * UPHILL[0], -SLOPE * UPHILL[1], 1.0]) / np.hypot(1, SLOPE)
+    assert values["incidence"][middle] == pytest.approx(np.degrees(np.arccos([east, north, up] @ normal)), abs=0.2)
+    assert values["bistatic_angle"][middle] == pytest.approx(np.degrees(np.arccos(to_tx @ to_rx)), abs=0.01)
+    assert not values["mask"].any()  # a plane facing the radar by less than its incidence
+
+
+@pytest.mark.slow
+def test_a_constant_dem_gives_the_image_of_flat_ground(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    shutil.rmtree(root / "results")
+    write_plane(root, slope=0.0)
+    edit_scene(root, dem="dem.tif", dem_datum="ellipsoid", height_m=-99.0)
+    campaign = run_steps(root, exports=False)
+    one, other = (
+        open_stage(which.stage("image", "f01", "uav1-uav2"), "image").image.values
+        for which in (campaign, finished_tiny)
+    )
+    assert np.abs(one - other).max() < 1e-3 * np.abs(other).max()
+
+
+def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
+    shutil.copyfile(shared / "dem_isce3" / "egm96_15.gtx", tiny / "egm96_15.gtx")
+    campaign = edit_scene(tiny, height_m=572.0, height_datum="egm96", geoid="egm96_15.gtx")
+    path = scene.scene(campaign)
+    settled = json.loads(path.read_text())
+    assert settled["grid"]["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
+    assert settled["inputs"] == {"geoid": hashlib.sha256((tiny / "egm96_15.gtx").read_bytes()).hexdigest()}
+
+
+# Bad input
+
+
+def complaint(work):
+    with pytest.raises(CampaignError) as caught:
+        work()
+    return str(caught.value)
+
+
+def test_a_dem_without_its_datum_is_refused(tiny):
+    write_plane(tiny)
+    message = complaint(lambda: edit_scene(tiny, dem="dem.tif"))
+    assert "dem_datum" in message
+    assert "never guessed" in message
+    assert "given without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
+
+
+def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
+    campaign = edit_scene(tiny, dem="terrain/dem.tif", dem_datum="ellipsoid")
+    message = complaint(campaign.check_files)
+    assert "terrain/dem.tif: no such file" in message
+    assert "scene.dem" in message
+
+
+def test_a_void_in_the_scene_is_counted_and_placed(tiny):
+    write_plane(tiny, void=True)
+    campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
+    message = complaint(lambda: ground(campaign))
+    assert "of 3600 pixels" in message
+    assert "first at x " in message
+    assert not (tiny / "results" / "terrain.zarr").exists()
+    write_plane(tiny)  # mended: the work in progress of the old DEM is not taken up
+    ground(campaign)
+    assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
+
+
+def test_a_dem_that_misses_part_of_the_scene_is_refused_when_the_grid_is_settled(tiny):
+    write_plane(tiny)
+    bounds = Campaign.load(tiny).settings.scene.bounds_m
+    campaign = edit_scene(
+        tiny, dem="dem.tif", dem_datum="ellipsoid", bounds_m=[bounds[0], bounds[1], bounds[2] + 40, bounds[3]]
+    )
+    message = complaint(lambda: scene.scene(campaign))
+    assert "% of the scene lies outside the DEM, to the east" in message
+
+
+def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):
+    """The hill is moved over the track; the scene is widened to hold it."""
+    root = copy_writable(hillside.root, tmp_path / "campaign")
+    bounds = [
+        round(edge + by, 6) for edge, by in zip(hillside.settings.scene.bounds_m, (-12, -12, 12, 12), strict=True)
+    ]
+    write_plane(root, slope=-1.5 * SLOPE)
+    campaign = edit_scene(root, bounds_m=bounds)
+    ground(campaign)
+    message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
+    assert "transmitter is in or below the ground" in message
+    assert "worst at pulse" in message
+
+
+def test_a_stage_terrain_without_a_dem_says_so(tiny):
+    campaign = Campaign.load(tiny)
+    scene.scene(campaign)
+    assert "scene.dem: no DEM" in complaint(lambda: terrain.terrain(campaign))
