@@ -115,6 +115,16 @@ def test_predictions_fall_as_more_is_asked_and_cost_does_not():
     assert seconds == sorted(seconds)
 
 
+def test_content_is_paid_for_as_long_as_that_is_cheap():
+    """Where errors weigh 6 dB more a finer table is taken; where they may weigh 60 dB more, no slower engine."""
+    even, sparse, unreachable = (plan(-60.0, content_db=content) for content in (0.0, 6.0, 60.0))
+    assert sparse.setting.error_db <= even.setting.error_db - 3
+    assert sparse.setting.error_db <= -69
+    assert unreachable.engine == even.engine
+    assert unreachable.predicted_seconds <= 1.3 * even.predicted_seconds
+    assert unreachable.predicted_error_db > -60
+
+
 def test_what_no_table_can_give_is_left_to_the_double_sum():
     assert plan(-120.0).engine == "reference"
     assert plan(-120.0).presum is None

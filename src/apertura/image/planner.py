@@ -29,6 +29,9 @@ MARGIN_DB = 3.0
 UNSEEN_DB = 3.0
 """And this much further before the echo is there: at random pixels of a sparse scene errors weigh more."""
 
+NEAR = 1.3
+"""A setting that costs no more than this times the cheapest is near it."""
+
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 _NET_PULSES = 48
 
@@ -68,7 +71,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     )
     some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
     desk = _Desk(job, look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m), costs, asked)
-    whole = desk.cheapest(len(job.tx_position_m), desk.target_db(accuracy_db))
+    whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
     terrain = _decide_terrain(desk)
@@ -105,13 +108,17 @@ class _Desk:
     costs: Costs
     asked: Mapping[str, Any]
 
-    def target_db(self, accuracy_db: float) -> float:
-        """Return the error that a flat spectrum of incoherent pixels may show for the accuracy to be met."""
-        unseen = UNSEEN_DB if self.job.content_db is None else max(0.0, self.job.content_db)
-        return accuracy_db - MARGIN_DB - unseen
+    @property
+    def content_db(self) -> float:
+        """How much more errors may weigh at the scene's pixels than at those of a flat, incoherent one."""
+        return UNSEEN_DB if self.job.content_db is None else max(0.0, self.job.content_db)
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
-        """Return the cheapest setting that meets the target, or the best there is."""
+        """Return the cheapest setting that meets the target, or the best there is.
+
+        What the content may cost is paid for as long as it is cheap: beyond that the certificate decides, and tiles
+        that need it are redone.
+        """
         load = replace(self.job.load, pulses=pulses)
         options = candidates(self.view, self.job.signal, load, self.costs, asked=self.asked)
         if not options:
@@ -121,8 +128,12 @@ class _Desk:
                 expected="an engine that can run here",
                 remedy="Install with a C++ compiler, or choose another engine.",
             )
-        exact = (setting for setting in options if setting.error_db <= target_db)
-        return next(exact, min(options, key=lambda setting: setting.error_db))
+        exact = [setting for setting in options if setting.error_db <= target_db]
+        if not exact:
+            return min(options, key=lambda setting: setting.error_db)
+        near = [setting for setting in exact if setting.seconds <= NEAR * exact[0].seconds]
+        sure = (setting for setting in near if setting.error_db <= target_db - self.content_db)
+        return next(sure, min(near, key=lambda setting: setting.error_db))
 
     def ladder(self, error_db: float, engine: str) -> tuple[Setting, ...]:
         """Return per 6 dB gained the cheapest setting, ending with the reference."""
@@ -151,7 +162,8 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
         return keep("asked for in config/config.yaml")
     if whole.engine == "reference":
         return keep("the double sum takes every pulse")
-    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, desk.target_db(accuracy_db) - 3)
+    limit_db = accuracy_db - MARGIN_DB - desk.content_db - 3
+    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, limit_db)
     if found is None and asked:
         raise CampaignError(
             f"pulse_thinning is {asked}",
@@ -160,12 +172,10 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
             remedy="Use a smaller factor or auto.",
         )
     if found is None:
-        return keep(
-            f"fewer pulses would err by more than {desk.target_db(accuracy_db) - 3:.0f} dB even after a low-pass sum"
-        )
+        return keep(f"fewer pulses would err by more than {limit_db:.0f} dB even after a low-pass sum")
     presum, error_db = found
     spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
-    less = desk.cheapest(len(presum.at), desk.target_db(accuracy_db) - 1)
+    less = desk.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
     if not asked and spent + less.seconds > 0.9 * whole.seconds:
         return keep(f"a low-pass sum {presum.factor}:1 costs more than it saves")
     line = f"{oversampled}; a low-pass sum makes {len(presum.at)} of {pulses} pulses"
