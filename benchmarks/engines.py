@@ -186,8 +186,9 @@ def main() -> None:
     asked = parser.parse_args()
     flat = build(asked.size, asked.pulses)
     mono = build(asked.size, asked.pulses, bistatic=False)
-    terrain = build(asked.size, asked.pulses, terrain_m=0.1)
-    jobs = {"bistatic": flat, "monostatic": mono, "bistatic, DEM": terrain, "bistatic, turned 30°": turned(flat, 30)}
+    jobs = {"bistatic": flat, "monostatic": mono, "bistatic, turned 30°": turned(flat, 30)}
+    for name, surface in (("bistatic, DEM", "natural"), ("bistatic, harsh DEM", "harsh")):
+        jobs[name] = build(asked.size, asked.pulses, surface=surface)
     contestants = native_contestants(jobs)
     contestants.append(numba_contestant(flat))
     if importlib.util.find_spec("fastsar"):

@@ -6,15 +6,18 @@ are of one size.
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.image.history import Profiles
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16
+Surface = Literal["flat", "harsh", "natural"]
 
 
 @dataclass(frozen=True)
@@ -42,16 +45,27 @@ def flight(generator: np.random.Generator, pulses: int, *, bistatic: bool) -> tu
     return tx, rx if bistatic else tx
 
 
-def grid(size: int, spacing_m: float = 0.05, *, turned_deg: float = 0.0, terrain_m: float = 0.0) -> NDArray[np.float64]:
-    """Return (y, x, 3) pixels; `terrain_m` is the RMS of heights that change from pixel to pixel and over metres."""
+def grid(
+    size: int, spacing_m: float = 0.05, *, turned_deg: float = 0.0, surface: Surface = "flat"
+) -> NDArray[np.float64]:
+    """Return (y, x, 3) pixels on a surface."""
     step = spacing_m * (np.arange(size) - (size - 1) / 2)
     across, along = np.meshgrid(step, step)
     turn = np.radians(turned_deg)
     middle = 5 + spacing_m * size / 2
     x, y = middle + across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    return np.stack([x, y, height(x, y, surface)], -1)
+
+
+def height(x: NDArray, y: NDArray, surface: Surface) -> NDArray[np.float64]:
+    """Return heights: relief of 10 cm and 1 cm RMS from pixel to pixel, or 1 m and 1 cm RMS over a quarter metre."""
     rough = np.random.default_rng(5).standard_normal(x.shape)
-    height = terrain_m * (np.sin(x / 3) + np.cos(y / 4)) + 0.1 * terrain_m * rough
-    return np.stack([x, y, height], -1)
+    if surface == "harsh":
+        return 0.1 * (np.sin(x / 3) + np.cos(y / 4)) + 0.01 * rough
+    if surface == "natural":
+        rough = gaussian_filter(rough, 0.25 / abs(np.hypot(x[0, 1] - x[0, 0], y[0, 1] - y[0, 0])))
+        return 1.0 * np.sin(x / 8) * np.cos(y / 10) + 0.01 * rough / rough.std()
+    return np.zeros_like(x)
 
 
 def total_path(tx: NDArray, rx: NDArray, place: NDArray) -> NDArray[np.float64]:
@@ -68,17 +82,17 @@ def response(path_m: NDArray) -> NDArray[np.float64]:
     return np.where(small, 1.0, np.sin(SUBCARRIERS * safe) / (SUBCARRIERS * np.sin(safe)))
 
 
-def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, terrain_m: float = 0.0) -> Job:
+def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface: Surface = "flat") -> Job:
     """Return the job; profiles are exact samples of the band-limited echo."""
     generator = np.random.default_rng(1)
     tx, rx = flight(generator, pulses, bistatic=bistatic)
-    pixels = grid(size, terrain_m=terrain_m)
+    pixels = grid(size, surface=surface)
     flat = pixels.reshape(-1, 3)
     scatterers = flat[generator.integers(0, len(flat), 100)] + generator.uniform(-0.025, 0.025, (100, 3)) * [1, 1, 0]
     amplitude = generator.standard_normal(100) + 1j * generator.standard_normal(100)
     step = C / (SUBCARRIERS * SPACING_HZ) / 2
-    edge = grid(64, 0.05 * size * 1.45 / 64).reshape(-1, 3)  # a turned grid fits in too
-    paths = total_path(tx, rx, edge)
+    edge = grid(64, 0.05 * size * 1.45 / 64)  # a turned grid fits in too
+    paths = total_path(tx, rx, np.concatenate([edge, pixels[::8, ::8]], axis=None).reshape(-1, 3))
     start = paths.min(1) - GUARD * step
     length = int(np.ceil((paths.max(1) - start).max() / step)) + GUARD
     samples = np.zeros((pulses, length), np.complex128)
