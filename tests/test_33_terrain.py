@@ -1,5 +1,7 @@
 """Terrain: heights where they are true, datums never guessed, and what of it a radar can see."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import rasterio
@@ -112,6 +114,13 @@ def test_a_geoid_grid_is_found_where_proj_looks(shared, monkeypatch, tmp_path):
     monkeypatch.setenv("PROJ_DATA", str(folder))
     terrain = open_terrain(shared / "dem_isce3" / "SanAnd_dem.tif", "EPSG:32611", datum="egm96")
     assert terrain.geoid == folder / "egm96_15.gtx"
+    assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3), 0.0))).all()
+
+
+def test_a_geoid_grid_in_the_working_folder_opens_by_its_bare_name(shared, monkeypatch):
+    """As the workflow names it, from inside the campaign folder."""
+    monkeypatch.chdir(shared / "dem_isce3")
+    terrain = open_terrain(Path("SanAnd_dem.tif"), "EPSG:32611", datum="egm96", geoid=Path("egm96_15.gtx"))
     assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3), 0.0))).all()
 
 

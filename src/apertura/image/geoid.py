@@ -62,7 +62,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     wrong = "no such file" if not given.is_file() else None
     if any(mark in given.name.lower() for mark in others):
         wrong = f"the grid of another geoid than {datum}"
-    if any(mark in str(given) for mark in '",'):
+    if any(mark in str(given.absolute()) for mark in '",'):
         wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
     if wrong:
         raise CampaignError(wrong, where=given, expected=wanted, remedy="Get that file, or correct scene.geoid.")
@@ -101,7 +101,7 @@ def undulation(
     Source: PROJ, operation vgridshift. The grid is named in the operation itself, because PROJ skips one that it has to
     look for and does not find.
     """
-    steps = f'+step +proj=vgridshift +grids="{grid}" +multiplier=1'
+    steps = f'+step +proj=vgridshift +grids="{grid.absolute()}" +multiplier=1'  # a bare name PROJ would look for
     try:
         shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
     except ProjError as error:
