@@ -309,6 +309,8 @@ def test_outcomes_survive_their_file_and_give_an_edge(tmp_path):
     edge = edge_of([outcome(0.1, 0.0), outcome(1.0, 0.5), outcome(10.0, 1.5)])
     assert edge.size_at_1_db == pytest.approx(10**0.5, rel=1e-5)
     assert np.isnan(edge.size_at_3_db)
+    gained = edge_of([outcome(0.1, 0.0), outcome(1.0, -0.5), outcome(10.0, -1.5)])
+    assert gained.size_at_1_db == edge.size_at_1_db
 
 
 def test_a_chart_is_the_same_bytes_for_the_same_rows(tmp_path):

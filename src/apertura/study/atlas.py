@@ -32,7 +32,7 @@ class Edge:
     impairment, unit, method
         What was tried.
     size_at_1_db, size_at_3_db
-        Interpolated; NaN where the loss never gets there.
+        Interpolated; NaN where the peaks never get that wrong, too low or too high.
     first_size, last_size
         Between which sizes it was tried.
     draws, seed
@@ -79,11 +79,11 @@ def join_parts(folder: Path, impairment: str) -> list[Outcome]:
 
 
 def edge_of(outcomes: list[Outcome]) -> Edge:
-    """Return where the loss of one impairment under one correction passes 1 and 3 dB."""
+    """Return where the loss of one impairment under one correction passes 1 and 3 dB, or a gain as wrong does."""
     first, last = outcomes[0], outcomes[-1]
     sizes, losses = (np.array([getattr(one, name) for one in outcomes]) for name in ("size", "loss_db"))
     logarithmic = SWEEPS[first.impairment].logarithmic
-    at = [round(crossing(sizes, losses, level, logarithmic=logarithmic), 6) for level in LEVELS_DB]
+    at = [round(crossing(sizes, np.abs(losses), level, logarithmic=logarithmic), 6) for level in LEVELS_DB]
     return Edge(
         first.impairment, first.unit, first.method, at[0], at[1], first.size, last.size, first.draws, first.seed
     )

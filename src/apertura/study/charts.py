@@ -93,8 +93,8 @@ def draw_summary(edges: Sequence[Edge], path: Path) -> None:
     units = [f", {sweep.unit}" if sweep.unit != "1" else "" for sweep in SWEEPS.values()]
     axes.set_yticks(range(len(SWEEPS)), [s.title + unit for s, unit in zip(SWEEPS.values(), units, strict=True)])
     axes.tick_params(labeltop=True, labelbottom=False, length=0)
-    axes.set_title("Size at which the peaks lose 1 dB | 3 dB (>: not within the sweep)", pad=24)
-    figure.colorbar(picture, ax=axes, label="Share of the sweep below 1 dB loss", pad=0.01, fraction=0.03)
+    axes.set_title("Size at which the peaks are wrong by 1 dB | 3 dB (> or <: not within the sweep)", pad=24)
+    figure.colorbar(picture, ax=axes, label="Share of the sweep below 1 dB", pad=0.01, fraction=0.03)
     save(figure, path)
 
 
