@@ -1,6 +1,7 @@
 """From heights above a geoid to heights above the ellipsoid, through a grid file that must be there."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import ProjError
+from pyproj.transformer import TransformerGroup
 
 from apertura.errors import CampaignError
 
@@ -134,3 +136,12 @@ def carried_datum(crs: CRS) -> str | None:
         return "ellipsoid" if len(crs.axis_info) == 3 else None
     authority = vertical.to_authority() or ("", "")
     return EPSG.get(":".join(authority), vertical.name)
+
+
+def grid_names(system: CRS) -> list[str]:
+    """Return the grid file that PROJ would want for the heights of a compound CRS."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup(system, "EPSG:4979", always_xy=True, allow_ballpark=False)
+    operations = [part for one in group.transformers for part in (one.operations or ())] + group.unavailable_operations
+    return list(dict.fromkeys(grid.short_name for operation in operations[:1] for grid in operation.grids))

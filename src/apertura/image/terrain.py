@@ -1,6 +1,5 @@
 """Terrain under the scene: a DEM file in any CRS becomes ellipsoidal heights at the pixels of the grid."""
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,10 @@ import rasterio
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
-from pyproj.transformer import TransformerGroup
 from rasterio.windows import Window
 
 from apertura.errors import CampaignError
-from apertura.image.geoid import carried_datum, geoid_file, undulation
+from apertura.image.geoid import carried_datum, geoid_file, grid_names, undulation
 from apertura.image.grid import LOCAL, SceneGrid
 
 LATTICE_M = 50.0
@@ -191,7 +189,9 @@ def open_terrain(path: Path, crs: str, *, datum: str, geoid: Path | None = None)
     earth = found in {"egm96", "egm2008"}
     geodetic = CRS("EPSG:4979") if earth or horizontal.geodetic_crs is None else horizontal.geodetic_crs.to_3d()
     grid = (
-        None if found == "ellipsoid" else geoid_file(found, geoid, names=_names(system) if datum == "carried" else ())
+        None
+        if found == "ellipsoid"
+        else geoid_file(found, geoid, names=grid_names(system) if datum == "carried" else ())
     )
     return Terrain(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), grid, metres)
 
@@ -231,15 +231,6 @@ def _metres_per_unit(path: Path, system: CRS, unit: str) -> float:
     if unit not in {"m", "metre", "meter", "metres", "meters"}:
         raise _wrong(path, f"heights in {unit}", "metres")
     return 1.0
-
-
-def _names(system: CRS) -> list[str]:
-    """Return the grid file that PROJ would want for the heights of a compound CRS."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        group = TransformerGroup(system, "EPSG:4979", always_xy=True, allow_ballpark=False)
-    operations = [part for one in group.transformers for part in (one.operations or ())] + group.unavailable_operations
-    return list(dict.fromkeys(grid.short_name for operation in operations[:1] for grid in operation.grids))
 
 
 def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
