@@ -16,6 +16,9 @@ import xarray as xr
 from apertura import __version__
 from apertura.errors import ContractError
 
+Window = tuple[slice, slice]
+"""Rows and columns of a part of an image."""
+
 
 @dataclass(frozen=True)
 class Variable:

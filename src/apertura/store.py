@@ -17,11 +17,9 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from apertura.contracts import canonical_json, check
+from apertura.contracts import Window, canonical_json, check
 from apertura.errors import CampaignError
 from apertura.provenance import sha256_tree
-
-Window = tuple[slice, slice]
 
 # An all-zero chunk must exist on disk: a missing chunk means "not computed yet".
 zarr.config.set({"array.write_empty_chunks": True})

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.contracts import Window
 from apertura.image.quality import NumericalError, Raster, numerical_error
-
-Window = tuple[slice, slice]
 
 BRIGHT_PIXELS = 16
 

@@ -8,10 +8,9 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.contracts import Window
 from apertura.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.image.grid import LOCAL, SceneGrid
-
-Window = tuple[slice, slice]
 
 GRAZING_LIMIT_DEG = 10.0
 """Ground seen at a lower grazing angle than this is left out of automatic bounds."""

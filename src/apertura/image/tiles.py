@@ -9,9 +9,8 @@ from dask.delayed import delayed
 from dask.diagnostics.progress import ProgressBar
 from numpy.typing import NDArray
 
+from apertura.contracts import Window
 from apertura.image.grid import SceneGrid
-
-Window = tuple[slice, slice]
 
 
 def form_tiles(

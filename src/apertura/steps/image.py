@@ -10,17 +10,18 @@ import zarr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.echo.compression import window_weights
+from apertura.contracts import Window
 from apertura.image.candidates import Setting
 from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.history import Profiles, Spectra
+from apertura.image.history import Spectra
 from apertura.image.peaks import cut_through, find_peak, ground_position
 from apertura.image.plan import Plan
 from apertura.image.planner import ladder
 from apertura.image.quality import coherence_factor, survey
-from apertura.image.tiles import Window, form_tiles
+from apertura.image.tiles import form_tiles
+from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.plan import plan_pair, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
@@ -38,7 +39,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     folder = campaign.stage("image", flight, pair)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
-    history = {"echo": _spectra(echo, processing.window), "profile": _profiles(profile)}
+    history = {"echo": spectra_of(echo, processing.window), "profile": profiles_of(profile)}
     plan = plan_pair(campaign, flight, pair, threads=threads)
     heights = planned_heights(plan, heights, grid)
     empty = stamped(
@@ -160,29 +161,6 @@ def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
             },
         },
     }
-
-
-def _spectra(echo: xr.Dataset, window: str) -> Spectra:
-    return Spectra(
-        echo.transfer.values,
-        echo.frequency.values,
-        window_weights(window, len(echo.subcarrier)),
-        echo.reference_delay.values,
-        echo.tx_position.values,
-        echo.rx_position.values,
-    )
-
-
-def _profiles(profile: xr.Dataset) -> Profiles:
-    return Profiles(
-        profile.profile.values,
-        profile.start.values,
-        profile.attrs["step_m"],
-        profile.attrs["centre_frequency_hz"],
-        profile.attrs["oversampling"],
-        profile.tx_position.values,
-        profile.rx_position.values,
-    )
 
 
 def _empty(grid: SceneGrid, pair: str, flags: dict[str, str], name: str) -> xr.Dataset:

@@ -19,7 +19,7 @@ from rasterio import Affine
 
 from apertura import __version__
 from apertura.campaign import Campaign
-from apertura.contracts import canonical_json
+from apertura.contracts import Window, canonical_json
 from apertura.export import LAYERS
 from apertura.geodesy import local_crs
 from apertura.image.grid import LOCAL, SceneGrid
@@ -34,7 +34,7 @@ from apertura.image.visibility import (
 from apertura.provenance import chained_sha256, code_sha256, merged
 from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
 from apertura.steps.terrain import Heights, open_heights
-from apertura.store import Window, open_stage
+from apertura.store import open_stage
 
 LOOKS = 17
 """Pulses, evenly spread over the aperture, from which shadow is decided."""

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import window_weights
 from apertura.echo.demodulate import subcarrier_numbers
 from apertura.echo.geometry import phase_centres
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Spectra
 from apertura.ingest import PHASE_HISTORIES, TRACKS
 from apertura.settings import OfdmWaveform, PhaseHistoryWaveform
+from apertura.steps.history import spectra_of
 from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
 
@@ -51,10 +51,9 @@ def outlook_of(campaign: Campaign, flight: str, pair: str) -> Outlook:
         echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
     else:
         return _expected(campaign, flight, pair, waveform)
-    tx, rx, frequency = echo.tx_position.values, echo.rx_position.values, echo.frequency.values
-    weight = window_weights(campaign.settings.processing.window, len(frequency))
-    spectra = Spectra(echo.transfer.values, frequency, weight, echo.reference_delay.values, tx, rx)
-    return Outlook(tx, rx, frequency, float(echo.path_limit.values.min()), spectra)
+    spectra = spectra_of(echo, campaign.settings.processing.window)
+    limit_m = float(echo.path_limit.values.min())
+    return Outlook(spectra.tx_position_m, spectra.rx_position_m, spectra.frequency_hz, limit_m, spectra)
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:

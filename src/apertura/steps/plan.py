@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from apertura.campaign import Campaign
+from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
 from apertura.image.candidates import Signal
@@ -26,7 +27,7 @@ from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
 from apertura.steps.terrain import Heights
-from apertura.store import Window, manifest_of
+from apertura.store import manifest_of
 
 OVERRIDES = (
     "engine",

@@ -11,13 +11,14 @@ import zarr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.contracts import Window
 from apertura.errors import CampaignError
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.terrain import Terrain
 from apertura.steps.ground import Ground
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
-from apertura.store import Window, finish, open_stage, tiles_missing, writing
+from apertura.store import finish, open_stage, tiles_missing, writing
 
 
 def terrain(campaign: Campaign) -> Path:

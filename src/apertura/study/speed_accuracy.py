@@ -20,6 +20,7 @@ from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.view import look
+from apertura.steps.history import profiles_of
 from apertura.steps.outlook import campaign_grid, outlook_of
 from apertura.steps.plan import OVERRIDES, job_of
 from apertura.steps.terrain import Heights, open_heights
@@ -89,7 +90,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     """
     outlook = outlook_of(campaign, flight, pair)
     grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
-    profile = open_stage(campaign.stage("profile", flight, pair), "profile")
+    profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     middle = len(outlook.tx) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     spectra = _block(outlook.spectra, block)
@@ -99,14 +100,12 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     costs = _of_engines(read_costs())
     overrides = {name: getattr(processing, name) for name in OVERRIDES if name not in {"engine"}}
     plan = make_plan(job, accuracy_db=processing.accuracy_db, costs=costs, overrides=overrides)
-    profiles = Profiles(
-        profile.profile.values[block],
-        profile.start.values[block],
-        profile.attrs["step_m"],
-        profile.attrs["centre_frequency_hz"],
-        profile.attrs["oversampling"],
-        outlook.tx,
-        outlook.rx,
+    profiles = replace(
+        profiles,
+        samples=profiles.samples[block],
+        start_m=profiles.start_m[block],
+        tx_position_m=outlook.tx,
+        rx_position_m=outlook.rx,
     )
     part = _part(spectra, profiles, grid, heights, whole=job.load)
     points = measure(part, plan, _settings(job, costs), seconds=seconds)
