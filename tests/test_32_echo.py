@@ -82,6 +82,21 @@ def test_a_reference_delay_is_put_back():
     )
 
 
+@pytest.mark.parametrize("count", [20, 75, 400])
+def test_a_swath_of_the_range_holds_what_the_whole_sum_does_there(count):
+    """Decimation to the swath errs by less than -110 dB of the strongest echo, wherever that is."""
+    frequency, generator = band(), np.random.default_rng(3)
+    paths = generator.uniform(0, 749, 40)  # everywhere in the unambiguous range
+    transfer = np.repeat(echo_of(paths, frequency) + 10 * echo_of([400.0], frequency), 3, axis=0)
+    start, weight = np.array([100.0, 333.3, 700.0]), window_weights("none", 512)
+    options = {"weight": weight, "reference_delay_s": np.zeros(3), "start_m": start, "count": count}
+    step, _ = range_step(frequency, oversampling=2)
+    delay = (start[:, None] + step * np.arange(count)) / SPEED_OF_LIGHT_M_S
+    waves = np.exp(2j * np.pi * (frequency - centre_frequency(frequency)) * delay[..., None])
+    whole = np.einsum("pn,n,prn->pr", transfer, weight, waves)
+    assert np.abs(compress(transfer, frequency, **options) - whole).max() < 10 * 10 ** (-110 / 20)
+
+
 def test_the_hann_window_widens_the_cell_and_lowers_the_sidelobes():
     frequency = band()
     levels = {}

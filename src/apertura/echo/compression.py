@@ -1,6 +1,7 @@
 """Range compression: transfer functions to range profiles, referenced to band centre and cropped to a swath."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,12 @@ from scipy import fft
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 
-_PULSES_AT_ONCE = 64
+_PULSES_AT_ONCE = 32  # which the caches hold
+
+_TAPS = 7
+_ROOM = 2.0
+"""A decimated profile spans this many times the swath; with seven taps its error is below that of complex64."""
+_LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
 """Name → weights of that many subcarriers."""
@@ -100,7 +106,8 @@ def compress(
     Notes
     -----
     Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth an interpolator
-    meets; exp(+j2πf_mid·ρ/c) remains for backprojection.
+    meets; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
+    subcarriers are decimated to it first (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
     --------
@@ -114,15 +121,66 @@ def compress(
     _, length = range_step(frequency_hz, oversampling=oversampling)
     if count > length:
         raise ValueError(f"{count=}: the unambiguous range holds {length} samples")
-    middle = len(frequency_hz) // 2
-    baseband = frequency_hz - frequency_hz[middle]
-    bins = (np.arange(len(frequency_hz)) - middle) % length
+    middle, after = len(frequency_hz) // 2, np.arange(count) - count // 2
+    spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
+    turns = (start_m / SPEED_OF_LIGHT_M_S - reference_delay_s) * spacing_hz + (count // 2) / length
+    carrier = np.exp(-2j * np.pi * (frequency_hz[middle] * reference_delay_s % 1.0))
+    filters = _decimation(len(frequency_hz), length, count)
+    factor, blocks = len(filters.taps), -(-len(frequency_hz) // len(filters.taps))
+    weighted = np.zeros((_PULSES_AT_ONCE, blocks * factor), np.complex64)
     profiles = np.empty((len(transfer), count), np.complex64)
     for first in range(0, len(transfer), _PULSES_AT_ONCE):
-        block = slice(first, first + _PULSES_AT_ONCE)
-        delay = start_m[block] / SPEED_OF_LIGHT_M_S - reference_delay_s[block]
-        turns = delay[:, None] * baseband - (frequency_hz[middle] * reference_delay_s[block])[:, None]
-        spectrum = np.zeros((len(delay), length), np.complex64)
-        spectrum[:, bins] = transfer[block] * (weight * np.exp(2j * np.pi * (turns % 1.0)))
-        profiles[block] = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)[:, :count]
+        part = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
+        here = weighted[: part.stop - first]
+        np.multiply(transfer[part], weight.astype(np.float32), out=here[:, : len(frequency_hz)])
+        taps = filters.taps * _phasors(turns[part], factor)[:, :, None]
+        sums = here.reshape(len(here), blocks, factor) @ taps
+        start = _turned(carrier[part], -middle * turns[part])
+        sums *= (_phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
+        spectrum = np.zeros((len(here), length // factor), np.complex64)
+        for tap in range(filters.taps.shape[1]):
+            spectrum[:, tap : tap + blocks] += sums[:, :, tap]
+        whole = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
+        profiles[part] = whole[:, after % (length // factor)] * filters.response
     return profiles
+
+
+@dataclass(frozen=True)
+class _Decimation:
+    """Taps (factor, tap) that sum `factor` subcarriers to one, and what undoes their response (count,) afterwards."""
+
+    taps: NDArray[np.complex64]
+    response: NDArray[np.complex64]
+
+
+def _decimation(subcarriers: int, length: int, count: int) -> _Decimation:
+    """Return the filters of the largest decimation that leaves the swath room: none where it fills the range."""
+    after, middle = np.arange(count) - count // 2, subcarriers // 2
+    factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]
+    factors = [n for n in factors if length // n >= max(_ROOM * count, -(-subcarriers // n) + _TAPS - 1)]
+    if not factors:
+        return _Decimation(np.ones((1, 1), np.complex64), _turned(np.ones(count), -middle * after / length))
+    factor, reach = factors[-1], _TAPS // 2
+    beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
+
+    def bell(place: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.i0(beta * np.sqrt(1 - (2 * place / _TAPS) ** 2)) / np.i0(beta))
+
+    within = (np.arange(factor) - (factor - 1) / 2) / factor
+    taps = bell(within[:, None] - np.arange(-reach, reach + 1))
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
+    response = 1 / (wave @ (weights * _TAPS / 2 * bell(nodes * _TAPS / 2)))
+    delay = (factor - 1) / 2 - middle - factor * reach
+    return _Decimation(taps.astype(np.complex64), _turned(response, delay * after / length))
+
+
+def _turned(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
+    return np.asarray(values * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)
+
+
+def _phasors(turns: NDArray[np.float64], count: int) -> NDArray[np.complex64]:
+    """Return (pulse, count) exp(j2π·turns·n), as products of coarse and fine ones: exponentials cost most."""
+    side = int(np.ceil(np.sqrt(count)))
+    fine, coarse = (_turned(np.ones(1), turns[:, None] * step * np.arange(side)) for step in (1, side))
+    return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
