@@ -82,7 +82,7 @@ def test_a_reference_delay_is_put_back():
     )
 
 
-@pytest.mark.parametrize("count", [20, 75, 400])
+@pytest.mark.parametrize("count", [16, 49, 64, 400])
 def test_a_swath_of_the_range_holds_what_the_whole_sum_does_there(count):
     """Decimation to the swath errs by less than -110 dB of the strongest echo, wherever that is."""
     frequency, generator = band(), np.random.default_rng(3)
