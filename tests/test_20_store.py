@@ -1,8 +1,10 @@
 """A stage is whole or absent, and says so when it is not what was written."""
 
+import fcntl
 import json
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -12,7 +14,7 @@ import zarr
 
 from apertura.contracts import STAGES, check, stamp
 from apertura.errors import CampaignError, ContractError
-from apertura.store import finish, manifest_of, open_stage, save_stage, tiles_missing, writing
+from apertura.store import finish, manifest_of, open_stage, save_stage, sharing, tiles_missing, writing
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -86,6 +88,37 @@ def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
         assert tiles_missing(wip, empty_image(), "image", WINDOWS) == [WINDOWS[0], *WINDOWS[2:]]
         assert tiles_missing(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
+
+
+def test_jobs_share_the_work_and_who_finishes_waits_for_them(tmp_path):
+    folder, alone = tmp_path / "image.zarr", threading.Event()
+
+    def finish_it():
+        with writing(folder):
+            alone.set()
+
+    finisher = threading.Thread(target=finish_it)
+    with sharing(folder, empty_image(), "image", WINDOWS) as (wip, first):
+        zarr.open_array(wip / "image", mode="r+")[WINDOWS[0]] = 1
+        with sharing(folder, empty_image(), "image", WINDOWS) as (_, second):
+            finisher.start()
+            assert not alone.wait(0.3)
+    finisher.join(10)
+    assert alone.is_set()
+    assert (first, second) == (WINDOWS, WINDOWS[1:])
+
+
+def test_other_work_that_came_between_is_not_written_into(tmp_path, monkeypatch):
+    folder, real = tmp_path / "image.zarr", fcntl.flock
+
+    def slow(lock, kind):
+        if kind == fcntl.LOCK_SH:  # the lock is let go for a moment: another step begins other work
+            tiles_missing(folder.with_name("image.zarr.wip"), empty_image(code="1"), "image", WINDOWS)
+        real(lock, kind)
+
+    monkeypatch.setattr(fcntl, "flock", slow)
+    with sharing(folder, empty_image(), "image", WINDOWS) as (_, missing):
+        assert missing == []
 
 
 def finished_image(folder):

@@ -11,7 +11,7 @@ import pytest
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.errors import CampaignError
 from apertura.image.candidates import Signal, candidates
-from apertura.image.cost import Costs, default_costs, machine, read_costs, write_costs
+from apertura.image.cost import Costs, default_costs, kept_costs, machine, read_costs, write_costs
 from apertura.image.edges import crossed_edges, finest_cell_m
 from apertura.image.engines import ENGINES, native, reference
 from apertura.image.grid import SceneGrid
@@ -443,6 +443,8 @@ def test_measured_costs_are_used_and_unfit_ones_are_not(tmp_path):
     mine = Costs({name: 2 * value for name, value in shipped.seconds.items()}, "")
     assert read_costs(write_costs(mine, path)).seconds == mine.seconds
     other = path.read_text().replace(f'"{machine()}"', '"abacus"')
+    path.write_text(other)
+    assert kept_costs(path).seconds == mine.seconds  # a campaign's own count wherever they were measured
     for spoilt in (other, "", "[]", '{"machine": "abacus", "seconds": {}}', path.read_text().replace("e-", "e+")):
         path.write_text(spoilt)
         assert read_costs(path).source.startswith("shipped")

@@ -176,6 +176,11 @@ def test_bounds_that_are_no_multiple_of_the_spacing_propose_the_nearest(tiny):
     assert "[570658.3, 5363704.2, 570664.3, 5363710.2]" in message
 
 
+def test_swapped_bounds_are_refused_and_put_in_order(tiny):
+    edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570664.3, 5363704.2, 570658.3, 5363710.2]))
+    assert "in order [570658.3, 5363704.2, 570664.3, 5363710.2]" in complaint(lambda: Campaign.load(tiny))
+
+
 def test_a_silent_capture_is_named(tiny):
     edit_data(tiny, "uav1", lambda samples: samples.reshape(-1, 8000)[5].fill(0))
     message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))

@@ -22,7 +22,7 @@ def snakemake(campaign, *options, **popen):
     )
 
 
-def finished(process, timeout=240):
+def finished(process, timeout=600):
     output, _ = process.communicate(timeout=timeout)
     return process.returncode, output
 
@@ -65,6 +65,10 @@ def tiles(root):
     return list((root / "results" / "f01").glob("*/image.zarr.wip/image/c/*/*"))
 
 
+def lines_of(folder, pattern):
+    return [line for path in folder.glob(pattern) for line in path.read_text().splitlines()]
+
+
 def wait_for_tiles(root, process, count=5, timeout=120):
     until = time.monotonic() + timeout
     while len(tiles(root)) < count:
@@ -98,9 +102,30 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
     process.stdout.close()
     code, output = finished(snakemake(tiny))
     assert code == 0, output
-    log = "".join(path.read_text() for path in (tiny / "results" / "logs" / "f01").glob("*.image.log"))
-    formed_again = sum(int(line.split(": ")[1].split()[0]) for line in log.splitlines() if "tiles to form" in line)
+    log = lines_of(tiny / "results" / "logs" / "f01", "*.image.log")
+    formed_again = sum(int(line.split()[0]) for line in log if "tiles to form" in line)
     assert formed_again <= 2 * 100 - made
+    assert contents(tiny) == unbroken
+    assert not list((tiny / "results").rglob("*.wip"))
+
+
+@pytest.mark.slow
+def test_tiles_scattered_over_jobs_and_killed_give_the_same_bytes(tiny, unbroken):
+    larger(tiny)
+    process = snakemake(tiny, "--set-scatter", "tiles=3", start_new_session=True)
+    made = wait_for_tiles(tiny, process)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    code, output = finished(snakemake(tiny, "--set-scatter", "tiles=4"))
+    assert code == 0, output
+    logs = tiny / "results" / "logs" / "f01"
+    by_shares, by_image = (
+        sum(int(line.split()[0]) for line in lines_of(logs, pattern) if "tiles to form" in line)
+        for pattern in ("*.tiles.*-of-4.log", "*.image.log")
+    )
+    assert 0 < by_shares <= 2 * 100 - made
+    assert by_image == 0
     assert contents(tiny) == unbroken
     assert not list((tiny / "results").rglob("*.wip"))
 

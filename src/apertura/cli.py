@@ -176,6 +176,14 @@ def scene(campaign: Directory = HERE) -> None:
 
 
 @step.command()
+def costs(campaign: Directory = HERE) -> None:
+    """Keep what imaging costs on this machine as the campaign's, costs.json."""
+    from apertura.steps import costs as steps
+
+    print(steps.costs(Campaign.load(campaign)))
+
+
+@step.command()
 def terrain(campaign: Directory = HERE) -> None:
     """Bring the DEM onto the campaign's grid, terrain.zarr."""
     from apertura.steps import terrain as steps
@@ -205,6 +213,14 @@ def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads =
     from apertura.steps import image as steps
 
     print(steps.image(Campaign.load(campaign), flight, pair, threads=threads))
+
+
+@step.command()
+def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Form one job's share of a pair's tiles, '2-of-8'; step image finishes them."""
+    from apertura.steps import image as steps
+
+    print(steps.tiles(Campaign.load(campaign), flight, pair, share, threads=threads))
 
 
 @step.command("chart")

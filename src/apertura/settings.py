@@ -156,7 +156,10 @@ class Scene(Section):
             return self
         xmin, ymin, xmax, ymax = self.bounds_m
         if xmin >= xmax or ymin >= ymax:
-            raise ValueError(f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max")
+            sorted_m = [min(xmin, xmax), min(ymin, ymax), max(xmin, xmax), max(ymin, ymax)]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max, in order {sorted_m}"
+            )
         if self.spacing_m != "auto":
             self._divisible(xmin, ymin, xmax, ymax, self.spacing_m)
         return self

@@ -8,10 +8,10 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import xarray as xr
@@ -23,6 +23,8 @@ from apertura.provenance import sha256_tree
 
 # An all-zero chunk must exist on disk: a missing chunk means "not computed yet".
 zarr.config.set({"array.write_empty_chunks": True})
+
+_PROVENANCE = ("runspec", "inputs", "code_sha256")
 
 
 def save_stage(dataset: xr.Dataset, folder: Path, *, chunks: Mapping[str, int] | None = None) -> None:
@@ -108,23 +110,58 @@ def writing(folder: Path) -> Iterator[Path]:
     pathlib.Path
         ``<folder>.wip``; kept if the body fails, so that finished chunks are picked up again.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    wip = folder.with_name(f"{folder.name}.wip")
-    with _seal_of(folder).open("a+") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        manifest_of(folder).unlink(missing_ok=True)
-        if folder.is_dir() and not wip.exists():
-            lock.seek(0)
-            if lock.read() == canonical_json(sha256_tree(folder)):
-                folder.rename(wip)
+    with _opened(folder) as (wip, lock):
+        _take_whole(lock, folder, wip)
         yield wip
+
+
+@contextmanager
+def sharing(
+    folder: Path, empty: xr.Dataset, name: str, windows: Sequence[Window]
+) -> Iterator[tuple[Path, list[Window]]]:
+    """Join the jobs that write tiles of one stage at once; each writes tiles of its own, whoever finishes waits.
+
+    Parameters
+    ----------
+    folder, empty, name, windows
+        As `writing` and `tiles_missing` take them.
+
+    Yields
+    ------
+    tuple
+        ``<folder>.wip``, and the windows that it does not hold yet: none if meanwhile others finished it, or began
+        other work there.
+    """
+    with _opened(folder) as (wip, lock):
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        if _attributes(wip) != _identity(empty):
+            _take_whole(lock, folder, wip)
+            tiles_missing(wip, empty, name, windows)
+            fcntl.flock(lock, fcntl.LOCK_SH)  # not at once: one who waits for the whole may come between
+        yield wip, _missing(wip, name, windows) if _attributes(wip) == _identity(empty) else []
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[tuple[Path, IO[str]]]:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with _seal_of(folder).open("a+") as lock:
+        yield folder.with_name(f"{folder.name}.wip"), lock
+
+
+def _take_whole(lock: IO[str], folder: Path, wip: Path) -> None:
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    manifest_of(folder).unlink(missing_ok=True)
+    if folder.is_dir() and not wip.exists():
+        lock.seek(0)
+        if lock.read() == canonical_json(sha256_tree(folder)):
+            folder.rename(wip)
 
 
 def _seal_of(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.seal")
 
 
-def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Window]) -> list[Window]:
+def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Sequence[Window]) -> list[Window]:
     """Return the windows of array `name` that `wip` does not hold yet, starting `wip` afresh if it is other work.
 
     Parameters
@@ -143,15 +180,21 @@ def tiles_missing(wip: Path, empty: xr.Dataset, name: str, windows: Iterable[Win
     A chunk file is written beside and renamed, so one that exists is whole. Work in progress is other work
     when its settings, inputs or code differ.
     """
-    identity = {key: empty.attrs[key] for key in ("runspec", "inputs", "code_sha256")}
-    tiles = list(windows)
-    side = tuple(part.stop - part.start for part in tiles[0])
-    if _attributes(wip) != identity:
-        lay_out(wip, empty, {name: side})
+    if _attributes(wip) != _identity(empty):
+        lay_out(wip, empty, {name: _side(windows)})
+    return _missing(wip, name, windows)
+
+
+def _side(windows: Sequence[Window]) -> tuple[int, ...]:
+    return tuple(part.stop - part.start for part in windows[0])
+
+
+def _missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
+    chunks, (high, wide) = wip / name / "c", _side(windows)
     return [
-        window
-        for window in tiles
-        if not (wip / name / "c" / str(window[0].start // side[0]) / str(window[1].start // side[1])).is_file()
+        (rows, columns)
+        for rows, columns in windows
+        if not (chunks / str(rows.start // high) / str(columns.start // wide)).is_file()
     ]
 
 
@@ -183,10 +226,14 @@ def lay_out(wip: Path, empty: xr.Dataset, chunks: Mapping[str, tuple[int, ...]])
         )
 
 
+def _identity(stage: xr.Dataset) -> dict[str, Any]:
+    return {key: stage.attrs[key] for key in _PROVENANCE}
+
+
 def _attributes(wip: Path) -> dict[str, Any] | None:
     try:
         attributes = zarr.open_group(wip, mode="r").attrs
-        return {key: attributes[key] for key in ("runspec", "inputs", "code_sha256")}
+        return {key: attributes[key] for key in _PROVENANCE}
     except (FileNotFoundError, KeyError, ValueError):
         return None
 

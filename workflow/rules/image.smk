@@ -1,3 +1,8 @@
+# Tiles of one image are formed by so many jobs: --set-scatter tiles=8, or `set-scatter: tiles=8` in a profile.
+scattergather:
+    tiles=1,
+
+
 rule scene:
     input:
         campaign.scene_sources(),
@@ -20,6 +25,26 @@ rule scene:
         "settling the campaign's grid"
     shell:
         "apertura step scene > {log} 2>&1"
+
+
+rule costs:
+    output:
+        "results/costs.json",
+    log:
+        "results/logs/costs.log",
+    benchmark:
+        "results/benchmarks/costs.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.image.cost"),
+    message:
+        "keeping what imaging costs here, so that all jobs plan alike"
+    shell:
+        "apertura step costs > {log} 2>&1"
 
 
 rule terrain:
@@ -70,12 +95,46 @@ rule layers:
         "apertura step layers --threads {threads} > {log} 2>&1"
 
 
+rule tiles:
+    input:
+        "results/{flight}/{pair}/echo.manifest.json",
+        "results/{flight}/{pair}/profile.manifest.json",
+        "results/scene.json",
+        "results/costs.json",
+        campaign.terrain_sources(),
+    output:
+        temp("results/{flight}/{pair}/tiles/{scatteritem}.json"),
+    log:
+        "results/logs/{flight}/{pair}.tiles.{scatteritem}.log",
+    benchmark:
+        "results/benchmarks/{flight}/{pair}.tiles.{scatteritem}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 4
+    resources:
+        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+    params:
+        settings=campaign.relevant("image"),
+        code=code_sha256("apertura.steps.forming"),
+    message:
+        "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
+    shell:
+        "apertura step tiles {wildcards.flight} {wildcards.pair} {wildcards.scatteritem} --threads {threads} > {log} 2>&1"
+
+
+# One job alone forms the tiles and finishes the image; the shares of many are gathered.
 rule image:
     input:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
+        "results/costs.json",
         campaign.terrain_sources(),
+        [
+            share
+            for share in gather.tiles("results/{{flight}}/{{pair}}/tiles/{scatteritem}.json")
+            if "-of-1." not in share
+        ],
     output:
         "results/{flight}/{pair}/image.manifest.json",
         "results/{flight}/{pair}/image.json",

@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from apertura.image.engines import ENGINES, native
 
@@ -139,24 +140,37 @@ def read_costs(path: Path | None = None) -> Costs:
     >>> read_costs(Path("nowhere.json")).source.startswith("shipped defaults")
     True
     """
-    shipped = default_costs(machine())
-    path = path or cache_file()
+    found = _stored(path or cache_file())
+    if found is None or found["machine"] != machine():
+        return default_costs(machine())
+    return Costs(found["seconds"], f"measured on this machine ({machine()})")
+
+
+def kept_costs(path: Path) -> Costs:
+    """Return the costs that a campaign keeps, wherever they were measured; those of this machine before it keeps any.
+
+    All jobs of a campaign plan with the same costs, on whatever machines they run: so they plan the same.
+    """
+    found = _stored(path)
+    return read_costs() if found is None else Costs(found["seconds"], found["source"])
+
+
+def _stored(path: Path) -> dict[str, Any] | None:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         seconds = {name: float(value) for name, value in found["seconds"].items()}
-        fits = found["machine"] == machine() and seconds.keys() >= shipped.seconds.keys()
+        document = {"machine": str(found["machine"]), "source": str(found["source"]), "seconds": seconds}
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return shipped
-    if not fits or not all(0 < value < 1 for value in seconds.values()):
-        return shipped
-    return Costs(seconds, f"measured on this machine ({machine()})")
+        return None
+    whole = seconds.keys() >= default_costs().seconds.keys() and all(0 < value < 1 for value in seconds.values())
+    return document if whole else None
 
 
 def write_costs(costs: Costs, path: Path | None = None) -> Path:
-    """Keep measured costs for later plans; return the file."""
+    """Keep costs for later plans, of this machine or at `path`; return the file."""
     path = path or cache_file()
     path.parent.mkdir(parents=True, exist_ok=True)
-    document = {"machine": machine(), "seconds": dict(sorted(costs.seconds.items()))}
+    document = {"machine": machine(), "source": costs.source, "seconds": dict(sorted(costs.seconds.items()))}
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     beside.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     beside.replace(path)

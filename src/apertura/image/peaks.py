@@ -169,7 +169,7 @@ def cut_through(
     lobe = slice(middle - left, middle + right + 1)
     beyond = np.concatenate([line[: lobe.start], line[lobe.stop :]])
     return Cut(
-        _width(line, middle) * float(along[1] - along[0]),
+        half_power_width(line, middle) * float(along[1] - along[0]),
         10 * float(np.log10(beyond.max() / line[middle])) if beyond.size else float("nan"),
         10 * float(np.log10(beyond.sum() / line[lobe].sum())) if beyond.size else float("nan"),
     )
@@ -180,10 +180,17 @@ def _first_minimum(line: NDArray[np.float64]) -> int:
     return int(rising[0]) if rising.size else len(line) - 1
 
 
-def _width(line: NDArray[np.float64], middle: int) -> float:
-    half = line[middle] / 2
+def half_power_width(power: NDArray[np.float64], middle: int) -> float:
+    """Return the −3 dB width in samples of a lobe that peaks at sample `middle`; NaN where it leaves the line.
+
+    Examples
+    --------
+    >>> half_power_width(np.array([0.0, 0.0, 1.0, 0.0, 0.0]), 2)
+    1.0
+    """
+    half = power[middle] / 2
     sides = []
-    for side in (line[middle::-1], line[middle:]):
+    for side in (power[middle::-1], power[middle:]):
         below = np.flatnonzero(side < half)
         if not below.size:
             return float("nan")

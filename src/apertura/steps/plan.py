@@ -15,7 +15,6 @@ from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
 from apertura.image.candidates import Signal
-from apertura.image.cost import read_costs
 from apertura.image.engines import reference
 from apertura.image.extent import swath
 from apertura.image.grid import LOCAL, SceneGrid
@@ -23,6 +22,7 @@ from apertura.image.history import Spectra
 from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
+from apertura.steps.costs import campaign_costs
 from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
@@ -67,7 +67,7 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     plan = make_plan(
         replace(job_of(outlook, grid, tile_px=processing.tile_px, threads=threads), **_relief(campaign, grid)),
         accuracy_db=processing.accuracy_db,
-        costs=read_costs(),
+        costs=campaign_costs(campaign),
         overrides={name: getattr(processing, name) for name in OVERRIDES},
     )
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()

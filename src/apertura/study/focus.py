@@ -11,6 +11,7 @@ from apertura.echo.compression import centre_frequency, compress, range_step, wi
 from apertura.echo.demodulate import remove_path
 from apertura.image.engines import numba, reference
 from apertura.image.history import Profiles, Spectra
+from apertura.image.peaks import half_power_width
 from apertura.image.quality import coherence_factor
 from apertura.study.bench import Bench, Complexes
 
@@ -153,19 +154,8 @@ def widths_of(image: Callable[[Floats], Complexes], peak_m: Floats) -> tuple[flo
     still, across_m, along_m = np.zeros(1), np.linspace(-1, 1, 401), np.linspace(-0.4, 0.4, 401)
     across = np.abs(image(pixels_around(peak_m, still, across_m))).ravel() ** 2
     along = np.abs(image(pixels_around(peak_m, along_m, still))).ravel() ** 2
-    return _half_power_width(across, across_m), _half_power_width(along, along_m)
-
-
-def _half_power_width(power: Floats, line_m: Floats) -> float:
-    middle, half = len(power) // 2, power[len(power) // 2] / 2
-    ends = []
-    for side in (power[middle::-1], power[middle:]):
-        below = np.flatnonzero(side < half)
-        if not below.size:
-            return float("nan")
-        k = int(below[0])
-        ends.append(k - 1 + (side[k - 1] - half) / (side[k - 1] - side[k]))
-    return float(sum(ends) * (line_m[1] - line_m[0]))
+    across_step_m, along_step_m = across_m[1] - across_m[0], along_m[1] - along_m[0]
+    return half_power_width(across, 200) * across_step_m, half_power_width(along, 200) * along_step_m
 
 
 def coherence_factors(observed: History, points_m: Floats) -> Floats:
