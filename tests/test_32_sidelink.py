@@ -223,6 +223,9 @@ def test_a_wrong_code_is_named_and_division_still_images():
     assert choose(state)[0] == "divide"
     assert abs(SCENE.loss_db(divide(radar * wrong, sidelink * wrong))) < 0.3
     assert "wrong_code" not in measure(sidelink).flags
+    for method, needs_code in (("divide", False), ("wiener", False), ("gated", True), ("two_parameter", True)):
+        assert ("sidelink_code" in edges(method, state)) == needs_code
+        assert "sidelink_code" not in edges(method, measure(sidelink))
 
 
 @pytest.mark.parametrize(("second", "flagged"), [(0.45, False), (0.65, True)])  # -6.9 and -3.7 dB
