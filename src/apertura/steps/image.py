@@ -40,7 +40,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
     history = {"echo": spectra_of(echo, processing.window), "profile": profiles_of(profile)}
-    plan = plan_pair(campaign, flight, pair, threads=threads)
+    plan = plan_pair(campaign, flight, pair, threads=threads, echo=echo, heights=heights)
     heights = planned_heights(plan, heights, grid)
     empty = stamped(
         _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
