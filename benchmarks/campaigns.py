@@ -14,6 +14,7 @@ from apertura.image.plan import Job
 from apertura.steps.outlook import Outlook
 from apertura.steps.plan import job_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
+from apertura.steps.terrain import Heights
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,12 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
     window = str(generator.choice(["hann", "none"]))
     spectra = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
     accuracy = float(generator.choice([-50.0, -60.0, -70.0, -80.0]))
-    profiles = _compressed(spectra, grid, window)
-    outlook = Outlook(tx, rx, spectra.frequency_hz, np.inf, spectra)
+    profiles = compressed(spectra, grid, window)
+    outlook = Outlook(tx, rx, spectra.frequency_hz, spectra.weight, np.inf, spectra)
     name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
-    return Drawn(name, spectra, profiles, grid, job_of(outlook, grid, tile_px=256, threads=1), accuracy)
+    return Drawn(
+        name, spectra, profiles, grid, job_of(outlook, grid, Heights((), None), tile_px=256, threads=1), accuracy
+    )
 
 
 def _fly(
@@ -108,7 +111,8 @@ def _record(
     return Spectra(transfer.astype(np.complex64), frequency, weights, reference, tx, rx)
 
 
-def _compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
+def compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
+    """Return the range profiles of an echo, as the profile step makes them."""
     near, far = swath(grid, spectra.tx_position_m, spectra.rx_position_m)
     frequency = spectra.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)

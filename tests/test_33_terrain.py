@@ -281,7 +281,7 @@ ROW = (slice(6, 7), slice(0, 240))
 
 def seen(heights, antenna, grid=STREET, window=ROW):
     looks = antennas_over(grid, np.atleast_2d(np.asarray(antenna, float)))
-    return visibility(Relief.of(grid, heights), looks, looks, window)
+    return visibility(Relief.of(grid, heights.__getitem__), looks, looks, window)
 
 
 @pytest.mark.parametrize("wall_m", [1.5, 2.0, 3.0])
@@ -348,7 +348,7 @@ def test_a_pixel_hidden_from_few_looks_is_not_in_shadow_and_either_antenna_count
         assert seen(heights, looks)[0, behind[1]] & 1 == dark
     tx, rx = (antennas_over(STREET, np.array([antenna])) for antenna in (high, low))
     for pair in ((tx, rx), (rx, tx)):
-        assert visibility(Relief.of(STREET, heights), *pair, ROW)[0, behind[1]] & 1 == 1
+        assert visibility(Relief.of(STREET, heights.__getitem__), *pair, ROW)[0, behind[1]] & 1 == 1
 
 
 def test_the_ground_curves_away_below_a_long_line():

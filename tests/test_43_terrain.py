@@ -15,12 +15,17 @@ from rasterio.transform import from_origin
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geodesy import projected_from_ecef
+from apertura.image.engines import ENGINES
 from apertura.simulate.campaign import write_campaign
 from apertura.simulate.plan import grid_around
 from apertura.simulate.presets import DEMO_ORIGIN, tandem
 from apertura.simulate.scene import PointTarget, Scene
-from apertura.steps import profile, scene, terrain
+from apertura.steps import outlook, profile, scene, terrain
+from apertura.steps.history import profiles_of, spectra_of
+from apertura.steps.outlook import outlook_of
+from apertura.steps.plan import job_of, plan_pair
 from apertura.steps.scene import scene_grid
+from apertura.steps.terrain import Heights, expected_heights
 from apertura.steps.verify import verify
 from apertura.store import open_stage
 
@@ -142,6 +147,32 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
     settled = json.loads(path.read_text())
     assert settled["grid"]["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
     assert settled["inputs"] == {"geoid": hashlib.sha256((tiny / "egm96_15.gtx").read_bytes()).hexdigest()}
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
+    """Samples and bytes of tables are those of its ground, whether stage `terrain` is made or only its DEM is there."""
+    root = copy_writable(hillside.root, tmp_path / "campaign")
+    if not made:
+        (root / "results" / "terrain.manifest.json").unlink()
+    campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
+    seen, profiles = outlook_of(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
+    grid = scene_grid(campaign)
+    heights = expected_heights(campaign, grid)
+    assert job_of(seen, grid, heights, tile_px=256, threads=1).signal.samples == profiles.sizes["range"]
+    assert job_of(seen, grid, Heights((), None), tile_px=256, threads=1).signal.samples != profiles.sizes["range"]
+    plan = plan_pair(campaign, *pair)
+    tables = ENGINES[plan.engine].prepare(plan.history(profiles_of(profiles)), **plan.options)
+    assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
+
+
+def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
+    echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
+    held = spectra_of(echo, "hann").transfer
+    monkeypatch.setattr(outlook, "open_stage", None)
+    found = outlook.outlook_of(hillside, "f01", "uav1-uav2", echo=echo)
+    assert np.shares_memory(found.spectra.transfer, held)
+    plan_pair(hillside, "f01", "uav1-uav2", echo=echo, heights=terrain.open_heights(hillside))
 
 
 # Bad input

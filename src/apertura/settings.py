@@ -203,6 +203,9 @@ class Processing(Section):
     pulse_thinning: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
         "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
     )
+    pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
+        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
+    )
     midpoint: bool | Literal["auto"] = Field(
         "auto", description="image a bistatic pair as if both antennas were at their midpoint: true, false or auto"
     )

@@ -1,15 +1,16 @@
 """Every setting of every engine, with the error and the cost that geometry and waveform predict for it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.image import cost
 from apertura.image.engines import ENGINES
-from apertura.image.engines.tables import MARGIN, TAPS, plan, ratio
+from apertura.image.engines.tables import BAND, MARGIN, TAPS, band_error_db, plan, ratio
 from apertura.image.view import View, forms
 
 DEGREES = (1, 2)
@@ -23,7 +24,7 @@ NUMBA_OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 WIDE_SUM_DB = -105.0
 """Below this error the sum over pulses is float64; in float32 it errs by about -115 dB."""
 
-_WORST_TO_RMS = 0.25
+_WORST_TO_RMS = 1 / 3
 _FLOAT32_RAD = 2e-6
 _REFINED_DB = -98.0  # the sinc filter of numba's table
 _REFERENCE_DB = -140.0  # images are complex64
@@ -31,12 +32,27 @@ _REFERENCE_DB = -140.0  # images are complex64
 
 @dataclass(frozen=True)
 class Signal:
-    """What profiles hold: centre frequency, samples per cell c/B, path between samples (m), samples per pulse."""
+    """What profiles hold.
+
+    Attributes
+    ----------
+    centre_hz
+        f_mid.
+    oversampling
+        Samples per cell c/B.
+    step_m
+        Total path between samples.
+    samples
+        Per pulse.
+    window
+        (subcarrier,) float64, weights over the band, of any scale; flat by default.
+    """
 
     centre_hz: float
     oversampling: float
     step_m: float
     samples: int
+    window: NDArray[np.float64] = field(default_factory=lambda: np.ones(1), repr=False)
 
     @property
     def wavenumber_rad_m(self) -> float:
@@ -59,9 +75,13 @@ class Setting:
     seconds, table_seconds
         Predicted on one thread: in all, and for what all tiles share.
     table_bytes
-        What `prepare` returns.
+        What `prepare` returns for all pulses.
     reason
         One line.
+    shares
+        Of pixels × pulses that native computes by its shared, wide and exact forms.
+    pulse_blocks
+        Into how many blocks pulses are split, so that the tables of one fit into memory; their images add up.
     """
 
     engine: str
@@ -73,6 +93,7 @@ class Setting:
     reason: str = ""
     table_seconds: float = 0.0
     shares: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    pulse_blocks: int = 1
 
     @property
     def line(self) -> str:
@@ -154,7 +175,9 @@ def _native(
     k = signal.wavenumber_rad_m
     up, down = ratio(signal.oversampling, oversampling)
     cell_m = signal.step_m * down / up
-    table_db = plan(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree).error_db
+    table_db = plan(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree).error_db(
+        signal.window
+    )
     shares, path_rad = forms(view, cell_m=cell_m, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
     cells = -(-((signal.samples - 1) * up // down + 1 + 2 * MARGIN) // TAPS) * TAPS
     paths_db = 20 * np.log10(_WORST_TO_RMS * path_rad + _FLOAT32_RAD)
@@ -177,7 +200,7 @@ def _native(
 def _numba(signal: Signal, load: cost.Load, costs: cost.Costs, oversampling: int) -> Setting:
     factor = max(1, round(oversampling / signal.oversampling))
     cells = signal.samples * factor
-    cubic_db = cubic_error_db(signal.oversampling * factor)
+    cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
     tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells))
     error_db = power_sum_db(cubic_db, _REFINED_DB)
     reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
@@ -190,15 +213,15 @@ def _reference(load: cost.Load, costs: cost.Costs) -> Setting:
     return Setting("reference", {}, {}, _REFERENCE_DB, spent, 0, "the double sum itself, float64")
 
 
-def cubic_error_db(oversampling: float) -> float:
-    """Return the RMS error of four-point Lagrange interpolation of a flat spectrum, dB.
+def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
+    """Return the RMS error of four-point Lagrange interpolation of echoes that a window (subcarrier,) weighs, dB.
 
     Examples
     --------
-    >>> round(cubic_error_db(4)), round(cubic_error_db(8))
-    (-54, -78)
+    >>> [round(cubic_error_db(n, window)) for window in (np.ones(64), np.hanning(64)) for n in (4, 8)]
+    [-54, -78, -72, -95]
     """
-    omega = np.pi / oversampling * np.linspace(-1, 1, 201)
+    omega = np.pi / oversampling * BAND
     u = np.linspace(0, 1, 41)[:, None]
     weights = (
         -u * (u - 1) * (u - 2) / 6,
@@ -207,7 +230,7 @@ def cubic_error_db(oversampling: float) -> float:
         (u + 1) * u * (u - 1) / 6,
     )
     value = sum(weight * np.exp(1j * omega * (n - 1)) for n, weight in enumerate(weights))
-    return float(10 * np.log10((np.abs(value - np.exp(1j * omega * u)) ** 2).mean()))
+    return band_error_db((np.abs(value - np.exp(1j * omega * u)) ** 2).mean(axis=0), window)
 
 
 def power_sum_db(*parts_db: float) -> float:

@@ -221,5 +221,9 @@ def seconds(
         pixels = work * unit["numba.pixel"]
     else:
         tables, pixels = 0.0, work * load.subcarriers * unit["reference.subcarrier"]
-    tiles = load.pixels * unit[f"place.{load.frame}"] + load.tiles * unit["tile"]
-    return tables, pixels + tiles
+    return tables, pixels + tile_seconds(costs, load)
+
+
+def tile_seconds(costs: Costs, load: Load) -> float:
+    """Return what an engine's tiles cost apart from their sums: placing pixels, and writing."""
+    return load.pixels * costs.seconds[f"place.{load.frame}"] + load.tiles * costs.seconds["tile"]

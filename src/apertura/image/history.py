@@ -1,6 +1,6 @@
 """What an engine is given: the recorded history as plain arrays, without settings or files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,16 @@ class Spectra:
     reference_delay_s: NDArray[np.float64]
     tx_position_m: NDArray[np.float64]
     rx_position_m: NDArray[np.float64]
+
+    def of_pulses(self, part: slice) -> "Spectra":
+        """Return the spectra of some pulses, as views."""
+        return replace(
+            self,
+            transfer=self.transfer[part],
+            reference_delay_s=self.reference_delay_s[part],
+            tx_position_m=self.tx_position_m[part],
+            rx_position_m=self.rx_position_m[part],
+        )
 
 
 @dataclass(frozen=True)
@@ -63,3 +73,13 @@ class Profiles:
     oversampling: float
     tx_position_m: NDArray[np.float64]
     rx_position_m: NDArray[np.float64]
+
+    def of_pulses(self, part: slice) -> "Profiles":
+        """Return the profiles of some pulses, as views; images of pulse blocks add up to the image of all."""
+        return replace(
+            self,
+            samples=self.samples[part],
+            start_m=self.start_m[part],
+            tx_position_m=self.tx_position_m[part],
+            rx_position_m=self.rx_position_m[part],
+        )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.image.candidates import Setting, Signal
 from apertura.image.cost import Load
 from apertura.image.history import Profiles
-from apertura.image.models import Decision
+from apertura.image.models import Decision, plane_through
 from apertura.image.thinning import Presum, thin
 
 
@@ -40,6 +40,8 @@ class Job:
         (row, column) float64 of a DEM above the flat model, in the middle of blocks of so many pixels; None without.
     path_limit_m
         Longest total path inside the cyclic prefix.
+    memory_bytes
+        What the imaging step may use.
     content_db
         How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
         errors of tables weigh that much more. None before anything was recorded.
@@ -60,6 +62,7 @@ class Job:
     heights_m: NDArray[np.float64] | None = None
     heights_step_px: int = 1
     path_limit_m: float = np.inf
+    memory_bytes: float = np.inf
     content_db: float | None = None
 
     @property
@@ -78,6 +81,17 @@ class Job:
     def place_m(self) -> NDArray[np.float64]:
         """The net as (place, 3), its middle in the middle."""
         return self.net_m.reshape(-1, 3)
+
+    @property
+    def tilt_m(self) -> tuple[float, float, float]:
+        """The plane through the DEM: height above the flat model at pixel (0, 0), per row and per column, metres."""
+        if self.heights_m is None:
+            return (0.0, 0.0, 0.0)
+        plane, step = plane_through(self.heights_m), self.heights_step_px
+        down, right = (
+            float(np.diff(plane[:2, :2], axis=axis)[0, 0]) / step if plane.shape[axis] > 1 else 0.0 for axis in (0, 1)
+        )
+        return (float(plane[0, 0]) - (down + right) * (step - 1) / 2, down, right)
 
 
 @dataclass(frozen=True)

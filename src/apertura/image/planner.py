@@ -6,9 +6,9 @@ from typing import Any
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.image.budget import bytes_needed, setting_decisions, wall_seconds
+from apertura.image.budget import block_decision, blocked, bytes_needed, setting_decisions, wall_seconds
 from apertura.image.candidates import Setting, candidates, power_sum_db
-from apertura.image.cost import Costs
+from apertura.image.cost import Costs, tile_seconds
 from apertura.image.edges import crossed_edges
 from apertura.image.models import (
     Decision,
@@ -16,7 +16,6 @@ from apertura.image.models import (
     decide_terrain,
     midpoint_error_db,
     phase_rates,
-    plane_through,
     upward,
 )
 from apertura.image.plan import Job, Plan
@@ -31,6 +30,9 @@ UNSEEN_DB = 3.0
 
 NEAR = 1.3
 """A setting that costs no more than this times the cheapest is near it."""
+
+ALIKE = 1.05
+"""And one that costs no more than this times the chosen is as cheap: the most exact of them is taken."""
 
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 _NET_PULSES = 48
@@ -49,7 +51,8 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         Constants of the machine. The same job and costs give the same plan.
     overrides
         Choice → value that a person asks for: engine, table_degree, table_oversampling, accumulate,
-        phase_tolerance_rad, pulse_thinning, midpoint, terrain. 'auto' or None leaves the choice to the planner.
+        phase_tolerance_rad, pulse_thinning, pulse_blocks, midpoint, terrain. 'auto' or None leaves the choice to the
+        planner.
 
     Raises
     ------
@@ -75,12 +78,19 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
     terrain = _decide_terrain(desk)
+    chosen = desk.fitted(chosen, presum)
     models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
     memory, disk = bytes_needed(job, chosen, presum)
     return Plan(
         setting=chosen,
         better=desk.ladder(chosen.error_db, chosen.engine),
-        decisions=(*setting_decisions(chosen, asked, accuracy_db), thinning, midpoint, terrain),
+        decisions=(
+            *setting_decisions(chosen, asked, accuracy_db),
+            thinning,
+            block_decision(chosen, job, asked="pulse_blocks" in asked),
+            midpoint,
+            terrain,
+        ),
         predicted_error_db=power_sum_db(chosen.error_db, *models) + max(0.0, job.content_db or 0.0),
         predicted_seconds=wall_seconds(chosen, job),
         memory_bytes=memory,
@@ -89,7 +99,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         presum=presum,
         midpoint=bool(midpoint.value),
         middle_m=job.place_m[len(job.place_m) // 2],
-        tilt_m=_tilt(job) if terrain.value == "tilted_plane" else None,
+        tilt_m=job.tilt_m if terrain.value == "tilted_plane" else None,
         cost_source=costs.source,
     )
 
@@ -133,7 +143,9 @@ class _Desk:
             return min(options, key=lambda setting: setting.error_db)
         near = [setting for setting in exact if setting.seconds <= NEAR * exact[0].seconds]
         sure = (setting for setting in near if setting.error_db <= target_db - self.content_db)
-        return next(sure, min(near, key=lambda setting: setting.error_db))
+        chosen = next(sure, min(near, key=lambda setting: setting.error_db))
+        alike = (setting for setting in exact if setting.seconds <= ALIKE * chosen.seconds)
+        return min(alike, key=lambda setting: setting.error_db)
 
     def ladder(self, error_db: float, engine: str) -> tuple[Setting, ...]:
         """Return per 6 dB gained the cheapest setting, ending with the reference."""
@@ -146,7 +158,14 @@ class _Desk:
             rungs.append(better[0])
             error_db = better[0].error_db
         last = [setting for setting in options if setting.engine == "reference" and engine != "reference"]
-        return (*rungs, *last)
+        return (*(self.fitted(rung, None) for rung in rungs), *last)
+
+    def fitted(self, setting: Setting, presum: Presum | None) -> Setting:
+        """Return the setting in as many pulse blocks as fit into memory; each one places the tiles anew."""
+        found = blocked(setting, self.job, presum, asked=self.asked.get("pulse_blocks"))
+        return replace(
+            found, seconds=found.seconds + (found.pulse_blocks - 1) * tile_seconds(self.costs, self.job.load)
+        )
 
 
 def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[Decision, Presum | None, Setting]:
@@ -234,14 +253,3 @@ def _decide_terrain(desk: _Desk) -> Decision:
             remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
         )
     return Decision("terrain", asked, f"asked for in config/config.yaml; the rule says {found.value}: {found.reason}")
-
-
-def _tilt(job: Job) -> tuple[float, float, float]:
-    """Return the plane through the DEM: height above the flat model at pixel (0, 0), per row and per column, metres."""
-    if job.heights_m is None:
-        return (0.0, 0.0, 0.0)
-    plane, step = plane_through(job.heights_m), job.heights_step_px
-    down, right = (
-        float(plane[at] - plane[0, 0]) / step for at in ((min(1, len(plane) - 1), 0), (0, min(1, plane.shape[1] - 1)))
-    )
-    return (float(plane[0, 0]) - (down + right) * (step - 1) / 2, down, right)

@@ -1,15 +1,19 @@
 """How the scene is seen: incidence, bistatic angle, and where terrain hides or folds."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.contracts import Window
 from apertura.geodesy import projected_from_ecef
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.sightlines import BLOCK, mark_layover, mark_shadow
 
 EARTH_RADIUS_M = 6371e3
+
+_STRIP = 256  # rows of heights read at once
 
 Floats = NDArray[np.float64]
 
@@ -104,10 +108,13 @@ class Relief:
     curvature_per_m: float
 
     @classmethod
-    def of(cls, grid: SceneGrid, height_m: Floats) -> "Relief":
-        """Return the relief of a scene from its pixel heights, (row, column), metres."""
+    def of(cls, grid: SceneGrid, heights: Callable[[Window], Floats]) -> "Relief":
+        """Return the relief of a scene from what gives the heights (m) of a window; they are read by strips."""
         base = float(grid.height_m)
-        relative = (height_m - base).astype(np.float32)
+        relative = np.empty(grid.shape, np.float32)
+        for row in range(0, grid.shape[0], _STRIP):
+            strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
+            relative[strip] = heights(strip) - base
         rows, columns = (-(-size // BLOCK) for size in grid.shape)
         highest = np.empty((rows, columns), np.float32)
         for row in range(rows):
@@ -145,7 +152,7 @@ def antennas_over(grid: SceneGrid, antenna: Floats) -> Floats:
     return np.stack([row, (place[:, 0] - west) / grid.spacing_m - 0.5, place[:, 2] - grid.height_m], -1)
 
 
-def visibility(relief: Relief, tx: Floats, rx: Floats, window: tuple[slice, slice]) -> NDArray[np.uint8]:
+def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArray[np.uint8]:
     """Return where one pair sees the ground of a window in shadow or in layover.
 
     Shadow: from more than half of the looks the straight line to the transmitter or to the receiver runs through
@@ -177,7 +184,7 @@ def visibility(relief: Relief, tx: Floats, rx: Floats, window: tuple[slice, slic
     >>> ground = np.zeros(grid.shape)
     >>> ground[:, 10] = 4.0
     >>> look = antennas_over(grid, np.array([[-30.0, 4.0, 20.0]]))
-    >>> visibility(Relief.of(grid, ground), look, look, (slice(4, 5), slice(0, 32)))[0, 7:22]
+    >>> visibility(Relief.of(grid, ground.__getitem__), look, look, (slice(4, 5), slice(0, 32)))[0, 7:22]
     array([0, 0, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0], dtype=uint8)
     """
     first = np.array([part.start for part in window])

@@ -1,6 +1,7 @@
 """What forms the tiles of one pair's image, whichever job does it: history, ground, plan and grid."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from apertura.image.candidates import Setting
 from apertura.image.engines import ENGINES
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.plan import Plan
-from apertura.image.tiles import form_tiles
+from apertura.image.tiles import Former, form_blocks
 from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.plan import plan_pair, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
@@ -28,6 +29,8 @@ class Work:
 
     Attributes
     ----------
+    folder
+        Where the stage will lie.
     echo
         The stage that image.json quotes.
     history
@@ -44,6 +47,7 @@ class Work:
         Tiles in work at once.
     """
 
+    folder: Path
     echo: xr.Dataset
     history: dict[str, Any]
     grid: SceneGrid
@@ -57,18 +61,21 @@ class Work:
     def of(cls, campaign: Campaign, flight: str, pair: str, *, threads: int) -> "Work":
         """Open what a pair's image is made from, and plan it."""
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-        grid, processing = scene_grid(campaign), campaign.settings.processing
+        grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
         history = {"echo": spectra_of(echo, processing.window), "profile": profiles_of(profile)}
-        plan = plan_pair(campaign, flight, pair, threads=threads)
-        heights = planned_heights(plan, open_heights(campaign), grid)
+        plan = plan_pair(campaign, flight, pair, threads=threads, echo=echo, heights=heights)
+        heights = planned_heights(plan, heights, grid)
+        # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
+        choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
         empty = stamped(
             _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
             "image",
             module=__name__,
             parents=[echo, profile, *heights.parents],
-            settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": plan.choices},
+            settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": choices},
         )
-        return cls(echo, history, grid, heights, plan, empty, list(grid.tiles(processing.tile_px)), threads)
+        folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(processing.tile_px))
+        return cls(folder, echo, history, grid, heights, plan, empty, windows, threads)
 
     def form(self, target: Any, setting: Setting, windows: list[Window], *, planned: bool = False) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.
@@ -86,16 +93,29 @@ class Work:
         """
         if not windows:
             return
-        engine, history = ENGINES[setting.engine], dict(self.history)
-        if planned:
-            history["profile"] = self.plan.history(history["profile"])
-        prepared = engine.prepare(history[engine.reads], **setting.options)
-        pulses = np.float32(len(self.history["echo"].transfer))
+        engine = ENGINES[setting.engine]
+        history = self.history[engine.reads]
+        if planned and engine.reads == "profile":
+            history = self.plan.history(history)
+        count = np.float32(len(self.history["echo"].transfer))
 
-        def mean(pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
-            return np.asarray(engine.form(prepared, pixels, **setting.form_options) / pulses, np.complex64)
+        def former(pulses: slice) -> Former:
+            prepared = engine.prepare(history.of_pulses(pulses), **setting.options)
+            return lambda pixels: np.asarray(
+                engine.form(prepared, pixels, **setting.form_options) / count, np.complex64
+            )
 
-        form_tiles(mean, self.grid, windows, write=target.__setitem__, threads=self.threads, heights=self.heights.of)
+        form_blocks(
+            former,
+            len(history.tx_position_m),
+            self.grid,
+            windows,
+            blocks=setting.pulse_blocks,
+            write=target.__setitem__,
+            scratch=self.folder.parent,
+            threads=self.threads,
+            heights=self.heights.of,
+        )
 
     def form_planned(self, target: Any, windows: list[Window]) -> None:
         """Form tiles as the plan says."""

@@ -18,9 +18,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
-    folder = campaign.stage("image", flight, pair)
     work = Work.of(campaign, flight, pair, threads=threads)
-    echo, plan = work.echo, work.plan
+    folder, echo, plan = work.folder, work.echo, work.plan
     with writing(folder) as wip:
         missing = tiles_missing(wip, work.empty, "image", work.windows)
         target = zarr.open_array(wip / "image", mode="r+")
@@ -61,13 +60,12 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     number, jobs = (int(part) for part in share.split("-of-"))
     if not 1 <= number <= jobs:
         raise ValueError(f"{share=}: must be one of 1-of-{jobs} to {jobs}-of-{jobs}")
-    folder = campaign.stage("image", flight, pair)
     work = Work.of(campaign, flight, pair, threads=threads)
     mine = work.windows[number - 1 :: jobs]
-    with sharing(folder, work.empty, "image", work.windows) as (wip, missing):
+    with sharing(work.folder, work.empty, "image", work.windows) as (wip, missing):
         todo = [window for window in mine if window in missing]
         if todo:
             work.form_planned(zarr.open_array(wip / "image", mode="r+"), todo)
-    receipt = folder.with_name("tiles") / f"{share}.json"
+    receipt = work.folder.with_name("tiles") / f"{share}.json"
     write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.plan.setting.line})
     return receipt

@@ -6,7 +6,7 @@ sum does not either.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,36 +71,82 @@ def _track(echo: xr.Dataset) -> Track:
     return Track(tx[len(tx) // 2], rx[len(rx) // 2], (tx[some], rx[some]))
 
 
-def _rasters(grid: SceneGrid, heights: Heights, tracks: Sequence[Track], *, threads: int) -> dict[str, Any]:
-    incidence, angle = (np.empty(grid.shape, np.float32) for _ in range(2))
-    mask = np.zeros(grid.shape, np.uint8)
-    whole = None if heights.of is None else heights.of((slice(0, grid.shape[0]), slice(0, grid.shape[1])))
-    relief = None if whole is None else Relief.of(grid, whole)
+@dataclass(frozen=True)
+class Layer:
+    """A raster whose blocks are computed when they are read: tiles of them, by some threads.
+
+    Attributes
+    ----------
+    grid
+        Its pixels.
+    dtype
+        Of the values.
+    of
+        Window of the grid → values (row, column).
+    threads
+        Tiles computed at once.
+    """
+
+    grid: SceneGrid
+    dtype: type[np.generic]
+    of: Callable[[Window], NDArray[Any]]
+    threads: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.grid.shape
+
+    def __getitem__(self, block: Window) -> NDArray[Any]:
+        """Return the values of a block of rows and columns."""
+        part = self.grid[block]
+        values = np.empty(part.shape, self.dtype)
+
+        def work(tile: Window) -> None:
+            rows, columns = (slice(at.start + by, at.stop + by) for at, by in zip(tile, part.first, strict=True))
+            values[tile] = self.of((rows, columns))
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, part.tiles(_TILE_PX)))
+        return values
+
+
+def _rasters(grid: SceneGrid, heights: Heights, tracks: Sequence[Track], *, threads: int) -> dict[str, Layer]:
+    relief = None if heights.of is None else Relief.of(grid, heights.of)
     looks = [tuple(antennas_over(grid, leg) for leg in track.looks) for track in tracks]
 
-    def look_at(window: Window) -> None:
-        position, normal = _surface(grid, whole, window)
-        incidence[window] = incidence_deg(position, normal, tracks[0].tx)
-        angle[window] = np.max([bistatic_angle_deg(position, track.tx, track.rx) for track in tracks], axis=0)
-        if relief is not None:
-            mask[window] = np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in looks])
+    def incidence(window: Window) -> NDArray[np.float64]:
+        return incidence_deg(*_surface(grid, heights, window), tracks[0].tx)
 
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(look_at, grid.tiles(_TILE_PX)))
-    return {"incidence.tif": incidence, "bistatic_angle.tif": angle, "mask.tif": mask}
+    def bistatic_angle(window: Window) -> NDArray[np.float64]:
+        position = grid[window].positions(None if heights.of is None else heights.of(window))
+        return np.asarray(np.max([bistatic_angle_deg(position, track.tx, track.rx) for track in tracks], axis=0))
+
+    def mask(window: Window) -> NDArray[np.uint8]:
+        if relief is None:
+            return np.zeros(grid[window].shape, np.uint8)
+        return np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in looks]))
+
+    return {
+        "incidence.tif": Layer(grid, np.float32, incidence, threads),
+        "bistatic_angle.tif": Layer(grid, np.float32, bistatic_angle, threads),
+        "mask.tif": Layer(grid, np.uint8, mask, threads),
+    }
 
 
-def _surface(
-    grid: SceneGrid, whole: NDArray[np.float64] | None, window: Window
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _surface(grid: SceneGrid, heights: Heights, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return positions and upward normals of a window; its neighbours count, so that tiles leave no seams."""
     around = [
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
         for part, size in zip(window, grid.shape, strict=True)
     ]
     row, column = np.meshgrid(*around, indexing="ij")
-    last = [size - 1 for size in grid.shape]
-    height = None if whole is None else whole[np.minimum(row, last[0]), np.minimum(column, last[1])]
+    height = None
+    if heights.of is not None:  # a grid of one row or column is continued level
+        known = [slice(axis[0], min(axis[-1] + 1, size)) for axis, size in zip(around, grid.shape, strict=True)]
+        found = heights.of((known[0], known[1]))
+        lacking = [(0, axis.size - size) for axis, size in zip(around, found.shape, strict=True)]
+        height = np.pad(found, lacking, mode="edge")
     position = grid.positions_at(row, column, height)
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
     return position[inner], surface_normals(position)[inner]

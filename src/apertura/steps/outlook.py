@@ -6,16 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.compression import window_weights
 from apertura.echo.demodulate import subcarrier_numbers
 from apertura.echo.geometry import phase_centres
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Spectra
 from apertura.ingest import PHASE_HISTORIES, TRACKS
-from apertura.settings import OfdmWaveform, PhaseHistoryWaveform
+from apertura.settings import OfdmWaveform
 from apertura.steps.history import spectra_of
 from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
@@ -23,11 +25,24 @@ from apertura.store import manifest_of, open_stage
 
 @dataclass(frozen=True)
 class Outlook:
-    """What is known of a pair's echo before it is formed, or after: phase centres (pulse, 3), band, prefix, spectra."""
+    """What is known of a pair's echo before it is formed, or after.
+
+    Attributes
+    ----------
+    tx, rx
+        (pulse, 3) float64, phase centres, metres.
+    frequency_hz, weight
+        (subcarrier,) float64, RF frequency and window.
+    path_limit_m
+        Longest total path inside the cyclic prefix.
+    spectra
+        The echo itself; None before it is formed.
+    """
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     frequency_hz: NDArray[np.float64]
+    weight: NDArray[np.float64]
     path_limit_m: float
     spectra: Spectra | None = None
 
@@ -40,20 +55,20 @@ def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
     return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
 
 
-def outlook_of(campaign: Campaign, flight: str, pair: str) -> Outlook:
-    """Return what is known of a pair: its echo where it is formed, else what the logs promise."""
-    folder = campaign.stage("echo", flight, pair)
+def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> Outlook:
+    """Return what is known of a pair: `echo`, its stage as far as it is formed, or what the logs promise."""
     waveform = campaign.settings.waveform
-    if manifest_of(folder).is_file():
-        echo = open_stage(folder, "echo")
-    elif isinstance(waveform, PhaseHistoryWaveform):
+    if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
+        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
+    if echo is None:
+        if isinstance(waveform, OfdmWaveform):
+            return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
         echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
-    else:
-        return _expected(campaign, flight, pair, waveform)
     spectra = spectra_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
-    return Outlook(spectra.tx_position_m, spectra.rx_position_m, spectra.frequency_hz, limit_m, spectra)
+    places = (spectra.tx_position_m, spectra.rx_position_m)
+    return Outlook(*places, spectra.frequency_hz, spectra.weight, limit_m, spectra)
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:
@@ -80,7 +95,8 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
         )
     numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
     frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
-    return Outlook(places[0], places[1], frequency, SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s)
+    weight = window_weights(campaign.settings.processing.window, len(frequency))
+    return Outlook(places[0], places[1], frequency, weight, SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s)
 
 
 def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:

@@ -1,11 +1,11 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
-import os
 import shutil
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -14,6 +14,7 @@ from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
+from apertura.image.budget import memory_limit, size_text
 from apertura.image.candidates import Signal
 from apertura.image.engines import reference
 from apertura.image.extent import swath
@@ -26,7 +27,7 @@ from apertura.steps.costs import campaign_costs
 from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
-from apertura.steps.terrain import Heights
+from apertura.steps.terrain import Heights, expected_heights
 from apertura.store import manifest_of
 
 OVERRIDES = (
@@ -36,6 +37,7 @@ OVERRIDES = (
     "phase_tolerance_rad",
     "accumulate",
     "pulse_thinning",
+    "pulse_blocks",
     "midpoint",
     "terrain",
 )
@@ -46,7 +48,15 @@ _BLOCKS = 33
 _CONTENT_PIXELS = 128
 
 
-def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
+def plan_pair(
+    campaign: Campaign,
+    flight: str,
+    pair: str,
+    *,
+    threads: int = 1,
+    echo: xr.Dataset | None = None,
+    heights: Heights | None = None,
+) -> Plan:
     """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran.
 
     Parameters
@@ -55,17 +65,22 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
         Which.
     threads
         Tiles formed at once: for seconds and bytes; nothing is chosen by it.
+    echo, heights
+        The pair's echo and the ground, where they are open already.
 
     Raises
     ------
     CampaignError
         If the job cannot fit in memory or on the disk, or its geometry is impossible.
     """
-    outlook = outlook_of(campaign, flight, pair)
+    outlook = outlook_of(campaign, flight, pair, echo=echo)
     grid = campaign_grid(campaign, outlook)
     processing = campaign.settings.processing
+    job = job_of(
+        outlook, grid, heights or expected_heights(campaign, grid), tile_px=processing.tile_px, threads=threads
+    )
     plan = make_plan(
-        replace(job_of(outlook, grid, tile_px=processing.tile_px, threads=threads), **_relief(campaign, grid)),
+        replace(job, memory_bytes=memory_limit(), **_relief(campaign, grid)),
         accuracy_db=processing.accuracy_db,
         costs=campaign_costs(campaign),
         overrides={name: getattr(processing, name) for name in OVERRIDES},
@@ -75,12 +90,12 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     return plan
 
 
-def job_of(outlook: Outlook, grid: SceneGrid, *, tile_px: int, threads: int) -> Job:
-    """Return the planner's job of a pair on a grid."""
+def job_of(outlook: Outlook, grid: SceneGrid, heights: Heights, *, tile_px: int, threads: int) -> Job:
+    """Return the planner's job of a pair on a grid and its ground."""
     rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
     frequency = outlook.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
-    nearest, farthest = swath(grid, outlook.tx, outlook.rx)
+    nearest, farthest = swath(grid, outlook.tx, outlook.rx, heights=heights.of)
     centre, count = centre_frequency(frequency), len(frequency)
     samples = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
     return Job(
@@ -92,19 +107,19 @@ def job_of(outlook: Outlook, grid: SceneGrid, *, tile_px: int, threads: int) -> 
         centre_hz=centre,
         bandwidth_hz=float(frequency[-1] - frequency[0]) * count / (count - 1),
         subcarriers=count,
-        signal=Signal(centre, length / count, step, samples),
+        signal=Signal(centre, length / count, step, samples, outlook.weight),
         frame="local" if grid.crs == LOCAL else "ecef",
         tile_px=tile_px,
         threads=threads,
         path_limit_m=outlook.path_limit_m,
-        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid),
+        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid, heights),
     )
 
 
-def _content_db(spectra: Spectra, grid: SceneGrid) -> float:
+def _content_db(spectra: Spectra, grid: SceneGrid, heights: Heights) -> float:
     """Return how much errors weigh at some random pixels of the scene."""
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
-    places = grid.positions_at(rows, columns)
+    places = grid.positions_at(rows, columns, heights.at(rows, columns))
     parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
     return content_loss_db(np.concatenate([reference.terms(spectra, places, pulses=part) for part in parts]))
 
@@ -159,21 +174,21 @@ def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | N
     where
         Flight and pair.
     memory
-        Bytes of this machine, by default what the operating system says.
+        Bytes, by default those of this machine or of the control group that the process runs in.
     """
-    memory = memory or os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = memory or memory_limit()
     if plan.memory_bytes > memory:
         raise CampaignError(
-            f"imaging needs {_size(plan.memory_bytes)} of memory",
+            f"imaging needs {size_text(plan.memory_bytes)} of memory",
             where=where,
-            expected=f"at most the {_size(memory)} of this machine",
-            remedy="Make scene.bounds_m smaller, use fewer threads, or a larger machine.",
+            expected=f"at most the {size_text(memory)} that this machine, or the job's share of it, has",
+            remedy="Make scene.bounds_m smaller, use fewer threads, or ask for more memory.",
         )
     if free_disk is not None and plan.disk_bytes > free_disk:
         raise CampaignError(
-            f"the results need {_size(plan.disk_bytes)} on disk",
+            f"the results need {size_text(plan.disk_bytes)} on disk",
             where=where,
-            expected=f"at most the {_size(free_disk)} that are free",
+            expected=f"at most the {size_text(free_disk)} that are free",
             remedy="Free some space, make scene.bounds_m smaller or scene.spacing_m larger.",
         )
 
@@ -189,13 +204,15 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
-    console.print(f"in all {seconds:.3g} s of imaging on {threads} threads, {_size(disk)} on disk before compression")
+    console.print(
+        f"in all {seconds:.3g} s of imaging on {threads} threads, {size_text(disk)} on disk before compression"
+    )
     free = shutil.disk_usage(campaign.root).free
     if disk > free and not campaign.results.is_dir():
         raise CampaignError(
-            f"the results of all pairs need {_size(disk)} on disk",
+            f"the results of all pairs need {size_text(disk)} on disk",
             where=campaign.root,
-            expected=f"at most the {_size(free)} that are free",
+            expected=f"at most the {size_text(free)} that are free",
             remedy="Free some space, or make the scene smaller.",
         )
 
@@ -208,15 +225,7 @@ def _table(plan: Plan, title: str, accuracy_db: float) -> Table:
         error = "" if decision.error_db is None else f"{decision.error_db:.1f} dB"
         table.add_row(decision.name, str(decision.value), decision.reason, error)
     table.add_section()
-    line = f"{plan.predicted_seconds:.3g} s, {_size(plan.memory_bytes)} of memory, {_size(plan.disk_bytes)} on disk"
-    line += f"; costs {plan.cost_source}"
+    memory, disk = size_text(plan.memory_bytes), size_text(plan.disk_bytes)
+    line = f"{plan.predicted_seconds:.3g} s, {memory} of memory, {disk} on disk; costs {plan.cost_source}"
     table.add_row("predicted", f"{accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
     return table
-
-
-def _size(count: float) -> str:
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if count < 1000 or unit == "TB":
-            break
-        count /= 1000
-    return f"{count:.3g} {unit}"

@@ -18,7 +18,7 @@ from apertura.image.terrain import Terrain
 from apertura.steps.ground import Ground
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
-from apertura.store import finish, open_stage, tiles_missing, writing
+from apertura.store import finish, manifest_of, open_stage, tiles_missing, writing
 
 
 def terrain(campaign: Campaign) -> Path:
@@ -136,3 +136,17 @@ def open_heights(campaign: Campaign) -> Heights:
     stage = open_stage(folder, "terrain")
     array = zarr.open_array(folder / "height", mode="r")
     return Heights((stage,), lambda window: np.asarray(array[window], np.float64))
+
+
+def expected_heights(campaign: Campaign, grid: SceneGrid) -> Heights:
+    """Return the ground as `open_heights`, or before stage `terrain` is made what it will hold; voids at the mean."""
+    if campaign.settings.scene.dem is None or manifest_of(campaign.stage("terrain")).is_file():
+        return open_heights(campaign)
+    source = Ground.of(campaign.settings.scene, campaign.root, crs=grid.crs).terrain
+    if source is None:
+        return Heights((), None)
+
+    def read(window: Window) -> NDArray[np.float64]:
+        return np.nan_to_num(source.heights(grid[window]), nan=grid.height_m)
+
+    return Heights((), read)

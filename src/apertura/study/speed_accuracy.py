@@ -93,21 +93,16 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     middle = len(outlook.tx) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
-    spectra = _block(outlook.spectra, block)
+    if outlook.spectra is None:
+        raise ValueError("the echo stage is not there")
+    spectra = outlook.spectra.of_pulses(block)
     outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra)
-    job = job_of(outlook, grid, tile_px=processing.tile_px, threads=1)
     heights = open_heights(campaign)
+    job = job_of(outlook, grid, heights, tile_px=processing.tile_px, threads=1)
     costs = _of_engines(read_costs())
     overrides = {name: getattr(processing, name) for name in OVERRIDES if name not in {"engine"}}
     plan = make_plan(job, accuracy_db=processing.accuracy_db, costs=costs, overrides=overrides)
-    profiles = replace(
-        profiles,
-        samples=profiles.samples[block],
-        start_m=profiles.start_m[block],
-        tx_position_m=outlook.tx,
-        rx_position_m=outlook.rx,
-    )
-    part = _part(spectra, profiles, grid, heights, whole=job.load)
+    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load)
     points = measure(part, plan, _settings(job, costs), seconds=seconds)
     size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
@@ -117,18 +112,6 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     draw_points(points, paths[1], title=title, accuracy_db=processing.accuracy_db)
     write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.accuracy_db)
     return paths
-
-
-def _block(spectra: Spectra | None, block: slice) -> Spectra:
-    if spectra is None:
-        raise ValueError("the echo stage is not there")
-    return replace(
-        spectra,
-        transfer=spectra.transfer[block],
-        reference_delay_s=spectra.reference_delay_s[block],
-        tx_position_m=spectra.tx_position_m[block],
-        rx_position_m=spectra.rx_position_m[block],
-    )
 
 
 def _part(spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load) -> Part:

@@ -85,7 +85,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2, pulse
         phase_form=design.phase_form,
         phase=design.phase,
         degree=degree,
-        error_db=design.error_db,
+        error_db=design.error_db(np.ones(1)),
     )
 
 

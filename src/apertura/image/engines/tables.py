@@ -15,6 +15,9 @@ MARGIN = 16  # empty cells at both ends, so that a look-up window may hang over
 # Sine terms, cosine terms, half turns taken off first: the forms of native/phase.hpp, cheapest first.
 PHASE_FORMS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 
+BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
+"""Where errors over the band are looked at, its edges at ±1: Chebyshev nodes, dense at the edges."""
+
 _LEAD = TAPS // 2 - 1  # taps before the sample at or before the cell's middle
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -73,8 +76,8 @@ class Plan:
         (up,) int32, sample of the first tap relative to the first of the `down` samples.
     phase_form, phase
         As in `Tables`.
-    error_db
-        As in `Tables`.
+    squared_error
+        (160,) float64, mean squared error of a frequency at each place of `BAND`, over the places in a cell.
     """
 
     up: int
@@ -83,7 +86,42 @@ class Plan:
     lead: NDArray[np.int32]
     phase_form: int
     phase: NDArray[np.float32]
-    error_db: float
+    squared_error: NDArray[np.float64]
+
+    def error_db(self, window: NDArray[np.float64]) -> float:
+        """Return the predicted RMS error on random pixels of echoes that a window weighs, as `band_error_db`."""
+        return band_error_db(self.squared_error, window)
+
+
+def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64]) -> float:
+    """Return the RMS error of a white echo under a window over its subcarriers, relative to what the window leaves.
+
+    Parameters
+    ----------
+    squared_error
+        (160,) float64, of a frequency at each place of `BAND`.
+    window
+        (subcarrier,) float64, weights from the lowest to the highest; their scale does not count.
+
+    Returns
+    -------
+    float
+        dB.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, eq. 1.
+
+    Examples
+    --------
+    >>> at_the_edges = 1e-6 * BAND**8
+    >>> [round(band_error_db(at_the_edges, window)) for window in (np.ones(64), np.hanning(64))]
+    [-70, -87]
+    """
+    count = len(window)
+    power = np.interp(BAND, (np.arange(count) - count // 2) * 2 / count, window**2)
+    power *= np.sqrt(1 - BAND**2)  # Chebyshev nodes → even over the band
+    return float(10 * np.log10((squared_error * power).sum() / power.sum()))
 
 
 def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
@@ -121,13 +159,13 @@ def plan(profile_oversampling: float, carrier_rad_per_sample: float, *, oversamp
     Examples
     --------
     >>> found = plan(2.0, 9.2, oversampling=6, degree=2)
-    >>> found.up, found.down, found.error_db < -74
+    >>> found.up, found.down, found.error_db(np.ones(1)) < -74
     (3, 1, True)
     """
     up, down = ratio(profile_oversampling, oversampling)
     starts = np.arange(up) * down / up
     whole = np.floor(starts)
-    omega = np.pi / profile_oversampling * np.cos(np.pi * (np.arange(160) + 0.5) / 160)  # dense at the band's edges
+    omega = np.pi / profile_oversampling * BAND
     ideal = np.exp(1j * omega * (starts - whole)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     basis = np.exp(1j * omega[:, None] * (np.arange(TAPS) - _LEAD))
     wanted = ideal.reshape(-1, omega.size).T
@@ -135,7 +173,7 @@ def plan(profile_oversampling: float, carrier_rad_per_sample: float, *, oversamp
     given = np.einsum("pkt,wt->pkw", taps, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     form, phase = _phase(carrier_rad_per_cell)
-    error = _error(
+    error = _squared_error(
         given,
         omega,
         starts - whole,
@@ -178,7 +216,7 @@ def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
     return PHASE_FORMS.index((sines, cosines, reduced)), phase
 
 
-def _error(
+def _squared_error(
     given: NDArray[np.complex128],
     omega: NDArray[np.float64],
     starts: NDArray[np.float64],
@@ -187,8 +225,8 @@ def _error(
     carrier_rad_per_cell: float,
     form: int,
     phase: NDArray[np.float32],
-) -> float:
-    """Return the RMS error in dB over band, place in the cell and position of the cell."""
+) -> NDArray[np.float64]:
+    """Return the mean squared error at each frequency, over place in the cell and position of the cell."""
     powers = _WITHIN ** np.arange(given.shape[1])[:, None]
     value = np.einsum("pkw,ku->pwu", given, powers)
     sines, cosines, reduced = PHASE_FORMS[form]
@@ -200,7 +238,4 @@ def _error(
     carrier = sign * (cosine + 1j * sine)
     place = starts[:, None, None] + samples_per_cell * _WITHIN
     truth = np.exp(1j * omega[:, None] * place) * np.exp(1j * carrier_rad_per_cell * _WITHIN)
-    flat = np.sqrt(np.clip(1 - (omega / np.abs(omega).max()) ** 2, 0, 1))  # Chebyshev nodes → uniform band
-    weight = flat[:, None] * _WITHIN_WEIGHTS
-    error = np.abs(value * carrier - truth) ** 2
-    return float(10 * np.log10((error * weight).sum() / (weight.sum() * starts.size)))
+    return np.asarray((np.abs(value * carrier - truth) ** 2 @ _WITHIN_WEIGHTS).mean(axis=0))
