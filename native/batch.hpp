@@ -153,22 +153,27 @@ inline void add_form(const ApertureJob& job, const Patch& patch, const Batch& ba
       const float* window = batch.row[q] + batch.window[q][group];
       const Stretch<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
       const Stretch<kWide> re2(kDegree == 2 ? window + 4 * width : window), im2(kDegree == 2 ? window + 5 * width : window);
+      Lanes u[kVectors];  // all places before the first look-up, so that no vector waits for its own
+      Whole index[kVectors];
 #pragma GCC unroll 4
       for (int v = 0; v < kVectors; v++) {
-        const int b = group + v / kParts, part = v % kParts * kLanes;
-        const Lanes t = place_pixels<kTerrain, kForm>(patch, batch, q, b, part);
-        const Lanes moved = t + kMagic, u = t - (moved - kMagic);
-        const Whole index = (Whole)moved;
-        Lanes vr = re1[index], vi = im1[index], cosine, sine;
-        if constexpr (kDegree == 2) vr += u * re2[index], vi += u * im2[index];
-        vr = re0[index] + u * vr, vi = im0[index] + u * vi;
+        const Lanes t = place_pixels<kTerrain, kForm>(patch, batch, q, group + v / kParts, v % kParts * kLanes);
+        const Lanes moved = t + kMagic;
+        u[v] = t - (moved - kMagic), index[v] = (Whole)moved;
+      }
+#pragma GCC unroll 4
+      for (int v = 0; v < kVectors; v++) {
+        Lanes vr = re1[index[v]], vi = im1[index[v]], cosine, sine;
+        if constexpr (kDegree == 2) vr += u[v] * re2[index[v]], vi += u[v] * im2[index[v]];
+        vr = re0[index[v]] + u[v] * vr, vi = im0[index[v]] + u[v] * vi;
         if constexpr (kForm == kWeighted) {
+          const int b = group + v / kParts, part = v % kParts * kLanes;
           Lanes weight = load(kLaneX + part) * batch.weight_x[q][b] + load(kLaneY + part) * batch.weight_y[q][b] +
                          batch.weight[q][b];
           if constexpr (kTerrain) weight += load(patch.rise + b * 16 + part) * batch.weight_h[q];
           vr *= weight, vi *= weight;
         }
-        phase(u, cosine, sine);
+        phase(u[v], cosine, sine);
         re[v] += vr * cosine, im[v] += vr * sine;
         re[v] -= vi * sine, im[v] += vi * cosine;
       }

@@ -188,6 +188,16 @@ def test_any_size_of_tile_will_do(isa, size):
     assert error_db(scene, pixels, image) <= -70
 
 
+@pytest.mark.parametrize("size", [(1, 1), (17, 3)])
+@pytest.mark.parametrize("rough_m", [0.0, 0.03])
+def test_one_pulse_will_do(isa, size, rough_m):
+    pixels = grid(*size)
+    pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal(size)
+    scene = fly(scatter(grid(40, 40)), pulses=1)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
+    assert error_db(scene, pixels, image) <= -70
+
+
 def test_splitting_into_tiles_changes_nothing_to_the_bit(isa, plain):
     _, pixels, profiles = plain
     tables, places = native.prepare(profiles), ecef(pixels)
@@ -238,6 +248,36 @@ def test_a_crooked_surface_goes_the_exact_way(isa):
     counts = np.zeros(4, np.int64)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
     assert counts[2] == counts.sum()
+    assert error_db(scene, pixels, image) <= -70
+
+
+@pytest.mark.parametrize(("range_m", "rough_m"), [(12, 3.0), (2000, 1.5)])  # beyond the series; beyond the window alone
+def test_heights_that_leave_the_windows_are_taken_one_by_one(isa, range_m, rough_m):
+    pixels = grid(33, 21, range_m=range_m)
+    pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((33, 21))
+    scene = fly(scatter(pixels), range_m=range_m)
+    counts = np.zeros(4, np.int64)
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
+    assert error_db(scene, pixels, image) <= -70
+    assert counts[2] == counts.sum()
+
+
+def test_rough_tiles_have_the_same_bits(isa):
+    pixels = grid(40, 56)
+    pixels[..., 2] = 0.02 * np.random.default_rng(6).standard_normal((40, 56))
+    tables = native.prepare(fly(scatter(pixels)).profiles(ecef(pixels)))
+    whole, part = native.form(tables, ecef(pixels)), native.form(tables, ecef(pixels)[16:, 32:])
+    np.testing.assert_array_equal(part.view(np.uint32), whole[16:, 32:].view(np.uint32))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 3)])
+def test_a_pixel_at_a_phase_centre_is_formed_like_any_other(isa, size):
+    antenna = (fly(np.zeros((1, 3)), pulses=3).tx[1] - PLACE) @ AXES
+    pixels = grid(*size) - grid(*size)[0, 0] + antenna
+    scene = fly(scatter(grid(40, 40)) - grid(40, 40)[0, 0] + antenna, pulses=3, bistatic=False)
+    assert np.linalg.norm(ecef(pixels)[0, 0] - scene.tx[1]) < 1e-8
+    image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
+    assert np.isfinite(image).all()
     assert error_db(scene, pixels, image) <= -70
 
 
@@ -331,10 +371,11 @@ def test_a_pulse_counts_only_where_its_profile_reaches(isa, plain):
     assert np.all(np.isfinite(image))
 
 
-def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(isa, plain):
+@pytest.mark.parametrize("nowhere", [np.nan, np.inf, -np.inf])
+def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(isa, plain, nowhere):
     scene, pixels, profiles = plain
     places = ecef(pixels)
-    places[20, 21] = np.nan
+    places[20, 21] = nowhere
     image = native.form(native.prepare(profiles), places)
     assert np.argwhere(np.isnan(image)).tolist() == [[20, 21]]
     image[20, 21] = scene.exact(ecef(pixels)[20, 21][None])[0]
