@@ -85,13 +85,14 @@ def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--campaigns", type=int, default=30)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first campaign")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--pulses", type=int, default=400)
     asked = parser.parse_args()
     warm = draw(np.random.default_rng(999), pixels=16, pulses=8)
     numba.form(numba.prepare(warm.profiles), warm.grid.positions())
     ratios, redone, missed = [], 0, 0
-    for seed in range(asked.campaigns):
+    for seed in range(asked.first, asked.first + asked.campaigns):
         drawn = draw(np.random.default_rng(seed), pixels=asked.size, pulses=asked.pulses)
         chosen, errors_db, ratio, best = compare(drawn)
         ratios.append(ratio)

@@ -39,7 +39,7 @@ def test_the_planners_choice_and_the_reference_are_there_however_short_the_time(
 
 
 def test_measured_errors_are_no_worse_than_predicted(charted):
-    """Predictions hold for a flat spectrum; this one has a window, and a few targets."""
+    """Predictions hold for white echoes; these are of a few targets."""
     for row in charted[1]:
         if row["engine"] != "reference":
             assert float(row["error_db"]) <= float(row["predicted_error_db"]) + 9

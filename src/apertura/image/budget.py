@@ -11,9 +11,9 @@ from apertura.image.models import Decision
 from apertura.image.plan import Job
 from apertura.image.thinning import Presum
 
-_BASE_BYTES = 300_000_000  # the interpreter and its libraries
+_BASE_BYTES = 350_000_000  # the interpreter and its libraries
 _TILE_BYTES = 150  # per pixel in work: positions, their projection, the sum
-_READ_BYTES = 3  # per byte of an array while it is read: as stored, as decoded, and where it goes
+_READ_BYTES = 3  # per byte of an array while it is read (as stored, as decoded, where it goes) or summed in float64
 _SUM_BYTES = 8  # per pixel of the sum of pulse blocks, in a file
 _LEAST_PULSES = 64  # of a block: the kernel sums that many at a time
 _PRODUCT_BYTES = 60  # per pixel: image, its part of the cube, three rasters with overviews, before compression
@@ -90,7 +90,7 @@ def block_decision(chosen: Setting, job: Job, *, asked: bool) -> Decision:
 def bytes_needed(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int, int]:
     """Return peak memory of the imaging step, and what the pair leaves on disk, bytes."""
     echo, profile = _history_bytes(job)
-    reading = max(_READ_BYTES * echo, echo + _READ_BYTES * profile)
+    reading = max(_READ_BYTES * echo + profile, echo + _READ_BYTES * profile)
     forming = _forming_bytes(job, presum) + chosen.table_bytes // chosen.pulse_blocks
     disk = echo + profile + _PRODUCT_BYTES * job.load.pixels
     return max(_BASE_BYTES + reading, forming), disk + (_SUM_BYTES * job.load.pixels if chosen.pulse_blocks > 1 else 0)

@@ -18,7 +18,7 @@ OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
     1: (4, 5, 6, 8, 10, 12, 16, 20, 24, 32),
     2: (2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20),
 }
-TOLERANCES_RAD = (1.5e-3, 5e-4, 1.5e-4, 5e-5, 1.5e-5)
+TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
 NUMBA_OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
 WIDE_SUM_DB = -105.0

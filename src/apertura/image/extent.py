@@ -15,6 +15,8 @@ from apertura.image.grid import LOCAL, SceneGrid
 GRAZING_LIMIT_DEG = 10.0
 """Ground seen at a lower grazing angle than this is left out of automatic bounds."""
 
+_PULSES_AT_ONCE = 256
+
 CELLS_PER_PIXEL = 3.0
 """Pixels per finest resolution cell; 2 would be Nyquist for a band-limited magnitude."""
 
@@ -163,8 +165,12 @@ def swath(
         low, high = np.array([[(height := heights(block)).min(), height.max()] for block in blocks]).T
     radius = np.sqrt((across**2).sum(axis=1) + ((high - low) / 2) ** 2)
     net = grid.positions_at(centre[:, 0], centre[:, 1], (low + high) / 2)
-    path = sum(np.linalg.norm(net - antenna[:, None], axis=-1) for antenna in (tx, rx))
-    return np.asarray((path - 2 * radius).min(axis=1)), np.asarray((path + 2 * radius).max(axis=1))
+    nearest, farthest = np.empty((2, len(tx)))
+    for first in range(0, len(tx), _PULSES_AT_ONCE):
+        pulses = slice(first, first + _PULSES_AT_ONCE)
+        path = sum(np.linalg.norm(net - antenna[pulses, None], axis=-1) for antenna in (tx, rx))
+        nearest[pulses], farthest[pulses] = (path - 2 * radius).min(axis=1), (path + 2 * radius).max(axis=1)
+    return nearest, farthest
 
 
 def clearance(

@@ -87,7 +87,7 @@ def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slic
         for centre in (spectra.tx_position_m, spectra.rx_position_m)
     )
     delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[pulses, None]
-    total = _polynomial(weighted.astype(np.complex128), np.exp(2j * np.pi * (step * delay % 1.0)))
+    total = _polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
     return np.asarray(total * np.exp(2j * np.pi * (frequency[0] * delay % 1.0)))
 
 
