@@ -76,6 +76,7 @@ rule image:
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
         campaign.terrain_sources(),
+        lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
     output:
         "results/{flight}/{pair}/image.manifest.json",
         "results/{flight}/{pair}/image.json",
@@ -89,7 +90,7 @@ rule image:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        settings=campaign.relevant("image"),
+        settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
         code=code_sha256("apertura.steps.image"),
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"

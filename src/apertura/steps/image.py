@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.contracts import Window
+from apertura.image.beam import Beams
 from apertura.image.candidates import Setting
 from apertura.image.certificate import Certificate, certified_pixels
 from apertura.image.engines import ENGINES, reference
@@ -21,6 +22,8 @@ from apertura.image.plan import Plan
 from apertura.image.planner import ladder
 from apertura.image.quality import coherence_factor, survey
 from apertura.image.tiles import form_tiles
+from apertura.provenance import sha256_file
+from apertura.steps.antennas import antennas_report, beams_of, body_axes
 from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.plan import plan_pair, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
@@ -47,14 +50,16 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         "image",
         module=__name__,
         parents=[echo, profile, *heights.parents],
-        settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": plan.choices},
+        inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
+        settings={**campaign.relevant("image", pair), "grid": grid_spec(grid), "plan": plan.choices},
     )
     windows = list(grid.tiles(processing.tile_px))
     with writing(folder) as wip:
         missing = tiles_missing(wip, empty, "image", windows)
         print(f"{pair}: {len(missing)} of {len(windows)} tiles to form with {plan.setting.line}", flush=True)
         target = zarr.open_array(wip / "image", mode="r+")
-        work = Work(history, grid, heights, target, threads)
+        beams = beams_of(campaign, pair, body_axes(echo))
+        work = Work(history, grid, heights, target, threads, beams)
         work.form(plan.setting, missing, prepared_for=plan)
         quality = {
             "engine": plan.engine,
@@ -64,6 +69,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **_measures(work, windows),
             **{name: echo.attrs[name] for name in ("pulses", "sidelink", "clock", "calibration") if name in echo.attrs},
             **heights.report,
+            **antennas_report(campaign, pair, plan.illumination),
         }
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}
         zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
@@ -81,6 +87,7 @@ class Work:
     heights: Heights
     target: Any
     threads: int
+    beams: Beams | None = None
 
     def form(self, setting: Setting, windows: list[Window], *, prepared_for: Plan | None = None) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.
@@ -96,7 +103,9 @@ class Work:
         pulses = np.float32(len(self.history["echo"].transfer))
 
         def mean(pixels: NDArray[np.float64]) -> NDArray[np.complex64]:
-            return np.asarray(engine.form(prepared, pixels, **setting.form_options) / pulses, np.complex64)
+            return np.asarray(
+                engine.form(prepared, pixels, beams=self.beams, **setting.form_options) / pulses, np.complex64
+            )
 
         form_tiles(
             mean, self.grid, windows, write=self.target.__setitem__, threads=self.threads, heights=self.heights.of
@@ -111,7 +120,7 @@ def _certified(work: Work, windows: list[Window], better: tuple[Setting, ...], a
     """Measure the error; redo tiles that are worse than asked with the next better settings."""
     spectra = work.history["echo"]
     pixels = certified_pixels(work.target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
-    exact = reference.form(spectra, work.places(*pixels.T)) / len(spectra.transfer)
+    exact = reference.form(spectra, work.places(*pixels.T), beams=work.beams) / len(spectra.transfer)
     certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
     redone: list[dict[str, Any]] = []
     for choice in better:
@@ -140,7 +149,7 @@ def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
     peak = find_peak(work.target, found.row, found.column)
     x, y = ground_position(grid, peak)
     spectra: Spectra = work.history["echo"]
-    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])))
+    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])), work.beams)
     along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)
     cuts = {
         name: cut_through(work.target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
@@ -153,7 +162,7 @@ def _measures(work: Work, windows: list[Window]) -> dict[str, Any]:
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(terms[:, 0]),
+            "coherence_factor": coherence_factor(terms[terms[:, 0] != 0, 0]),
             **{
                 f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
                 for name, cut in cuts.items()

@@ -14,6 +14,7 @@ from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
+from apertura.image.beam import Beams
 from apertura.image.candidates import Signal
 from apertura.image.cost import read_costs
 from apertura.image.engines import reference
@@ -23,6 +24,7 @@ from apertura.image.history import Spectra
 from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
+from apertura.steps.antennas import lit
 from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
@@ -65,7 +67,11 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     grid = campaign_grid(campaign, outlook)
     processing = campaign.settings.processing
     plan = make_plan(
-        replace(job_of(outlook, grid, tile_px=processing.tile_px, threads=threads), **_relief(campaign, grid)),
+        replace(
+            job_of(outlook, grid, tile_px=processing.tile_px, threads=threads),
+            **_relief(campaign, grid),
+            **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
+        ),
         accuracy_db=processing.accuracy_db,
         costs=read_costs(),
         overrides={name: getattr(processing, name) for name in OVERRIDES},
@@ -97,16 +103,16 @@ def job_of(outlook: Outlook, grid: SceneGrid, *, tile_px: int, threads: int) -> 
         tile_px=tile_px,
         threads=threads,
         path_limit_m=outlook.path_limit_m,
-        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid),
+        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid, outlook.beams),
     )
 
 
-def _content_db(spectra: Spectra, grid: SceneGrid) -> float:
+def _content_db(spectra: Spectra, grid: SceneGrid, beams: Beams | None) -> float:
     """Return how much errors weigh at some random pixels of the scene."""
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
     places = grid.positions_at(rows, columns)
     parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
-    return content_loss_db(np.concatenate([reference.terms(spectra, places, pulses=part) for part in parts]))
+    return content_loss_db(np.concatenate([reference.terms(spectra, places, beams, pulses=part) for part in parts]))
 
 
 def _relief(campaign: Campaign, grid: SceneGrid) -> dict[str, Any]:
