@@ -104,9 +104,10 @@ def _refuse(
     places: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
     """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
-    lines = []
+    stated = campaign.antennas(pair)
+    keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
     legs = {"radar_tx": (beams.transmit, places[0]), "radar_rx": (beams.receive, places[1])}
-    for point, (node, _) in campaign.antennas(pair).items():
+    for point, (node, _) in stated.items():
         beam, place = legs[point]
         if beam is None:
             continue
@@ -120,7 +121,7 @@ def _refuse(
         )
     raise CampaignError(
         f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
-        where="config/config.yaml: nodes.<node>.antennas",
+        where=f"config/config.yaml: {', '.join(keys)}",
         expected="a scene that both antennas of some pulse see",
         remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
         "log's yaw (clockwise from north) and scene.bounds_m.",
