@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_33_planner import COSTS, compiled, job, net, plan, track
+from test_33_planner import COSTS, compiled, draw, job, net, plan, track
 
 from apertura.errors import CampaignError
 from apertura.geodesy import body_axes
 from apertura.image.beam import Beam, Beams
 from apertura.image.cost import seconds
-from apertura.image.engines import native
+from apertura.image.engines import ENGINES, native, reference
 from apertura.image.illumination import Footprint, footprint, illuminate
 from apertura.image.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
+from apertura.image.planner import make_plan
+from apertura.image.quality import numerical_error
 
 
 def side(width_deg=(40.0, 60.0), *, boresight_deg=(-90.0, -25.0), pulses=300, cutoff_db=-20.0):
@@ -130,3 +132,34 @@ def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
     fine = plan(-100.0, **jobs(beams))
     assert fine.engine != "native"
     assert fine.setting.error_db <= -100
+
+
+def aimed(position_m, middle_m, width_deg):
+    """A beam on a level body that flies along the track, aimed at the scene's middle from the middle of the track."""
+    ahead = (position_m[-1] - position_m[0]) * [1, 1, 0]
+    ahead /= np.linalg.norm(ahead)
+    body = np.stack([ahead, np.cross(ahead, [0, 0, 1.0]), [0, 0, -1.0]], 1)
+    forward, right, down = (middle_m - position_m[len(position_m) // 2]) @ body
+    boresight_deg = np.degrees([np.arctan2(right, forward), np.arctan2(-down, np.hypot(forward, right))])
+    angle, gain = gaussian_cut(width_deg, cutoff_db=-20.0, limit_rad=np.pi / 2)
+    axes = antenna_axes(np.broadcast_to(body, (len(position_m), 3, 3)), tuple(boresight_deg))
+    return Beam(axes, angle, gain, angle, gain)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+@pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
+def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):
+    drawn = draw(np.random.default_rng(seed), pixels=64, pulses=90)
+    tx, rx = drawn.job.tx_position_m, drawn.job.rx_position_m
+    middle = drawn.job.place_m[len(drawn.job.place_m) // 2]
+    across_deg = np.degrees(64 * drawn.grid.spacing_m / np.linalg.norm(middle - tx[45]))
+    beams = Beams(*(aimed(position, middle, min(60.0, widths * across_deg)) for position in (tx, rx)))
+    lit = illuminate(beams, tx, rx, drawn.job.place_m)
+    found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db, costs=COSTS)
+    engine = ENGINES[found.engine]
+    history = {"echo": drawn.spectra, "profile": found.history(drawn.profiles)}[engine.reads]
+    places = drawn.grid.positions()
+    image = engine.form(engine.prepare(history, **found.options), places, beams=beams, **found.form_options)
+    some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
+    exact = reference.form(drawn.spectra, places[some], beams=beams)
+    assert numerical_error(image[some].astype(np.complex64), exact).rms_db <= drawn.accuracy_db
