@@ -64,6 +64,23 @@ inline void face(const BeamJob& beam, const double* antenna, const ApertureJob& 
   }
 }
 
+// Marks pulses whose patch lies outside the narrowest cone about the boresight that holds the pattern: no angle is taken.
+inline void pass_over(const BeamJob& beam, const Facing& to, int32_t* dark) {
+  float edge[2];
+  for (int which = 0; which < 2; which++) {
+    const double first = beam.first_rad[which], last = first + double(beam.count[which] - 1) / beam.samples_per_rad[which];
+    edge[which] = __builtin_cosf(float(last < -first ? -first : last));
+  }
+  const float widest = edge[0] < 0 ? edge[0] : edge[0] * (edge[1] < 0 ? 0 : edge[1]);
+  const auto length = [](const float (*v)[kBatch], int q) {
+    return __builtin_sqrtf(v[0][q] * v[0][q] + v[1][q] * v[1][q] + v[2][q] * v[2][q]);
+  };
+  for (int q = 0; q < kBatch; q++) {
+    const float far = length(to.along, q), reach = length(to.step_x, q) + length(to.step_y, q) + length(to.up, q);
+    dark[q] |= to.along[0][q] + reach < widest * (widest < 0 ? far + reach : far - reach) - 1e-3f * far;
+  }
+}
+
 // Gains at the nodes of a patch, and the angles they span.
 inline void view(const BeamJob& beam, const Patch& patch, const Facing& to, View& out) {
   for (int node = 0; node < (patch.terrain ? kNodes : 9); node++) {
@@ -138,22 +155,30 @@ inline bool spread(const Patch& patch, const float* g, float peak, int q, Batch&
 // Weights of eight pulses over the blocks of a patch, and how each may be taken.
 inline void weigh(const ApertureJob& job, const Patch& patch, int64_t pulse, Batch& batch, Sight* sight) {
   View seen;
-  Facing to;
+  Facing to[2];
   float peak = 1;
-  for (int node = 0; node < kNodes; node++)
-    for (int q = 0; q < kBatch; q++) seen.gain[node][q] = 1;
+  int lit = 0;
   for (int q = 0; q < kBatch; q++) seen.dark[q] = 0, seen.smooth[q] = 1;
   for (int leg = 0; leg < 2; leg++)
     if (const BeamJob* beam = job.beam[leg]) {
-      face(*beam, leg ? job.receiver : job.transmitter, job, patch, pulse, to);
-      view(*beam, patch, to, seen);
-      judge(*beam, to, seen);
+      face(*beam, leg ? job.receiver : job.transmitter, job, patch, pulse, to[leg]);
+      pass_over(*beam, to[leg], seen.dark);
+    }
+  for (int q = 0; q < kBatch; q++) sight[q] = kDark, lit |= patch.crooked || !seen.dark[q];
+  if (!lit) return;
+  for (int node = 0; node < kNodes; node++)
+    for (int q = 0; q < kBatch; q++) seen.gain[node][q] = 1;
+  for (int leg = 0; leg < 2; leg++)
+    if (const BeamJob* beam = job.beam[leg]) {
+      view(*beam, patch, to[leg], seen);
+      judge(*beam, to[leg], seen);
       peak *= float(beam->peak);
     }
   for (int q = 0; q < kBatch; q++) {
     float g[kNodes];
     for (int node = 0; node < kNodes; node++) g[node] = seen.gain[node][q];
-    sight[q] = seen.dark[q] ? kDark : seen.smooth[q] && spread(patch, g, peak, q, batch) ? kSmooth : kRough;
+    if (patch.crooked || !seen.dark[q])
+      sight[q] = seen.smooth[q] && spread(patch, g, peak, q, batch) ? kSmooth : kRough;
   }
 }
 
@@ -181,8 +206,10 @@ template <bool kTerrain>
 inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
   Aim aim;
   Sight sight[kBatch];
-  aim_at<kTerrain>(job, patch, pulse, aim);
   weigh(job, patch, pulse, batch, sight);
+  bool lit = false;
+  for (int q = 0; q < pulses; q++) lit |= sight[q] != kDark;
+  if (lit) aim_at<kTerrain>(job, patch, pulse, aim);
   for (int form = 0; form < kForms; form++) batch.count[form] = 0;
   for (int q = 0; q < pulses; q++) {
     Form form = kExact;

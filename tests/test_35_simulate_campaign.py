@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 
 from apertura.errors import CampaignError
 from apertura.geodesy import ecef_from_geodetic, ecef_from_projected
+from apertura.simulate.antenna import Antenna
 from apertura.simulate.campaign import write_campaign
 from apertura.simulate.continuous import continuous_blocks, pulse_samples
 from apertura.simulate.flight import Straight, follow_log, phase_centre, wobble
@@ -325,6 +326,32 @@ def test_lever_arms_turn_with_the_node():
     east = Straight((0.0, 0.0, 5.0), (1.0, 0.0, 0.0))  # nose east: forward is east, right is south
     arm = ORIGIN.enu(phase_centre(ORIGIN, east, np.zeros(1), (1.0, 2.0, 0.5)))[0]
     assert_allclose(arm, [1.0, -2.0, 4.5], atol=1e-5)  # the ellipsoid's normal turns by 1e-6 rad
+
+
+def test_an_echo_is_as_strong_as_both_antennas_see_its_target():
+    """Level antennas that look left of a flight eastward: bearings and depressions are those of a map."""
+    plain = small_simulation()
+    beams = {
+        "a": {"radar_tx": Antenna((-90.0, 0.0), (30.0, 40.0))},
+        "b": {"radar_rx": Antenna((270.0, 0.0), (50.0, 90.0))},
+    }
+    looking = replace(plain, nodes=tuple(replace(node, antennas=beams[node.name]) for node in plain.nodes))
+    scatterers = plain.scene.scatterers(np.random.default_rng(0))
+    amplitude = {
+        name: fly(simulation, simulation.flights[0], scatterers, np.random.default_rng(0))["b"]
+        .channels["radar"]
+        .paths.amplitude
+        for name, simulation in (("plain", plain), ("looking", looking))
+    }
+    gain = 1.0
+    for name, widths in (("a", (30, 40)), ("b", (50, 90))):
+        path = plain.flights[0].paths[name].position(np.arange(6) / 500.0)
+        east, north, up = np.moveaxis(ORIGIN.enu(scatterers.position_m)[None] - path[:, None], -1, 0)
+        bearing, above = np.degrees(np.arctan2(east, north)), np.degrees(np.arctan2(up, np.hypot(east, north)))
+        db = -12.0412 * ((bearing / widths[0]) ** 2 + (above / widths[1]) ** 2)
+        gain = gain * 10 ** (db / 20)
+    assert gain.max() / gain.min() > 1.2
+    assert_allclose(amplitude["looking"] / amplitude["plain"], gain, rtol=1e-3)
 
 
 def test_a_wobbling_flight_has_the_spread_asked_for_and_its_log_resolves_it():

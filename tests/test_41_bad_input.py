@@ -163,6 +163,65 @@ def test_a_lever_arm_with_a_log_that_holds_no_attitude_is_refused(tiny):
     assert "uav1.track" in message
 
 
+BEAM = {"boresight_deg": [90, -20], "beamwidth_deg": [40, 60]}
+
+
+def stating(antenna, node="uav1"):
+    return lambda document: document["nodes"][node].update(antennas={"radar_rx": antenna})
+
+
+def test_a_beam_without_attitude_is_refused(tiny):
+    edit_config(tiny, stating(BEAM, "uav2"))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "nodes.uav2: antennas has a beam but attitude is none" in message
+    assert "set attitude to log or course" in message
+
+
+def test_a_beam_with_a_log_that_holds_no_attitude_is_refused(tiny):
+    zero = {"radar_tx": [0, 0, 0], "radar_rx": [0, 0, 0], "sidelink": [0, 0, 0]}
+    edit_config(tiny, stating(BEAM))
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m=zero))
+    edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+    assert "an antenna's beam but no attitude (attitude: log)" in message
+
+
+@pytest.mark.parametrize(
+    ("antenna", "expected"),
+    [
+        ({"beamwidth_deg": [40, 60]}, "nodes.uav1.antennas.radar_rx.boresight_deg: missing"),
+        (
+            BEAM | {"boresight_deg": [90, -120]},
+            "radar_rx.boresight_deg.1: Input should be greater than or equal to -90",
+        ),
+        (BEAM | {"beamwidth_deg": [40, 0]}, "radar_rx.beamwidth_deg.1: Input should be greater than 0"),
+        (BEAM | {"pattern": "p.csv"}, "radar_rx: give either beamwidth_deg, [azimuth, elevation], or pattern"),
+        ({"boresight_deg": [90, 0]}, "radar_rx: give either beamwidth_deg, [azimuth, elevation], or pattern"),
+        (BEAM | {"cutoff_db": 20}, "radar_rx.cutoff_db: Input should be less than or equal to -3 (found 20)"),
+        (BEAM | {"cutof_db": -20}, "radar_rx.cutof_db: unknown key (did you mean 'cutoff_db'?)"),
+    ],
+)
+def test_an_antenna_that_is_none_is_named(tiny, antenna, expected):
+    edit_config(tiny, stating(antenna))
+    assert expected in complaint(lambda: Campaign.load(tiny))
+
+
+def test_a_missing_pattern_is_named_with_its_key(tiny):
+    edit_config(tiny, stating({"boresight_deg": [90, -20], "pattern": "config/horn.csv"}))
+    message = complaint(Campaign.load(tiny).check_files)
+    assert "config/horn.csv: no such file" in message
+    assert "nodes.uav1.antennas.radar_rx.pattern" in message
+
+
+def test_phase_history_has_no_attitude_for_a_beam(tiny):
+    waveform = {"kind": "phase_history", "format": "afrl_mat"}
+    edit_config(tiny, stating(BEAM))
+    edit_config(tiny, lambda document: document.update(waveform=waveform))
+    assert "nodes.uav1.antennas has a beam, but phase history" in complaint(lambda: Campaign.load(tiny))
+
+
 def test_bounds_outside_the_area_of_use_are_refused(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m=[5e6, 0.0, 5e6 + 6.0, 6.0]))
     message = complaint(lambda: scene.scene(Campaign.load(tiny)))

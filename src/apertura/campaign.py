@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from apertura.errors import CampaignError
 from apertura.flights import FLIGHTS, Flight, read_flights
-from apertura.settings import OfdmWaveform, Settings
+from apertura.settings import Antenna, OfdmWaveform, Settings
 
 CONFIG = Path("config/config.yaml")
 
@@ -95,18 +95,36 @@ class Campaign:
         scene = self.settings.scene
         return {role: self.root / name for role, name in (("dem", scene.dem), ("geoid", scene.geoid)) if name}
 
+    def antennas(self, pair: str) -> dict[str, tuple[str, Antenna]]:
+        """Return which antennas of a pair have beams: radar_tx, radar_rx → node and antenna."""
+        nodes = zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True)
+        found = {point: (name, getattr(self.settings.nodes[name].antennas, point)) for point, name in nodes}
+        return {point: (name, antenna) for point, (name, antenna) in found.items() if antenna is not None}
+
+    def pattern_files(self, pair: str) -> dict[str, Path]:
+        """Return key of the config → file of each sampled pattern of a pair's antennas."""
+        return {
+            f"nodes.{node}.antennas.{point}.pattern": self.root / antenna.pattern
+            for point, (node, antenna) in self.antennas(pair).items()
+            if antenna.pattern
+        }
+
     def check_files(self) -> None:
-        """Raise CampaignError unless every file that flights.tsv promises is there."""
+        """Raise CampaignError unless every file that flights.tsv or the config promises is there."""
         for flight in self.flights:
             for node in flight.nodes:
                 self.raw_files(flight.name, node)
-        for role, path in self.height_files().items():
+        named = {f"scene.{role}": path for role, path in self.height_files().items()}
+        for flight in self.image_flights:
+            for pair in flight.pairs:
+                named |= self.pattern_files(pair)
+        for key, path in named.items():
             if not path.is_file():
                 raise CampaignError(
                     "no such file",
                     where=path,
-                    expected=f"the file of config/config.yaml: scene.{role}",
-                    remedy=f"Copy it there, or correct scene.{role}.",
+                    expected=f"the file of config/config.yaml: {key}",
+                    remedy=f"Copy it there, or correct {key}.",
                 )
         waveform = self.settings.waveform
         if isinstance(waveform, OfdmWaveform) and not (self.root / waveform.codes).is_file():
@@ -121,10 +139,14 @@ class Campaign:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
         settings = self.settings.model_dump(mode="json")
         processing, nodes = settings["processing"], {name: settings["nodes"][name] for name in pair.split("-") if name}
+        for node in nodes.values():
+            del node["antennas"]  # echo asks only whether there are beams, image what they are
+        beams = self.antennas(pair) if pair else {}
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
                 "waveform": settings["waveform"],
                 "nodes": nodes,
+                **({"beams": sorted(beams)} if beams else {}),
                 **{key: processing[key] for key in ("sidelink", "accuracy_db")},
             },
             "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
@@ -136,7 +158,12 @@ class Campaign:
                 name: value
                 for name, value in processing.items()
                 if name not in {"window", "sidelink", "false_alarms_per_s"}
-            },
+            }
+            | (
+                {"antennas": {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}}
+                if beams
+                else {}
+            ),
         }
         return chosen.get(stage, {})
 

@@ -7,7 +7,7 @@ at echo. Two functions serve every step: `check` refuses a dataset that breaks i
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,10 +32,11 @@ class Variable:
 
 @dataclass(frozen=True)
 class Stage:
-    """One station of the road: its arrays and the attributes that must stand beside them."""
+    """One station of the road: its arrays, the attributes that must stand beside them, and arrays that may."""
 
     variables: Mapping[str, Variable]
     attributes: Mapping[str, str]
+    optional: Mapping[str, Variable] = field(default_factory=dict)
 
 
 _PULSE_GEOMETRY = {
@@ -77,6 +78,12 @@ STAGES: Mapping[str, Stage] = {
             "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
         },
         _FRAME,
+        {
+            f"{leg}_axes": Variable(
+                ("pulse", "axis", "body"), "float64", "1", f"forward, right, down of the {node}'s body, in `frame`"
+            )
+            for leg, node in (("tx", "transmitter"), ("rx", "receiver"))
+        },
     ),
     "profile": Stage(
         {
@@ -139,7 +146,7 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """
     contract = STAGES[stage]
     wrong = [f"no variable '{name}'" for name in contract.variables if name not in dataset.variables]
-    for name, promise in contract.variables.items():
+    for name, promise in {**contract.variables, **contract.optional}.items():
         if name not in dataset.variables:
             continue
         array = dataset[name]
@@ -187,7 +194,10 @@ def stamp(
         As `check`.
     """
     stamped = check(dataset, stage).copy()
-    for name, promise in STAGES[stage].variables.items():
+    contract = STAGES[stage]
+    for name, promise in {**contract.variables, **contract.optional}.items():
+        if name not in dataset.variables:
+            continue
         if promise.unit:
             stamped[name].attrs["units"] = promise.unit
         stamped[name].attrs["long_name"] = promise.meaning

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 Metres3 = tuple[float, float, float]
+Beamwidth = Annotated[float, Field(gt=0, le=180)]
 RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "benchmarks", "cube.zarr"})
 
 
@@ -84,6 +85,44 @@ class LeverArms(Section):
         return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
 
 
+class Antenna(Section):
+    """Where one antenna looks and how widely; its horizontal axis lies in the body's forward-right plane."""
+
+    boresight_deg: tuple[Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]] = Field(
+        description="azimuth clockwise from forward, elevation above the forward-right plane (down is negative), deg"
+    )
+    beamwidth_deg: tuple[Beamwidth, Beamwidth] | None = Field(
+        None, description="full width at -3 dB (one way) in azimuth and elevation of a Gaussian beam, deg"
+    )
+    pattern: str | None = Field(
+        None,
+        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, gain_db",
+    )
+    cutoff_db: float = Field(
+        -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"
+    )
+
+    @model_validator(mode="after")
+    def _one_pattern(self) -> Self:
+        if (self.beamwidth_deg is None) == (self.pattern is None):
+            raise ValueError("give either beamwidth_deg, [azimuth, elevation], or pattern, a CSV file")
+        return self
+
+
+_BEAM = "null (alike in all directions), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
+
+
+class Antennas(Section):
+    """The beams of a node."""
+
+    radar_tx: Antenna | None = Field(None, description=f"transmitting radar antenna: {_BEAM}")
+    radar_rx: Antenna | None = Field(None, description=f"receiving radar antenna: {_BEAM}")
+
+    def any(self) -> bool:
+        """Return whether one of them is stated."""
+        return self.radar_tx is not None or self.radar_rx is not None
+
+
 class PathOffsets(Section):
     """Electrical path beyond geometry, metres of total path, of the receiving node."""
 
@@ -95,6 +134,7 @@ class Node(Section):
     """One UAV."""
 
     lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
+    antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
     path_offset_m: PathOffsets = Field(
         default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
     )
@@ -108,6 +148,11 @@ class Node(Section):
             raise ValueError(
                 "lever_arms_m is not zero but attitude is none: body axes cannot be turned to north-east-down; "
                 "set attitude to log or course, or the lever arms to zero"
+            )
+        if self.attitude == "none" and self.antennas.any():
+            raise ValueError(
+                "antennas has a beam but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the beam to null"
             )
         return self
 
@@ -238,4 +283,13 @@ class Settings(Section):
     def _calibration_needs_a_place(self) -> Self:
         if self.calibration is not None and self.scene.crs == "auto":
             raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+        return self
+
+    @model_validator(mode="after")
+    def _beams_need_a_log(self) -> Self:
+        named = [name for name, node in self.nodes.items() if node.antennas.any()]
+        if named and isinstance(self.waveform, PhaseHistoryWaveform):
+            raise ValueError(
+                f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
+            )
         return self

@@ -86,7 +86,7 @@ rule layers:
         "../../environment.yml"
     threads: 2
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
         code=code_sha256("apertura.steps.layers"),
     message:
@@ -102,6 +102,7 @@ rule tiles:
         "results/scene.json",
         "results/costs.json",
         campaign.terrain_sources(),
+        lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
     output:
         temp("results/{flight}/{pair}/tiles/{scatteritem}.json"),
     log:
@@ -114,7 +115,7 @@ rule tiles:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        settings=campaign.relevant("image"),
+        settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
         code=code_sha256("apertura.steps.forming"),
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
@@ -130,6 +131,7 @@ rule image:
         "results/scene.json",
         "results/costs.json",
         campaign.terrain_sources(),
+        lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
         [
             share
             for share in gather.tiles("results/{{flight}}/{{pair}}/tiles/{scatteritem}.json")
@@ -148,7 +150,7 @@ rule image:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        settings=campaign.relevant("image"),
+        settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
         code=code_sha256("apertura.steps.image"),
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"

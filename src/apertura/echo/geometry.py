@@ -1,10 +1,10 @@
-"""Phase centres: where each antenna was at each pulse, from a logged track, attitude and lever arms."""
+"""Where each antenna was at each pulse and how the body was turned, from a logged track, attitude and lever arms."""
 
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import BSpline, make_interp_spline
 
 from apertura.errors import CampaignError
 from apertura.geodesy import body_axes, ned_axes
@@ -55,25 +55,72 @@ def phase_centres(
     (DESIGN section 3).
     """
     _check_covered(track_time, at, where)
-    origin = track_time[0]
-    epochs, pulses = _seconds(track_time - origin), _seconds(at - origin)
-    spline = make_interp_spline(epochs, position, k=min(3, len(epochs) - 1))
-    centres = spline(pulses)
+    centres = _spline(track_time, position)(_seconds(at - track_time[0]))
     if not any(lever_arm_m):
         return np.asarray(centres)
-    ned = ned_axes(centres)
+    why = f"a lever arm of {list(lever_arm_m)} m"
+    turn = _turn(track_time, position, attitude, at=at, attitude_from=attitude_from, why=why, where=where)
+    return np.asarray(centres + np.einsum("pij,pjk,k->pi", *turn, np.array(lever_arm_m)))
+
+
+def attitude_axes(
+    track_time: NDArray[np.datetime64],
+    position: NDArray[np.float64],
+    attitude: NDArray[np.float64],
+    *,
+    at: NDArray[np.datetime64],
+    attitude_from: Literal["log", "course", "none"],
+    where: object,
+) -> NDArray[np.float64]:
+    """Return how the body is turned at given times; parameters as `phase_centres`.
+
+    Returns
+    -------
+    ndarray
+        (pulse, 3, 3) float64; columns are the body's forward, right and down unit vectors in ECEF.
+
+    Raises
+    ------
+    CampaignError
+        If the track does not cover `at`, or the log does not hold an attitude.
+    """
+    _check_covered(track_time, at, where)
+    ned, body = _turn(
+        track_time, position, attitude, at=at, attitude_from=attitude_from, why="an antenna's beam", where=where
+    )
+    return ned @ body
+
+
+def _spline(track_time: NDArray[np.datetime64], position: NDArray[np.float64]) -> BSpline:
+    return make_interp_spline(_seconds(track_time - track_time[0]), position, k=min(3, len(track_time) - 1))
+
+
+def _turn(
+    track_time: NDArray[np.datetime64],
+    position: NDArray[np.float64],
+    attitude: NDArray[np.float64],
+    *,
+    at: NDArray[np.datetime64],
+    attitude_from: Literal["log", "course", "none"],
+    why: str,
+    where: object,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return NED → ECEF and body → NED at given times; `why` they are needed."""
+    pulses, spline = _seconds(at - track_time[0]), _spline(track_time, position)
+    ned = ned_axes(spline(pulses))
     angles = (
-        _course(spline.derivative()(pulses), ned) if attitude_from == "course" else _logged(epochs, attitude, pulses)
+        _course(spline.derivative()(pulses), ned)
+        if attitude_from == "course"
+        else _logged(_seconds(track_time - track_time[0]), attitude, pulses)
     )
     if not np.isfinite(angles).all():
         raise CampaignError(
-            f"a lever arm of {list(lever_arm_m)} m but no attitude (attitude: {attitude_from})",
+            f"{why} but no attitude (attitude: {attitude_from})",
             where=where,
             expected="roll, pitch and yaw at every epoch of the log",
-            remedy="Log attitude, or set the node's attitude to course, or its lever arms to zero.",
+            remedy="Log attitude, set the node's attitude to course, or its lever arms to zero and antennas to null.",
         )
-    arm = np.array(lever_arm_m)
-    return np.asarray(centres + np.einsum("pij,pjk,k->pi", ned, body_axes(angles), arm))
+    return ned, body_axes(angles)
 
 
 def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64], where: object) -> None:

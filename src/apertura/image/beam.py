@@ -1,6 +1,6 @@
 """Where an antenna looks: the weight of each pulse at each pixel."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,14 +78,20 @@ class Beam:
         ndarray
             (pulse, pixel) float64.
         """
-        away = pixels - position_m[pulses, None]
-        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes[pulses]), -1, 0)
-        angles = np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))
+        angles = self.angles(position_m, pixels, pulses=pulses)
         gains = [
             np.interp(angle, samples, values, left=0, right=0)
             for angle, (_, samples, values) in zip(angles, self._patterns(), strict=True)
         ]
         return np.asarray(gains[0] * gains[1])
+
+    def angles(
+        self, position_m: NDArray[np.float64], pixels: NDArray[np.float64], *, pulses: slice = slice(None)
+    ) -> NDArray[np.float64]:
+        """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; parameters as `gain`."""
+        away = pixels - position_m[pulses, None]
+        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes[pulses]), -1, 0)
+        return np.stack([np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))])
 
     def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
         return [
@@ -111,6 +117,11 @@ class Beams:
 
     transmit: Beam | None = None
     receive: Beam | None = None
+
+    def at(self, pulses: slice) -> "Beams":
+        """Return those of some pulses."""
+        some = (beam and replace(beam, axes=beam.axes[pulses]) for beam in (self.transmit, self.receive))
+        return Beams(*some)
 
     def weight(
         self,

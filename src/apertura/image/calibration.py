@@ -1,12 +1,14 @@
 """Measures the constants of the cost model on this machine, on small made-up jobs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.image.beam import Beam, Beams
 from apertura.image.cost import Costs, default_costs, machine
 from apertura.image.engines import ENGINES, native, numba, reference
 from apertura.image.grid import LOCAL, SceneGrid
@@ -37,10 +39,14 @@ def measure_costs(*, repeats: int = 3, size: int = 160, pulses: int = 256) -> Co
     pixels, work = grid.positions(), size * size * pulses
     if ENGINES["native"].available():
         found |= _native_costs(least, size=size, pulses=pulses)
+        found |= _beam_costs(least, profiles, pixels)
     fine = numba.prepare(profiles, oversampling=8)
     numba.form(fine, pixels[:2, :2])  # compile
     found["numba.table"] = least(lambda: numba.prepare(profiles, oversampling=8)) / fine.samples.size
     found["numba.pixel"] = least(lambda: numba.form(fine, pixels[: size // 4])) / (work / 4)
+    beams, some = _beams(profiles, pixels, np.ones(2)), pixels[:8, :32].reshape(-1, 3)
+    centres = (profiles.tx_position_m, profiles.rx_position_m)
+    found["weight"] = least(lambda: beams.weight(*centres, some)) / (2 * len(some) * pulses)
     found["reference.subcarrier"] = _reference_cost(least, profiles, pixels)
     found["place.local"] = least(grid.positions) / grid.shape[0] / grid.shape[1]
     placed = SceneGrid("EPSG:32632", 5e5, 5.3e6, 0.1, grid.shape, 0.0)
@@ -72,6 +78,41 @@ def _native_costs(least: Callable[[Callable[[], object]], float], *, size: int, 
             seconds = least(lambda profiles=profiles: native.prepare(profiles, oversampling=6))  # type: ignore[misc]
             found["native.table"] = seconds / (tables.cells.size / 2)
     return found
+
+
+def _beam_costs(
+    least: Callable[[Callable[[], object]], float], profiles: Profiles, pixels: NDArray[np.float64]
+) -> dict[str, float]:
+    """Time weights of two antennas: as a polynomial over each patch, pixel by pixel, and outside the pattern."""
+    tables, work = native.prepare(profiles, oversampling=6), len(profiles.samples) * pixels[..., 0].size
+    ahead = _beams(profiles, pixels, np.ones(2))
+    behind = (beam and replace(beam, axes=-beam.axes) for beam in (ahead.transmit, ahead.receive))
+    patterns = {
+        "beam": _beams(profiles, pixels, np.cos(np.linspace(-1, 1, 129))),
+        "edge": _beams(profiles, pixels, np.tile([0.0, 1.0], 129)),
+        "dark": Beams(*behind),
+    }
+    plain = least(lambda: native.form(tables, pixels)) / work
+    found = {
+        f"native.{name}": least(lambda beams=beams: native.form(tables, pixels, beams=beams)) / work  # type: ignore[misc]
+        for name, beams in patterns.items()
+    }
+    return found | {"native.beam": max(found["native.beam"] - plain, 0.1 * plain)}
+
+
+def _beams(profiles: Profiles, pixels: NDArray[np.float64], gain: NDArray[np.float64]) -> Beams:
+    """Return two antennas that look at the middle of the pixels, with a gain over ±50° of azimuth."""
+    angle, level = np.linspace(-1, 1, 2) * np.radians(50), np.ones(2)
+    across = np.linspace(angle[0], angle[1], len(gain))
+
+    def one(position_m: NDArray[np.float64]) -> Beam:
+        ahead = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2] - position_m
+        ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right, axis=-1, keepdims=True)
+        return Beam(np.stack([ahead, right, np.cross(right, ahead)], 1), across, gain, angle, level)
+
+    return Beams(one(profiles.tx_position_m), one(profiles.rx_position_m))
 
 
 def _reference_cost(

@@ -26,6 +26,7 @@ WIDE_SUM_DB = -105.0
 
 _WORST_TO_RMS = 1 / 3
 _FLOAT32_RAD = 2e-6
+_SILENT = 1e-20
 _REFINED_DB = -98.0  # the sinc filter of numba's table
 _REFERENCE_DB = -140.0  # images are complex64
 
@@ -134,10 +135,10 @@ def candidates(
         engines = {"native"}
     elif "table_oversampling" in asked:
         engines -= {"reference"}
-    found = [_reference(load, costs)] if "reference" in engines else []
+    found = [_reference(view, load, costs)] if "reference" in engines else []
     if "numba" in engines:
         wanted = _only(asked, "table_oversampling", NUMBA_OVERSAMPLINGS)
-        found += [_numba(signal, load, costs, n) for n in wanted if n >= signal.oversampling or len(wanted) == 1]
+        found += [_numba(view, signal, load, costs, n) for n in wanted if n >= signal.oversampling or len(wanted) == 1]
     if "native" in engines:
         found += [
             _native(
@@ -181,8 +182,11 @@ def _native(
     shares, path_rad = forms(view, cell_m=cell_m, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
     cells = -(-((signal.samples - 1) * up // down + 1 + 2 * MARGIN) // TAPS) * TAPS
     paths_db = 20 * np.log10(_WORST_TO_RMS * path_rad + _FLOAT32_RAD)
-    error_db = power_sum_db(table_db, paths_db)
-    tables, tiles = cost.seconds(costs, "native", replace(load, cells=cells), degree=degree, shares=shares)
+    beams_db = 20 * np.log10(view.footprint.error + _SILENT)
+    error_db = power_sum_db(table_db, paths_db, beams_db)
+    tables, tiles = cost.seconds(
+        costs, "native", replace(load, cells=cells), degree=degree, shares=shares, footprint=view.footprint
+    )
     sum_type = accumulate or ("complex64" if error_db > WIDE_SUM_DB else "complex128")
     return Setting(
         "native",
@@ -191,25 +195,26 @@ def _native(
         error_db,
         tables + tiles,
         load.pulses * cells * 8 * (degree + 1),
-        f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB",
+        f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB"
+        + (f", weights of antennas by {beams_db:.1f} dB" if view.footprint.antennas else ""),
         tables,
         shares,
     )
 
 
-def _numba(signal: Signal, load: cost.Load, costs: cost.Costs, oversampling: int) -> Setting:
+def _numba(view: View, signal: Signal, load: cost.Load, costs: cost.Costs, oversampling: int) -> Setting:
     factor = max(1, round(oversampling / signal.oversampling))
     cells = signal.samples * factor
     cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
-    tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells))
+    tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells), footprint=view.footprint)
     error_db = power_sum_db(cubic_db, _REFINED_DB)
     reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
     table_bytes = 8 * load.pulses * cells
     return Setting("numba", {"oversampling": oversampling}, {}, error_db, tables + tiles, table_bytes, reason, tables)
 
 
-def _reference(load: cost.Load, costs: cost.Costs) -> Setting:
-    spent = cost.seconds(costs, "reference", load)[1]
+def _reference(view: View, load: cost.Load, costs: cost.Costs) -> Setting:
+    spent = cost.seconds(costs, "reference", load, footprint=view.footprint)[1]
     return Setting("reference", {}, {}, _REFERENCE_DB, spent, 0, "the double sum itself, float64")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from apertura.image.engines import ENGINES, native
+from apertura.image.illumination import NO_BEAMS, Footprint
 
 _WIDE_FORMS = ("shared", "wide", "exact")
 
@@ -19,6 +20,7 @@ DEFAULTS: Mapping[str, Mapping[str, float]] = {
         "place.ecef": 5.0e-07,
         "place.local": 2.7e-09,
         "tile": 4.0e-03,
+        "weight": 1.2e-07,
         "thin": 8.0e-08,
     },
     "avx512": {
@@ -29,6 +31,9 @@ DEFAULTS: Mapping[str, Mapping[str, float]] = {
         "native.wide.2": 3.7e-10,
         "native.exact.1": 3.2e-09,
         "native.exact.2": 3.8e-09,
+        "native.beam": 6.7e-10,
+        "native.edge": 3.4e-08,
+        "native.dark": 1.2e-10,
     },
     "avx2": {
         "native.table": 2.5e-09,
@@ -38,6 +43,9 @@ DEFAULTS: Mapping[str, Mapping[str, float]] = {
         "native.wide.2": 8.5e-10,
         "native.exact.1": 4.5e-09,
         "native.exact.2": 5.5e-09,
+        "native.beam": 1.0e-09,
+        "native.edge": 3.5e-08,
+        "native.dark": 1.2e-10,
     },
     "portable": {
         "native.table": 4.0e-09,
@@ -47,6 +55,9 @@ DEFAULTS: Mapping[str, Mapping[str, float]] = {
         "native.wide.2": 2.8e-09,
         "native.exact.1": 1.1e-08,
         "native.exact.2": 1.2e-08,
+        "native.beam": 1.2e-09,
+        "native.edge": 4.1e-08,
+        "native.dark": 1.6e-10,
     },
 }
 """Seconds on one core of a 2.x GHz server of 2023, by instruction set; `apertura calibrate-cost` replaces them."""
@@ -60,9 +71,11 @@ class Costs:
     ----------
     seconds
         ``native.table`` per pulse, cell and coefficient; ``native.<form>.<degree>`` per pixel and pulse;
-        ``numba.table`` per pulse and fine sample; ``numba.pixel`` per pixel and pulse; ``reference.subcarrier`` per
-        pixel, pulse and subcarrier; ``place.<frame>`` per pixel position; ``tile`` per tile; ``thin`` per pulse and
-        range sample of a low-pass sum.
+        ``native.beam``, ``.edge``, ``.dark`` per pixel and pulse that antennas weigh smoothly (on top of its form),
+        pixel by pixel (instead of it) and not at all; ``numba.table`` per pulse and fine sample; ``numba.pixel`` per
+        pixel and pulse; ``reference.subcarrier`` per pixel, pulse and subcarrier; ``weight`` per pixel, pulse and
+        antenna of both; ``place.<frame>`` per pixel position; ``tile`` per tile; ``thin`` per pulse and range sample
+        of a low-pass sum.
     source
         Where they come from, in one line.
     """
@@ -178,7 +191,13 @@ def write_costs(costs: Costs, path: Path | None = None) -> Path:
 
 
 def seconds(
-    costs: Costs, engine: str, load: Load, *, degree: int = 2, shares: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    costs: Costs,
+    engine: str,
+    load: Load,
+    *,
+    degree: int = 2,
+    shares: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    footprint: Footprint = NO_BEAMS,
 ) -> tuple[float, float]:
     """Return predicted seconds (tables, pixels) of an engine.
 
@@ -194,6 +213,8 @@ def seconds(
         Of native's polynomials.
     shares
         Parts of pixels × pulses that native computes by its shared, wide and exact forms.
+    footprint
+        Of the antennas' beams.
 
     Returns
     -------
@@ -215,12 +236,21 @@ def seconds(
     if engine == "native":
         tables = unit["native.table"] * load.pulses * load.cells * (degree + 1)
         form = sum(share * unit[f"native.{name}.{degree}"] for name, share in zip(_WIDE_FORMS, shares, strict=True))
+        if footprint.antennas:
+            exact = unit[f"native.exact.{degree}"]
+            weighed = form + (1 - shares[2]) * unit["native.beam"] + shares[2] * (unit["native.edge"] - exact)
+            form = (
+                footprint.smooth * weighed
+                + footprint.rough * unit["native.edge"]
+                + footprint.dark * unit["native.dark"]
+            )
         pixels = work * form
     elif engine == "numba":
         tables = unit["numba.table"] * load.pulses * load.cells
-        pixels = work * unit["numba.pixel"]
+        pixels = work * (unit["numba.pixel"] + footprint.antennas * unit["weight"])
     else:
-        tables, pixels = 0.0, work * load.subcarriers * unit["reference.subcarrier"]
+        spent = load.subcarriers * unit["reference.subcarrier"] + footprint.antennas * unit["weight"]
+        tables, pixels = 0.0, work * spent
     return tables, pixels + tile_seconds(costs, load)
 
 

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.image.beam import Beams
 from apertura.image.candidates import Setting, Signal
 from apertura.image.cost import Load
 from apertura.image.history import Profiles
+from apertura.image.illumination import Illumination
 from apertura.image.models import Decision, plane_through
 from apertura.image.thinning import Presum, thin
 
@@ -45,6 +47,8 @@ class Job:
     content_db
         How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
         errors of tables weigh that much more. None before anything was recorded.
+    beams, illumination
+        Of the antennas, where they have any, over all pulses.
     """
 
     tx_position_m: NDArray[np.float64]
@@ -64,6 +68,8 @@ class Job:
     path_limit_m: float = np.inf
     memory_bytes: float = np.inf
     content_db: float | None = None
+    beams: Beams | None = None
+    illumination: Illumination | None = None
 
     @property
     def load(self) -> Load:
@@ -120,6 +126,8 @@ class Plan:
         Of a tilted plane: height above the flat model at pixel (0, 0), per row and per column, metres.
     cost_source
         Where the costs came from.
+    illumination
+        Of the job.
     """
 
     setting: Setting
@@ -135,6 +143,7 @@ class Plan:
     middle_m: NDArray[np.float64] | None = field(default=None, repr=False)
     tilt_m: tuple[float, float, float] | None = None
     cost_source: str = ""
+    illumination: Illumination | None = field(default=None, repr=False)
 
     @property
     def engine(self) -> str:

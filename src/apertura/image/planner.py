@@ -10,6 +10,7 @@ from apertura.image.budget import block_decision, blocked, bytes_needed, setting
 from apertura.image.candidates import Setting, candidates, power_sum_db
 from apertura.image.cost import Costs, tile_seconds
 from apertura.image.edges import crossed_edges
+from apertura.image.illumination import decide_antennas
 from apertura.image.models import (
     Decision,
     decide_midpoint,
@@ -73,11 +74,14 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         path_limit_m=job.path_limit_m,
     )
     some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
-    desk = _Desk(job, look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m), costs, asked)
+    beams = job.beams and job.beams.at(some)
+    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
+    desk = _Desk(job, view, costs, asked)
     whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
     terrain = _decide_terrain(desk)
+    antennas, missed = decide_antennas(job.beams, job.illumination, asked)
     chosen = desk.fitted(chosen, presum)
     models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
     memory, disk = bytes_needed(job, chosen, presum)
@@ -90,17 +94,19 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
             block_decision(chosen, job, asked="pulse_blocks" in asked),
             midpoint,
             terrain,
+            *antennas,
         ),
         predicted_error_db=power_sum_db(chosen.error_db, *models) + max(0.0, job.content_db or 0.0),
         predicted_seconds=wall_seconds(chosen, job),
         memory_bytes=memory,
         disk_bytes=disk,
-        flags=flags,
+        flags=flags | missed,
         presum=presum,
         midpoint=bool(midpoint.value),
         middle_m=job.place_m[len(job.place_m) // 2],
         tilt_m=job.tilt_m if terrain.value == "tilted_plane" else None,
         cost_source=costs.source,
+        illumination=job.illumination,
     )
 
 
@@ -179,6 +185,8 @@ def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[D
 
     if asked == 1:
         return keep("asked for in config/config.yaml")
+    if job.beams is not None:
+        return keep("the antennas weigh every pulse for itself")
     if whole.engine == "reference":
         return keep("the double sum takes every pulse")
     limit_db = accuracy_db - MARGIN_DB - desk.content_db - 3

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.image.beam import Beams
 from apertura.image.cost import machine
+from apertura.image.illumination import NO_BEAMS, Footprint, footprint
 
 
 @dataclass(frozen=True)
@@ -20,21 +22,32 @@ class View:
         (2, pulse, place) float64, change of total path per pixel along columns and rows, metres.
     spacing_m
         Pixel spacing.
+    footprint
+        Of the antennas' beams.
     """
 
     range_m: NDArray[np.float64]
     slope: NDArray[np.float64]
     spacing_m: float
+    footprint: Footprint = NO_BEAMS
 
 
-def look(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], net_m: NDArray[np.float64], spacing_m: float) -> View:
-    """Return the view of a net of places, (row, column, 3), from phase centres (pulse, 3), metres."""
+def look(
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    net_m: NDArray[np.float64],
+    spacing_m: float,
+    beams: Beams | None = None,
+) -> View:
+    """Return the view of a net of places, (row, column, 3), from phase centres (pulse, 3), metres, and their beams."""
     place = net_m.reshape(-1, 3)
     right, down = (_steps(net_m, axis, spacing_m).reshape(-1, 3) for axis in (1, 0))
     apart = np.stack([place - antenna[:, None] for antenna in (tx_m, rx_m)])
     distance = np.linalg.norm(apart, axis=-1)
     direction = (apart / distance[..., None]).sum(axis=0)
-    return View(distance, np.stack([(direction * step).sum(-1) for step in (right, down)]), spacing_m)
+    slope = np.stack([(direction * step).sum(-1) for step in (right, down)])
+    seen = NO_BEAMS if beams is None else footprint(beams, tx_m, rx_m, np.stack([right, down]), place)
+    return View(distance, slope, spacing_m, seen)
 
 
 def _steps(net_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[np.float64]:

@@ -116,7 +116,9 @@ def _write_config(root: Path, simulation: Simulation) -> None:
 
 def _node_section(node: Node) -> dict[str, Any]:
     stated = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
+    beams = {point: {key: list(pair) for key, pair in asdict(beam).items()} for point, beam in node.antennas.items()}
     return {
+        **({"antennas": beams} if beams else {}),
         "lever_arms_m": {name: [float(value) for value in arm] for name, arm in node.lever_arms_m.items()},
         "path_offset_m": {name: float(value) for name, value in stated.items()},
         "attitude": node.attitude,

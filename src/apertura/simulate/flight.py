@@ -180,8 +180,19 @@ def phase_centre(origin: Origin, path: Trajectory, time_s: Floats, lever_arm_m: 
     array([[6378138.,       0.,       0.]])
     """
     position = origin.ecef(path.position(time_s))
-    turn = ned_axes(position) @ body_axes(path.attitude(time_s))
-    return np.asarray(position + turn @ np.array(lever_arm_m, np.float64))
+    return np.asarray(position + body_turn(origin, path, time_s) @ np.array(lever_arm_m, np.float64))
+
+
+def body_turn(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
+    """Return (time, 3, 3) float64: forward-right-down of the body into ECEF.
+
+    Examples
+    --------
+    >>> turn = body_turn(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1))
+    >>> (turn[0] @ [1.0, 0.0, 0.0]).round(6) + 0.0  # forward is east
+    array([0., 1., 0.])
+    """
+    return np.asarray(ned_axes(origin.ecef(path.position(time_s))) @ body_axes(path.attitude(time_s)))
 
 
 def phase_centre_velocity(

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.random import Generator
 
 from apertura.geodesy import projected_from_ecef
-from apertura.simulate.flight import Trajectory, phase_centre, phase_centre_velocity
+from apertura.simulate.antenna import Antenna
+from apertura.simulate.flight import Trajectory, body_turn, phase_centre, phase_centre_velocity
 from apertura.simulate.frame import Framing
 from apertura.simulate.hidden import Hidden, draw, independent_streams
 from apertura.simulate.impairments import Impairments
@@ -38,6 +39,8 @@ class Node:
         csv (with attitude), pos (RTKLIB in GPST) or pos_utc, and epochs per second.
     impairments
         What is wrong with it.
+    antennas
+        Beams of `radar_tx`, `radar_rx`; missing: alike in all directions.
     """
 
     name: str
@@ -48,6 +51,7 @@ class Node:
     log_format: Literal["csv", "pos", "pos_utc"] = "csv"
     log_rate_hz: float = 10.0
     impairments: Impairments = field(default_factory=Impairments)
+    antennas: Mapping[str, Antenna] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,7 @@ def fly(simulation: Simulation, flight: Flight, scatterers: Scatterers, generato
     for name in flight.paths:
         node = simulation.node(name)
         geometry = _geometry(simulation, flight, name, hidden)
+        geometry = replace(geometry, gain=_gain(simulation, flight, name, geometry, scatterers))
         channels = receive(
             simulation.waveform,
             scatterers,
@@ -218,3 +223,13 @@ def _geometry(simulation: Simulation, flight: Flight, receiver: str, hidden: Map
         tx_velocity=velocity(sender),
         rx_velocity=velocity(receiver),
     )
+
+
+def _gain(simulation: Simulation, flight: Flight, receiver: str, geometry: Geometry, scatterers: Scatterers) -> Floats:
+    time_s, gain = pulse_times(simulation, flight), np.ones((1, 1))
+    for name, point in ((flight.transmitter, "radar_tx"), (receiver, "radar_rx")):
+        antenna = simulation.node(name).antennas.get(point)
+        if antenna is not None:
+            turn = body_turn(simulation.scene.origin, flight.paths[name], time_s)
+            gain = gain * antenna.gain(turn, getattr(geometry, point), scatterers.position_m)
+    return gain

@@ -1,7 +1,7 @@
 """What a node records of a flight, as arrays: scene and geometry, passed through what is wrong with the node."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ class Geometry:
         (pulse, 3) float64, ends of the direct path.
     tx_velocity, rx_velocity
         (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
+    gain
+        (pulse, point) float64, field of both radar antennas towards each scatterer, relative to their boresights.
     """
 
     radar_tx: Floats
@@ -36,6 +38,7 @@ class Geometry:
     sidelink_rx: Floats
     tx_velocity: Floats | float = 0.0
     rx_velocity: Floats | float = 0.0
+    gain: Floats | float = 1.0
 
 
 def receive(
@@ -78,6 +81,7 @@ def receive(
         tx_velocity_m_s=velocity[0],
         rx_velocity_m_s=velocity[1],
     )
+    echoes = replace(echoes, amplitude=echoes.amplitude * geometry.gain)
     direct = direct_path(
         geometry.sidelink_tx,
         geometry.sidelink_rx,

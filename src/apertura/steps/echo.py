@@ -134,6 +134,14 @@ def _ofdm(
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(rx_index))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            **{
+                name: (("pulse", "axis", "body"), node.body_axes(index))
+                for name, node, index, antenna in (
+                    ("tx_axes", tx, tx_index, tx.settings.antennas.radar_tx),
+                    ("rx_axes", rx, rx_index, rx.settings.antennas.radar_rx),
+                )
+                if antenna is not None
+            },
         },
         attrs={"frame": "ecef", "pair": f"{tx.name}-{rx.name}", **attrs},
     )

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.contracts import Window
+from apertura.image.beam import Beams
 from apertura.image.candidates import Setting
 from apertura.image.engines import ENGINES
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.plan import Plan
 from apertura.image.tiles import Former, form_blocks
+from apertura.provenance import sha256_file
+from apertura.steps.antennas import beams_of, body_axes
 from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.plan import plan_pair, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
@@ -35,6 +38,8 @@ class Work:
         The stage that image.json quotes.
     history
         'echo' → `Spectra`, 'profile' → `Profiles`.
+    beams
+        Of the antennas; None where they look everywhere alike.
     grid, heights
         The campaign's grid, and the ground as the plan models it.
     plan
@@ -50,6 +55,7 @@ class Work:
     folder: Path
     echo: xr.Dataset
     history: dict[str, Any]
+    beams: Beams | None
     grid: SceneGrid
     heights: Heights
     plan: Plan
@@ -72,10 +78,12 @@ class Work:
             "image",
             module=__name__,
             parents=[echo, profile, *heights.parents],
-            settings={**campaign.relevant("image"), "grid": grid_spec(grid), "plan": choices},
+            inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
+            settings={**campaign.relevant("image", pair), "grid": grid_spec(grid), "plan": choices},
         )
         folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(processing.tile_px))
-        return cls(folder, echo, history, grid, heights, plan, empty, windows, threads)
+        beams = beams_of(campaign, pair, body_axes(echo))
+        return cls(folder, echo, history, beams, grid, heights, plan, empty, windows, threads)
 
     def form(self, target: Any, setting: Setting, windows: list[Window], *, planned: bool = False) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.
@@ -101,9 +109,8 @@ class Work:
 
         def former(pulses: slice) -> Former:
             prepared = engine.prepare(history.of_pulses(pulses), **setting.options)
-            return lambda pixels: np.asarray(
-                engine.form(prepared, pixels, **setting.form_options) / count, np.complex64
-            )
+            options = {"beams": self.beams and self.beams.at(pulses), **setting.form_options}
+            return lambda pixels: np.asarray(engine.form(prepared, pixels, **options) / count, np.complex64)
 
         form_blocks(
             former,

@@ -6,6 +6,7 @@ import zarr
 
 from apertura.campaign import Campaign
 from apertura.image.planner import ladder
+from apertura.steps.antennas import antennas_report
 from apertura.steps.forming import Work
 from apertura.steps.quality import certified, measures
 from apertura.store import finish, sharing, tiles_missing, write_json, writing
@@ -32,6 +33,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **measures(work, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.heights.report,
+            **antennas_report(campaign, pair, plan.illumination),
         }
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}
         zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,11 +14,13 @@ from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import window_weights
 from apertura.echo.demodulate import subcarrier_numbers
-from apertura.echo.geometry import phase_centres
+from apertura.echo.geometry import attitude_axes, phase_centres
+from apertura.image.beam import Beams
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Spectra
 from apertura.ingest import PHASE_HISTORIES, TRACKS
 from apertura.settings import OfdmWaveform
+from apertura.steps.antennas import beams_of, body_axes
 from apertura.steps.history import spectra_of
 from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
@@ -37,6 +40,8 @@ class Outlook:
         Longest total path inside the cyclic prefix.
     spectra
         The echo itself; None before it is formed.
+    beams
+        Of the antennas; None where they look everywhere alike.
     """
 
     tx: NDArray[np.float64]
@@ -45,6 +50,7 @@ class Outlook:
     weight: NDArray[np.float64]
     path_limit_m: float
     spectra: Spectra | None = None
+    beams: Beams | None = None
 
 
 def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
@@ -67,8 +73,8 @@ def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset |
         echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
     spectra = spectra_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
-    places = (spectra.tx_position_m, spectra.rx_position_m)
-    return Outlook(*places, spectra.frequency_hz, spectra.weight, limit_m, spectra)
+    places, beams = (spectra.tx_position_m, spectra.rx_position_m), beams_of(campaign, pair, body_axes(echo))
+    return Outlook(*places, spectra.frequency_hz, spectra.weight, limit_m, spectra, beams)
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:
@@ -79,24 +85,20 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     first = max(track.time.values[0] for track in tracks.values())
     last = min(track.time.values[-1] for track in tracks.values())
     times = _pulse_times(campaign.raw_file(flight, tx, ".sigmf-meta"), first, last, waveform.prf_hz)
-    places = []
+    places, axes = [], {}
     for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
         track, settings = tracks[node], campaign.settings.nodes[node]
-        places.append(
-            phase_centres(
-                track.time.values,
-                track.position.values,
-                track.attitude.values,
-                at=times,
-                lever_arm_m=getattr(settings.lever_arms_m, antenna),
-                attitude_from=settings.attitude,
-                where=logs[node],
-            )
-        )
+        log = (track.time.values, track.position.values, track.attitude.values)
+        arm = getattr(settings.lever_arms_m, antenna)
+        stated: dict[str, Any] = {"at": times, "attitude_from": settings.attitude, "where": logs[node]}
+        places.append(phase_centres(*log, lever_arm_m=arm, **stated))
+        if antenna in campaign.antennas(pair):
+            axes[antenna] = attitude_axes(*log, **stated)
     numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
     frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
     weight = window_weights(campaign.settings.processing.window, len(frequency))
-    return Outlook(places[0], places[1], frequency, weight, SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s)
+    limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
+    return Outlook(places[0], places[1], frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
 
 
 def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:

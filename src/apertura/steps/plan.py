@@ -23,6 +23,7 @@ from apertura.image.history import Spectra
 from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
+from apertura.steps.antennas import lit
 from apertura.steps.costs import campaign_costs
 from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
@@ -80,7 +81,12 @@ def plan_pair(
         outlook, grid, heights or expected_heights(campaign, grid), tile_px=processing.tile_px, threads=threads
     )
     plan = make_plan(
-        replace(job, memory_bytes=memory_limit(), **_relief(campaign, grid)),
+        replace(
+            job,
+            memory_bytes=memory_limit(),
+            **_relief(campaign, grid),
+            **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
+        ),
         accuracy_db=processing.accuracy_db,
         costs=campaign_costs(campaign),
         overrides={name: getattr(processing, name) for name in OVERRIDES},
@@ -112,16 +118,18 @@ def job_of(outlook: Outlook, grid: SceneGrid, heights: Heights, *, tile_px: int,
         tile_px=tile_px,
         threads=threads,
         path_limit_m=outlook.path_limit_m,
-        content_db=None if outlook.spectra is None else _content_db(outlook.spectra, grid, heights),
+        content_db=None if outlook.spectra is None else _content_db(outlook, outlook.spectra, grid, heights),
     )
 
 
-def _content_db(spectra: Spectra, grid: SceneGrid, heights: Heights) -> float:
+def _content_db(outlook: Outlook, spectra: Spectra, grid: SceneGrid, heights: Heights) -> float:
     """Return how much errors weigh at some random pixels of the scene."""
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
     places = grid.positions_at(rows, columns, heights.at(rows, columns))
     parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
-    return content_loss_db(np.concatenate([reference.terms(spectra, places, pulses=part) for part in parts]))
+    return content_loss_db(
+        np.concatenate([reference.terms(spectra, places, outlook.beams, pulses=part) for part in parts])
+    )
 
 
 def _relief(campaign: Campaign, grid: SceneGrid) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def certified(work: Work, target: Any, better: tuple[Setting, ...], accuracy_db:
     """
     spectra, windows = work.history["echo"], work.windows
     pixels = certified_pixels(target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
-    exact = reference.form(spectra, work.places(*pixels.T)) / len(spectra.transfer)
+    exact = reference.form(spectra, work.places(*pixels.T), beams=work.beams) / len(spectra.transfer)
     certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
     redone: list[dict[str, Any]] = []
     for choice in better:
@@ -62,7 +62,7 @@ def measures(work: Work, target: Any) -> dict[str, Any]:
     peak = find_peak(target, found.row, found.column)
     x, y = ground_position(grid, peak)
     spectra: Spectra = work.history["echo"]
-    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])))
+    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])), work.beams)
     along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)
     cuts = {
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
@@ -75,7 +75,7 @@ def measures(work: Work, target: Any) -> dict[str, Any]:
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(terms[:, 0]),
+            "coherence_factor": coherence_factor(terms[terms[:, 0] != 0, 0]),
             **{
                 f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
                 for name, cut in cuts.items()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.echo.demodulate import demodulate, subcarrier_numbers
-from apertura.echo.geometry import phase_centres
+from apertura.echo.geometry import attitude_axes, phase_centres
 from apertura.echo.resampling import Waveform
 from apertura.errors import CampaignError
 from apertura.settings import Node, OfdmWaveform
@@ -66,6 +66,17 @@ class Recording:
             self.track.attitude.values,
             at=self.raw.time.values[pulses],
             lever_arm_m=getattr(self.settings.lever_arms_m, name),
+            attitude_from=self.settings.attitude,
+            where=f"{self.files}.track",
+        )
+
+    def body_axes(self, pulses: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return forward, right, down of the body in ECEF at the node's own time tags, (pulse, axis, body) float64."""
+        return attitude_axes(
+            self.track.time.values,
+            self.track.position.values,
+            self.track.attitude.values,
+            at=self.raw.time.values[pulses],
             attitude_from=self.settings.attitude,
             where=f"{self.files}.track",
         )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.image.beam import Beams
 from apertura.image.candidates import Setting, candidates
 from apertura.image.cost import Costs, Load, read_costs
 from apertura.image.engines import ENGINES, reference
@@ -20,6 +21,7 @@ from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.view import look
+from apertura.steps.antennas import lit
 from apertura.steps.history import profiles_of
 from apertura.steps.outlook import campaign_grid, outlook_of
 from apertura.steps.plan import OVERRIDES, job_of
@@ -67,6 +69,10 @@ class Part:
         (pixel,) complex128.
     whole
         What the whole image is: pixels and pulses.
+    reference_seconds
+        What the exact values took.
+    beams
+        Of the antennas over the block, where they have any.
     """
 
     spectra: Spectra
@@ -76,6 +82,7 @@ class Part:
     exact: NDArray[np.complex128]
     whole: Load
     reference_seconds: float
+    beams: Beams | None = None
 
 
 def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> list[Path]:
@@ -95,14 +102,15 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     if outlook.spectra is None:
         raise ValueError("the echo stage is not there")
-    spectra = outlook.spectra.of_pulses(block)
-    outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra)
+    spectra, beams = outlook.spectra.of_pulses(block), outlook.beams and outlook.beams.at(block)
+    outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra, beams=beams)
     heights = open_heights(campaign)
     job = job_of(outlook, grid, heights, tile_px=processing.tile_px, threads=1)
+    job = replace(job, **lit(campaign, pair, beams, grid, (outlook.tx, outlook.rx)))
     costs = _of_engines(read_costs())
     overrides = {name: getattr(processing, name) for name in OVERRIDES if name not in {"engine"}}
     plan = make_plan(job, accuracy_db=processing.accuracy_db, costs=costs, overrides=overrides)
-    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load)
+    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
     points = measure(part, plan, _settings(job, costs), seconds=seconds)
     size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
@@ -114,7 +122,9 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     return paths
 
 
-def _part(spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load) -> Part:
+def _part(
+    spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load, beams: Beams | None
+) -> Part:
     window = []
     for size in grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
@@ -122,8 +132,8 @@ def _part(spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Height
     pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
     picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
     begin = perf_counter()
-    exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]])
-    return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin)
+    exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]], beams=beams)
+    return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin, beams)
 
 
 def _of_engines(costs: Costs) -> Costs:
@@ -135,7 +145,8 @@ def _of_engines(costs: Costs) -> Costs:
 def _settings(job: Job, costs: Costs) -> list[Setting]:
     """Return the settings to measure, cheapest first."""
     some = slice(None, None, max(1, len(job.tx_position_m) // 48))
-    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m)
+    beams = job.beams and job.beams.at(some)
+    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
     every = candidates(view, job.signal, job.load, costs)
     return [
         setting
@@ -169,14 +180,16 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     tables_s, prepared = _least(prepare, repeats=2)
     rows = len(part.pixels)
     if setting.engine == "numba":  # any shape of pixels will do, so errors need not wait for the whole window
-        engine.form(prepared, part.pixels[:1, :1])
+        engine.form(prepared, part.pixels[:1, :1], beams=part.beams)
         rows = max(
             1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.whole.pixels / part.pixels.shape[1]))
         )
-        values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None])[0]
-        form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows]), repeats=2)
+        values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None], beams=part.beams)[0]
+        form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows], beams=part.beams), repeats=2)
     else:
-        form_s, image = _least(lambda: engine.form(prepared, part.pixels, **setting.form_options), repeats=3)
+        form_s, image = _least(
+            lambda: engine.form(prepared, part.pixels, beams=part.beams, **setting.form_options), repeats=3
+        )
         values = image[part.picked[:, 0], part.picked[:, 1]]
     pixels = rows * part.pixels.shape[1]
     taken = tables_s + form_s * part.whole.pixels / pixels

@@ -16,7 +16,7 @@ class Engine:
     prepare
         (history, **options) → what all tiles share.
     form
-        (prepared, pixels (y, x, 3) float64) → (y, x) complex; releases the GIL, starts no threads.
+        (prepared, pixels (y, x, 3) float64, beams=None) → (y, x) complex; releases the GIL, starts no threads.
     reads
         Which history it is given: `Spectra` of the echo, or `Profiles`.
     available

@@ -26,7 +26,6 @@ from apertura.image.history import Profiles
 
 __all__ = ["INSTRUCTION_SETS", "PATCH", "available", "form", "instruction_set", "prepare"]
 
-NO_BEAMS = Beams()
 PATCH = 16  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
 
 
@@ -93,7 +92,7 @@ def form(
     tables: Tables,
     pixels: NDArray[np.float64],
     *,
-    beams: Beams = NO_BEAMS,
+    beams: Beams | None = None,
     accumulate: Literal["complex64", "complex128"] = "complex64",
     tolerance_rad: float = 1.5e-3,
     counts: NDArray[np.int64] | None = None,
@@ -108,7 +107,7 @@ def form(
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local): any surface. A tile of
         a larger grid that begins at multiples of 16 pixels gets the same bits as in the whole.
     beams
-        Weight of each pulse at each pixel by its antennas; pulses whose beam misses a patch cost little.
+        Weight of each pulse at each pixel by its antennas; none by default. A beam that misses a patch costs little.
     accumulate
         Type of the sum over blocks of pulses.
     tolerance_rad
@@ -143,7 +142,8 @@ def form(
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
     padded = tables.first_path_m.size
-    weights = [_weight(beam, len(tables.cells), padded) for beam in (beams.transmit, beams.receive)]
+    antennas = (None, None) if beams is None else (beams.transmit, beams.receive)
+    weights = [_weight(beam, len(tables.cells), padded) for beam in antennas]
     pointers = (ctypes.POINTER(BeamJob) * 2)()
     for leg, weight in enumerate(weights):
         if weight is not None:

@@ -50,14 +50,13 @@ def form(spectra: Spectra, pixels: NDArray[np.float64], *, beams: Beams | None =
     image = np.zeros(len(flat), np.complex128)
     for first in range(0, len(spectra.transfer), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        added = terms(spectra, flat, pulses=pulses)
-        if beams is not None:
-            added *= beams.weight(spectra.tx_position_m, spectra.rx_position_m, flat, pulses=pulses)
-        image += added.sum(axis=0)
+        image += terms(spectra, flat, beams, pulses=pulses).sum(axis=0)
     return image.reshape(pixels.shape[:-1])
 
 
-def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slice(None)) -> NDArray[np.complex128]:
+def terms(
+    spectra: Spectra, pixels: NDArray[np.float64], beams: Beams | None = None, *, pulses: slice = slice(None)
+) -> NDArray[np.complex128]:
     """Return what each pulse adds at each pixel: the sum over subcarriers alone.
 
     Parameters
@@ -66,6 +65,8 @@ def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slic
         As `form`.
     pixels
         (pixel, 3) float64, metres.
+    beams
+        As `form`.
     pulses
         Which pulses; all by default.
 
@@ -88,7 +89,10 @@ def terms(spectra: Spectra, pixels: NDArray[np.float64], *, pulses: slice = slic
     )
     delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[pulses, None]
     total = _polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
-    return np.asarray(total * np.exp(2j * np.pi * (frequency[0] * delay % 1.0)))
+    total *= np.exp(2j * np.pi * (frequency[0] * delay % 1.0))
+    if beams is not None:
+        total *= beams.weight(spectra.tx_position_m, spectra.rx_position_m, pixels, pulses=pulses)
+    return np.asarray(total)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,165 @@
+"""Patterns, axes and footprints of antennas, and what the planner makes of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_33_planner import COSTS, compiled, draw, job, net, plan, track
+
+from apertura.errors import CampaignError
+from apertura.geodesy import body_axes
+from apertura.image.beam import Beam, Beams
+from apertura.image.cost import seconds
+from apertura.image.engines import ENGINES, native, reference
+from apertura.image.illumination import Footprint, footprint, illuminate
+from apertura.image.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
+from apertura.image.planner import make_plan
+from apertura.image.quality import numerical_error
+
+
+def side(width_deg=(40.0, 60.0), *, boresight_deg=(-90.0, -25.0), pulses=300, cutoff_db=-20.0):
+    """A beam to the left of a body that flies east: northward."""
+    body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
+    cuts = (
+        gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
+    )
+    return Beam(antenna_axes(body, boresight_deg), *(part for cut in cuts for part in cut))
+
+
+def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
+    for azimuth, elevation in ((0, 0), (90, -30), (-135, 60), (200, -90)):
+        body = body_axes(np.radians([[10.0, -20.0, 30.0]]))
+        ahead, right, below = np.moveaxis(body @ body_axes(np.radians([0.0, elevation, azimuth])), -1, 0)
+        np.testing.assert_allclose(
+            antenna_axes(body, (azimuth, elevation))[0], np.concatenate([ahead, right, -below]), atol=1e-12
+        )
+
+
+def test_half_the_power_is_left_at_half_the_width_and_nothing_beyond_the_cutoff():
+    beam = side((20.0, 50.0), boresight_deg=(0.0, 0.0), pulses=1)
+    angle = np.radians([10.0, 25.0])
+    places = np.array([[np.cos(angle[0]), -np.sin(angle[0]), 0], [np.cos(angle[1]), 0, np.sin(angle[1])], [1, -0.6, 0]])
+    np.testing.assert_allclose(beam.gain(np.zeros((1, 3)), places)[0] ** 2, [0.5, 0.5, 0.0], atol=1e-4)
+    assert np.degrees(beam.azimuth_rad[-1]) == pytest.approx(20 * np.sqrt(20 / 12.0412), abs=1e-3)
+
+
+def test_a_wide_beam_ends_where_directions_do():
+    angle, gain = gaussian_cut(170.0, cutoff_db=-20.0, limit_rad=np.pi / 2)
+    assert angle[-1] == np.pi / 2
+    assert gain[-1] > 0.1
+
+
+def test_a_sampled_cut_keeps_its_main_lobe_alone():
+    angle = np.array([-40.0, -30, -20, 0, 20, 30, 40])
+    found, gain = sampled_cut(angle, np.array([-5.0, -13, -60, 0, -60, -13, -5]), cutoff_db=-20)
+    assert np.degrees(found[-1]) == pytest.approx(20 / 3, abs=0.05)
+    assert gain.min() >= 0.1
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ("cut,angle_deg\nazimuth,0\n", "no column gain_db"),
+        ("cut,angle_deg,gain_db\nazimut,0,0\n", "a cut called 'azimut'"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,0\nazimuth,9,-9\n", "0 samples of the elevation cut"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,x\nazimuth,9,-9\n", "could not convert string"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,nan\nazimuth,9,-9\n", "azimuth cut holds a cell that is no"),
+        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,0,0\nazimuth,9,-9\n", "angles of the azimuth cut do not grow"),
+        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,90,0\nazimuth,270,-9\n", "0° to 270°, beyond ±180°"),
+    ],
+)
+def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):
+    path = tmp_path / "horn.csv"
+    path.write_text(rows)
+    with pytest.raises(CampaignError, match=rf"horn.csv: .*{expected}.*expected columns cut"):
+        read_pattern(path, cutoff_db=-20.0)
+
+
+def test_pulses_that_see_a_place_are_counted():
+    tx, places = track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
+    beams = Beams(side((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
+    found = illuminate(beams, tx, tx, places)
+    half_m = np.hypot(20, 10) * np.tan(np.radians(4 * np.sqrt(20 / 12.0412)))
+    expected = [2 * half_m / 6 * 3000, (half_m + 1) / 6 * 3000, 0]
+    np.testing.assert_allclose(found.seen, expected, atol=12)
+    assert found.unseen == pytest.approx(1 / 3)
+
+
+def jobs(beams, *, shape=(200, 200)):
+    tx = track()
+    lit = None if beams is None else illuminate(beams, tx, tx, net().reshape(-1, 3))
+    return {"beams": beams, "illumination": lit, "shape": shape}
+
+
+def test_pulses_in_the_dark_cost_less_than_without_beams_and_lit_ones_more():
+    load = replace(job().load, cells=1, tiles=0, pixels=10**6)
+    lit, half, dark = (
+        sum(seconds(COSTS, "native", load, footprint=Footprint(1 - share, 0.0, share, 0.0, 2))) for share in (0, 0.5, 1)
+    )
+    assert half == pytest.approx((lit + dark) / 2)
+    assert 2 * dark < sum(seconds(COSTS, "native", load)) < lit / 2.5
+
+
+@compiled
+def test_a_plan_counts_what_its_beams_cost():
+    lit = plan(**jobs(None, shape=(2000, 2000))).predicted_seconds
+    wide = Beams(side((100.0, 100.0), cutoff_db=-40.0), side((100.0, 100.0), cutoff_db=-40.0))
+    assert plan(**jobs(wide, shape=(2000, 2000))).predicted_seconds > 1.8 * lit
+
+
+@compiled
+@pytest.mark.parametrize("width_deg", [20.0, 35.0, 60.0])
+def test_the_ways_native_weighs_are_foreseen(width_deg):
+    from test_34_engine_beam import beam
+    from test_34_engine_native import ecef, fly, grid, scatter
+
+    pixels = grid(48, 64)
+    scene = fly(scatter(pixels), pulses=64)
+    places = ecef(pixels)
+    beams = Beams(beam(scene.tx, (12, 0, 0), width_deg, sway_deg=width_deg), beam(scene.rx, (12, 0, 0), width_deg))
+    counts = np.zeros(4, np.int64)
+    native.form(native.prepare(scene.profiles(places)), places, beams=beams, counts=counts)
+    middle = places[8::16, 8::16]
+    steps = np.stack([(places[8::16, 9::16] - middle).reshape(-1, 3), (places[9::16, 8::16] - middle).reshape(-1, 3)])
+    found = footprint(beams, scene.tx, scene.rx, steps, middle.reshape(-1, 3))
+    np.testing.assert_allclose([found.smooth, found.rough, found.dark], counts[1:] / counts.sum(), atol=0.1)
+
+
+@compiled
+def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
+    beams = Beams(side((8.0, 16.0)), side((8.0, 16.0)))
+    assert plan(-60.0, **jobs(beams)).engine == "native"
+    fine = plan(-100.0, **jobs(beams))
+    assert fine.engine != "native"
+    assert fine.setting.error_db <= -100
+
+
+def aimed(position_m, middle_m, width_deg):
+    """A beam on a level body that flies along the track, aimed at the scene's middle from the middle of the track."""
+    ahead = (position_m[-1] - position_m[0]) * [1, 1, 0]
+    ahead /= np.linalg.norm(ahead)
+    body = np.stack([ahead, np.cross(ahead, [0, 0, 1.0]), [0, 0, -1.0]], 1)
+    forward, right, down = (middle_m - position_m[len(position_m) // 2]) @ body
+    boresight_deg = np.degrees([np.arctan2(right, forward), np.arctan2(-down, np.hypot(forward, right))])
+    angle, gain = gaussian_cut(width_deg, cutoff_db=-20.0, limit_rad=np.pi / 2)
+    axes = antenna_axes(np.broadcast_to(body, (len(position_m), 3, 3)), tuple(boresight_deg))
+    return Beam(axes, angle, gain, angle, gain)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+@pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
+def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):
+    drawn = draw(np.random.default_rng(seed), pixels=64, pulses=90)
+    tx, rx = drawn.job.tx_position_m, drawn.job.rx_position_m
+    middle = drawn.job.place_m[len(drawn.job.place_m) // 2]
+    across_deg = np.degrees(64 * drawn.grid.spacing_m / np.linalg.norm(middle - tx[45]))
+    beams = Beams(*(aimed(position, middle, min(60.0, widths * across_deg)) for position in (tx, rx)))
+    lit = illuminate(beams, tx, rx, drawn.job.place_m)
+    found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db, costs=COSTS)
+    engine = ENGINES[found.engine]
+    history = {"echo": drawn.spectra, "profile": found.history(drawn.profiles)}[engine.reads]
+    places = drawn.grid.positions()
+    image = engine.form(engine.prepare(history, **found.options), places, beams=beams, **found.form_options)
+    some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
+    exact = reference.form(drawn.spectra, places[some], beams=beams)
+    assert numerical_error(image[some].astype(np.complex64), exact).rms_db <= drawn.accuracy_db
