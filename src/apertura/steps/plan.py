@@ -76,28 +76,34 @@ def plan_pair(
     """
     outlook = outlook_of(campaign, flight, pair, echo=echo)
     grid = campaign_grid(campaign, outlook)
-    processing = campaign.settings.processing
-    job = job_of(
-        outlook, grid, heights or expected_heights(campaign, grid), tile_px=processing.tile_px, threads=threads
-    )
-    plan = make_plan(
-        replace(
-            job,
-            memory_bytes=memory_limit(),
-            **_relief(campaign, grid),
-            **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
-        ),
-        accuracy_db=processing.accuracy_db,
-        costs=campaign_costs(campaign),
-        overrides={name: getattr(processing, name) for name in OVERRIDES},
-    )
+    job = campaign_job(campaign, pair, outlook, grid, heights or expected_heights(campaign, grid), threads=threads)
+    plan = plan_job(campaign, job)
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()
     check_fits(plan, free_disk=None if written else shutil.disk_usage(campaign.root).free, where=f"{flight}/{pair}")
     return plan
 
 
+def plan_job(campaign: Campaign, job: Job) -> Plan:
+    """Return how a job will be done at the accuracy, with the overrides and the costs of a campaign."""
+    processing = campaign.settings.processing
+    overrides = {name: getattr(processing, name) for name in OVERRIDES}
+    return make_plan(job, accuracy_db=processing.accuracy_db, costs=campaign_costs(campaign), overrides=overrides)
+
+
+def campaign_job(
+    campaign: Campaign, pair: str, outlook: Outlook, grid: SceneGrid, heights: Heights, *, threads: int = 1
+) -> Job:
+    """Return the planner's job of a pair, or of a part of its pulses, with the campaign's DEM, antennas and memory."""
+    return replace(
+        job_of(outlook, grid, heights, tile_px=campaign.settings.processing.tile_px, threads=threads),
+        memory_bytes=memory_limit(),
+        **_relief(campaign, grid),
+        **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
+    )
+
+
 def job_of(outlook: Outlook, grid: SceneGrid, heights: Heights, *, tile_px: int, threads: int) -> Job:
-    """Return the planner's job of a pair on a grid and its ground."""
+    """Return the planner's job of what is known of a pair, on a grid and its ground."""
     rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
     frequency = outlook.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)

@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.image.beam import Beams
 from apertura.image.candidates import Setting, candidates
-from apertura.image.cost import Costs, Load, read_costs
+from apertura.image.cost import Costs, Load, tile_seconds
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles, Spectra
 from apertura.image.plan import Job, Plan
-from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.view import look
-from apertura.steps.antennas import lit
+from apertura.steps.costs import campaign_costs
 from apertura.steps.history import profiles_of
 from apertura.steps.outlook import campaign_grid, outlook_of
-from apertura.steps.plan import OVERRIDES, job_of
+from apertura.steps.plan import campaign_job, plan_job
 from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.interactive import write_page
@@ -105,13 +104,10 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     spectra, beams = outlook.spectra.of_pulses(block), outlook.beams and outlook.beams.at(block)
     outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra, beams=beams)
     heights = open_heights(campaign)
-    job = job_of(outlook, grid, heights, tile_px=processing.tile_px, threads=1)
-    job = replace(job, **lit(campaign, pair, beams, grid, (outlook.tx, outlook.rx)))
-    costs = _of_engines(read_costs())
-    overrides = {name: getattr(processing, name) for name in OVERRIDES if name not in {"engine"}}
-    plan = make_plan(job, accuracy_db=processing.accuracy_db, costs=costs, overrides=overrides)
+    job = campaign_job(campaign, pair, outlook, grid, heights)
+    plan, costs = plan_job(campaign, job), campaign_costs(campaign)
     part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
-    points = measure(part, plan, _settings(job, costs), seconds=seconds)
+    points = measure(part, plan, _settings(job, costs), seconds=seconds, shared_seconds=tile_seconds(costs, job.load))
     size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
@@ -136,12 +132,6 @@ def _part(
     return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin, beams)
 
 
-def _of_engines(costs: Costs) -> Costs:
-    """Return costs without placing pixels and storing tiles, which every engine shares: the chart times engines."""
-    shared = {name: 1e-15 for name in costs.seconds if name == "tile" or name.startswith("place.")}
-    return replace(costs, seconds={**costs.seconds, **shared})
-
-
 def _settings(job: Job, costs: Costs) -> list[Setting]:
     """Return the settings to measure, cheapest first."""
     some = slice(None, None, max(1, len(job.tx_position_m) // 48))
@@ -155,8 +145,14 @@ def _settings(job: Job, costs: Costs) -> list[Setting]:
     ]
 
 
-def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
-    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
+def measure(
+    part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float, shared_seconds: float = 0.0
+) -> list[Point]:
+    """Return what the plan, the reference and as many settings as time allows take and err, fastest first.
+
+    The chart times engines: `shared_seconds`, which every engine spends on placing pixels and storing tiles, is taken
+    off what was predicted.
+    """
     begin = perf_counter()
     points = [_reference_point(part, plan)]
     if plan.engine != "reference":
@@ -166,6 +162,7 @@ def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: flo
         if perf_counter() - begin > seconds:
             break
         points.append(_measured(part, setting, None))
+    points = [replace(point, predicted_seconds=point.predicted_seconds - shared_seconds) for point in points]
     return _with_front(sorted(points, key=lambda point: point.seconds))
 
 
