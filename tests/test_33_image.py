@@ -14,6 +14,7 @@ from apertura.image.extent import auto_bounds, auto_spacing, swath, utm_crs
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles, Spectra
 from apertura.image.peaks import Patch, cut_through, find_peak
+from apertura.image.placement import block
 from apertura.image.quality import coherence_factor, numerical_error, survey
 from apertura.image.tiles import form_tiles
 
@@ -115,8 +116,28 @@ def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
     whole = grid.positions()
     for window in grid.tiles(32):
         count[window] += 1
-        np.testing.assert_allclose(grid[window].positions(), whole[window], atol=1e-8)
+        np.testing.assert_array_equal(grid[window].positions(), whole[window])
     assert (count == 1).all()
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
+@pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
+def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):
+    """To 10 nm, far below the wavelength; in between nodes, across blocks, and high above the grid's ground."""
+    west_m, north_m = {"EPSG:32632": (330e3, 9.2e6), "EPSG:2056": (2.6e6, 1.2e6)}.get(crs, (1e6, -2e6))
+    grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270), 620.0)[3:, 5:]
+    height = np.random.default_rng(1).uniform(-400, 4000, grid.shape)
+    for above in (None, height):
+        exact = ecef_from_projected(
+            crs, *np.meshgrid(grid.x_m, grid.y_m), np.full(grid.shape, 620.0) if above is None else above
+        )
+        np.testing.assert_allclose(grid.positions(above), exact, rtol=0, atol=1e-8)
+
+
+def test_blocks_too_wide_for_polynomials_are_placed_by_proj():
+    options = ("EPSG:32632", (9.2e6, 330e3))
+    assert block(*options, 1.0, 0.0, (0, 0)).exact
+    assert not block(*options, 300.0, 0.0, (0, 0)).exact
 
 
 def test_pixels_are_where_their_coordinates_say():

@@ -3,6 +3,8 @@
 Positions are computed in ECEF (EPSG:4978) float64: no zone, no scale factor, no curvature to model.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
@@ -36,7 +38,7 @@ def ecef_from_geodetic(latitude_deg: Positions, longitude_deg: Positions, height
     >>> ecef_from_geodetic(np.array(0.0), np.array(0.0), np.array(10.0))
     array([6378147.,       0.,       0.])
     """
-    transformer = Transformer.from_crs(GEODETIC, ECEF)
+    transformer = _transformer(GEODETIC, ECEF)
     return np.stack(transformer.transform(latitude_deg, longitude_deg, height_m), axis=-1)
 
 
@@ -48,7 +50,7 @@ def geodetic_from_ecef(position: Positions) -> Positions:
     >>> geodetic_from_ecef(np.array([6378147.0, 0.0, 0.0])).round(6) + 0.0
     array([ 0.,  0., 10.])
     """
-    transformer = Transformer.from_crs(ECEF, GEODETIC)
+    transformer = _transformer(ECEF, GEODETIC)
     return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
 
 
@@ -74,7 +76,7 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     >>> ecef_from_projected("EPSG:32632", *map(np.array, (500000.0, 0.0, 0.0))).round(2) + 0.0
     array([6299611.55,  997760.45,       0.  ])
     """
-    transformer = Transformer.from_crs(CRS(crs).to_3d(), ECEF, always_xy=True, allow_ballpark=False)
+    transformer = _transformer(crs, ECEF)
     position = np.stack(transformer.transform(x, y, height_m), axis=-1)
     if not np.isfinite(position).all():
         raise CampaignError(
@@ -88,8 +90,17 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
 
 def projected_from_ecef(crs: str, position: Positions) -> Positions:
     """Return (..., 3) float64 easting, northing, ellipsoidal height (m) in `crs` of ECEF positions (m)."""
-    transformer = Transformer.from_crs(ECEF, CRS(crs).to_3d(), always_xy=True, allow_ballpark=False)
+    transformer = _transformer(ECEF, crs)
     return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
+
+
+@lru_cache(maxsize=64)
+def _transformer(source: str, target: str) -> Transformer:
+    """Return PROJ's way between two systems, kept: it takes milliseconds to find."""
+    if GEODETIC in (source, target):
+        return Transformer.from_crs(source, target)
+    here, there = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
+    return Transformer.from_crs(here, there, always_xy=True, allow_ballpark=False)
 
 
 def ned_axes(position: Positions) -> NDArray[np.float64]:

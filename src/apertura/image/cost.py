@@ -17,7 +17,7 @@ DEFAULTS: Mapping[str, Mapping[str, float]] = {
         "numba.table": 3.1e-08,
         "numba.pixel": 3.2e-08,
         "reference.subcarrier": 5.3e-10,
-        "place.ecef": 5.0e-07,
+        "place.ecef": 2.0e-08,
         "place.local": 2.7e-09,
         "tile": 4.0e-03,
         "weight": 1.2e-07,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from pyproj.exceptions import CRSError
 
 from apertura.errors import CampaignError
 from apertura.geodesy import ecef_from_projected
+from apertura.image.placement import BLOCK_PX, block
 
 LOCAL = "local"
 
@@ -128,8 +130,29 @@ class SceneGrid:
         ndarray
             (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
         """
-        x, y = np.meshgrid(self.x_m, self.y_m)
-        return self._place(x, y, height_m)
+        if self.crs == LOCAL:
+            return self._place(*np.meshgrid(self.x_m, self.y_m), height_m)
+        places = np.empty((*self.shape, 3))
+        for rows, columns in self._blocks():
+            height = None if height_m is None else height_m[rows, columns]
+            places[rows, columns] = self[rows, columns]._of_block(height)
+        return places
+
+    def _blocks(self) -> Iterator[tuple[slice, slice]]:
+        """Yield the parts of blocks of the whole grid that this window holds."""
+        rows, columns = (
+            [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
+            for first, size in zip(self.first, self.shape, strict=True)
+        )
+        return product(rows, columns)
+
+    def _of_block(self, height_m: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        index = (self.first[0] // BLOCK_PX, self.first[1] // BLOCK_PX)
+        found = block(self.crs, (self.north_m, self.west_m), self.spacing_m, self.height_m, index)
+        if not found.exact:
+            return self._place(*np.meshgrid(self.x_m, self.y_m), height_m)
+        row, column = (np.arange(size) + at % BLOCK_PX for size, at in zip(self.shape, self.first, strict=True))
+        return found.positions(row, column, None if height_m is None else height_m - self.height_m)
 
     def positions_at(
         self, row: ArrayLike, column: ArrayLike, height_m: NDArray[np.float64] | None = None

@@ -8,7 +8,7 @@ sum does not either.
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -140,14 +140,15 @@ def _surface(grid: SceneGrid, heights: Heights, window: Window) -> tuple[NDArray
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
         for part, size in zip(window, grid.shape, strict=True)
     ]
-    row, column = np.meshgrid(*around, indexing="ij")
+    rows, columns = around
+    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
     height = None
     if heights.of is not None:  # a grid of one row or column is continued level
         known = [slice(axis[0], min(axis[-1] + 1, size)) for axis, size in zip(around, grid.shape, strict=True)]
         found = heights.of((known[0], known[1]))
         lacking = [(0, axis.size - size) for axis, size in zip(around, found.shape, strict=True)]
         height = np.pad(found, lacking, mode="edge")
-    position = grid.positions_at(row, column, height)
+    position = wider.positions(height)
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
     return position[inner], surface_normals(position)[inner]
 
