@@ -1,8 +1,7 @@
 """Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,10 +12,11 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.image.beam import Beams
 from apertura.image.candidates import Setting, candidates
-from apertura.image.cost import Costs, Load, read_costs
+from apertura.image.cost import Costs, Load
 from apertura.image.engines import ENGINES, reference
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles, Spectra
+from apertura.image.machine import read_costs
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
@@ -28,29 +28,13 @@ from apertura.steps.plan import OVERRIDES, job_of
 from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.interactive import write_page
-from apertura.study.pareto import draw_points
+from apertura.study.pareto import Point, draw_points, with_front, write_points
 
 FOLDER = Path("results/study")
 PULSES, SIDE_PX, PIXELS = 1024, 256, 200
 _TOLERANCES_RAD = (1.5e-3, 1.5e-4)
 _SLOW_SECONDS = 0.3
 """A former slower than this on the window is timed on fewer of its rows."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """One setting: seconds are for the whole image on one thread, from what its part took."""
-
-    engine: str
-    setting: str
-    pulse_thinning: int
-    seconds: float
-    pixel_pulses_per_s: float
-    error_db: float
-    predicted_seconds: float
-    predicted_error_db: float
-    on_front: bool
-    planned: bool
 
 
 @dataclass(frozen=True)
@@ -166,7 +150,7 @@ def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: flo
         if perf_counter() - begin > seconds:
             break
         points.append(_measured(part, setting, None))
-    return _with_front(sorted(points, key=lambda point: point.seconds))
+    return with_front(sorted(points, key=lambda point: point.seconds))
 
 
 def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
@@ -237,22 +221,3 @@ def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
         result = work()
         times.append(perf_counter() - begin)
     return min(times), result
-
-
-def _with_front(points: Sequence[Point]) -> list[Point]:
-    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
-    best, marked = np.inf, []
-    for point in points:
-        marked.append(replace(point, on_front=point.error_db < best))
-        best = min(best, point.error_db)
-    return marked
-
-
-def write_points(points: Sequence[Point], path: Path) -> None:
-    """Write the points as CSV, one line each."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
-        table.writeheader()
-        for point in points:
-            row = asdict(point)
-            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
