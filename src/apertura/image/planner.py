@@ -15,13 +15,12 @@ from apertura.image.illumination import decide_antennas
 from apertura.image.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db
 from apertura.image.plan import Job, Plan
 from apertura.image.thinning import Presum, design, presum_error_db
-from apertura.image.view import look, phase_rates, upward
+from apertura.image.view import phase_rates, upward
 
 MARGIN_DB = 3.0
 """Predicted errors lie this far below what is asked."""
 
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
-_NET_PULSES = 48
 
 
 def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[str, Any] | None = None) -> Plan:
@@ -58,10 +57,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         band_hz=job.band_hz,
         path_limit_m=job.path_limit_m,
     )
-    some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
-    beams = job.beams and job.beams.at(some)
-    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
-    desk = Desk(job, view, costs, asked)
+    desk = Desk(job, job.view, costs, asked)
     whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)

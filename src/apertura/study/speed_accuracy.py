@@ -20,7 +20,6 @@ from apertura.image.machine import read_costs
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
-from apertura.image.view import look
 from apertura.steps.antennas import lit
 from apertura.steps.history import profiles_of
 from apertura.steps.outlook import campaign_grid, outlook_of
@@ -128,13 +127,9 @@ def _of_engines(costs: Costs) -> Costs:
 
 def _settings(job: Job, costs: Costs) -> list[Setting]:
     """Return the settings to measure, cheapest first."""
-    some = slice(None, None, max(1, len(job.tx_position_m) // 48))
-    beams = job.beams and job.beams.at(some)
-    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
-    every = candidates(view, job.signal, job.load, costs)
     return [
         setting
-        for setting in every
+        for setting in candidates(job.view, job.signal, job.load, costs)
         if setting.engine == "numba" or setting.form_options.get("tolerance_rad") in _TOLERANCES_RAD
     ]
 
