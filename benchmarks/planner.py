@@ -14,10 +14,10 @@ import numpy as np
 from campaigns import Drawn, draw
 
 from apertura.image.candidates import Setting, candidates
-from apertura.image.cost import read_costs
 from apertura.image.engines import ENGINES, numba, reference
+from apertura.image.machine import read_costs
 from apertura.image.plan import Plan
-from apertura.image.planner import ladder, make_plan
+from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.view import look
 
@@ -62,7 +62,7 @@ def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
 
     mine = [Runner(drawn, plan.setting, plan)]
     reached = [error_db(mine[0])]
-    for better in ladder(plan):
+    for better in plan.better:
         if reached[-1] > drawn.accuracy_db:
             mine.append(Runner(drawn, better))
             reached.append(error_db(mine[-1]))

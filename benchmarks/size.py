@@ -71,7 +71,7 @@ def image_seconds(parts: list[slice], history: Profiles, grid: SceneGrid, thread
 
         for part in parts:
             begin = time.perf_counter()
-            tables = native.prepare(history, pulses=part)
+            tables = native.prepare(history.of_pulses(part))
             form_tiles(
                 partial(native.form, tables),
                 grid,

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from apertura.campaign import validated
 from apertura.errors import CampaignError
-from apertura.settings import Processing, Settings
+from apertura.settings import Processing, Settings, validated
 from apertura.template import config_schema, config_template, flights_template
 
 ROOT = Path(__file__).parents[1]

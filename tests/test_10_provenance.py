@@ -40,6 +40,8 @@ def touched(copied, file, module):
         ("ingest/rtklib.py", "ingest", True),
         ("simulate/presets.py", "image", False),
         ("constants.py", "image", True),
+        ("settings/node.py", "ingest", True),
+        ("store/locks.py", "ingest", True),
         ("cli.py", "ingest", False),
     ],
 )

@@ -13,18 +13,19 @@ from apertura.echo.compression import window_weights
 from apertura.errors import CampaignError
 from apertura.image.budget import memory_limit
 from apertura.image.candidates import Signal, candidates
-from apertura.image.cost import Costs, default_costs, kept_costs, machine, read_costs, write_costs
+from apertura.image.cost import Costs
 from apertura.image.edges import crossed_edges, finest_cell_m
 from apertura.image.engines import ENGINES, native, reference
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles
-from apertura.image.models import decide_midpoint, decide_terrain, midpoint_error, phase_rates
+from apertura.image.machine import default_costs, kept_costs, machine, read_costs, write_costs
+from apertura.image.models import decide_midpoint, decide_terrain, midpoint_error
 from apertura.image.plan import Job
-from apertura.image.planner import ladder, make_plan
+from apertura.image.planner import make_plan
 from apertura.image.quality import numerical_error
 from apertura.image.thinning import design, presum_error_db, thin
 from apertura.image.tiles import form_blocks
-from apertura.image.view import forms, look
+from apertura.image.view import forms, look, phase_rates
 from apertura.steps.plan import check_fits, planned_heights
 from apertura.steps.terrain import Heights
 
@@ -75,11 +76,11 @@ def certified(drawn) -> tuple[float, int]:
     """Return the certified error and how often a better setting was needed, as the image step goes about it."""
     found = make_plan(drawn.job, accuracy_db=drawn.accuracy_db, costs=COSTS)
     error = random_values(drawn.spectra, drawn.grid, formed(drawn, found.setting, found.history(drawn.profiles)))
-    for redone, better in enumerate(ladder(found)):
+    for redone, better in enumerate(found.better):
         if error <= drawn.accuracy_db:
             return error, redone
         error = random_values(drawn.spectra, drawn.grid, formed(drawn, better, drawn.profiles))
-    return error, len(ladder(found))
+    return error, len(found.better)
 
 
 SETTINGS = (
@@ -210,14 +211,14 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
     assert found.options == {"oversampling": 2}
     assert found.predicted_error_db > -60
     assert "does not meet" in found.reasons["engine"]
-    assert ladder(found)[-1].engine == "reference"
+    assert found.better[-1].engine == "reference"
 
 
 def test_each_rung_of_the_ladder_errs_6_db_less_than_the_last():
     found = plan()
-    errors = [found.setting.error_db, *(rung.error_db for rung in ladder(found))]
+    errors = [found.setting.error_db, *(rung.error_db for rung in found.better)]
     assert all(after <= before - 6 for before, after in pairwise(errors))
-    assert ladder(found)[-1].engine == "reference"
+    assert found.better[-1].engine == "reference"
 
 
 @pytest.mark.parametrize(("baseline_m", "allowed"), [(2.4, True), (2.6, False)])
@@ -488,8 +489,8 @@ def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
     assert split.predicted_seconds > one.predicted_seconds
     assert "of tables do not fit into" in split.reasons["pulse_blocks"]
     assert replace(split.setting, pulse_blocks=1, seconds=one.setting.seconds) == one.setting  # nothing else changes
-    assert all(rung.pulse_blocks > 1 for rung in ladder(split)[:-1])  # finer tables outgrow it as well
-    assert ladder(split)[-1].pulse_blocks == 1
+    assert all(rung.pulse_blocks > 1 for rung in split.better[:-1])  # finer tables outgrow it as well
+    assert split.better[-1].pulse_blocks == 1
     check_fits(split, free_disk=None, where="f01/a-b", memory=split.memory_bytes)
     short = plan(**LONG, memory_bytes=beside // 2)
     with pytest.raises(CampaignError, match="imaging needs"):

@@ -13,12 +13,12 @@ from apertura.errors import CampaignError
 from apertura.export import layers as exported
 from apertura.geodesy import projected_from_ecef
 from apertura.image import geoid, sightlines
+from apertura.image.dem import open_terrain
 from apertura.image.engines import reference
 from apertura.image.extent import clearance, swath
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Spectra
 from apertura.image.peaks import find_peak, ground_position
-from apertura.image.terrain import open_terrain
 from apertura.image.visibility import (
     Relief,
     antennas_over,

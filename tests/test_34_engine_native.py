@@ -338,7 +338,8 @@ def test_a_raised_target_focuses_where_geometry_predicts(isa):
 def test_blocks_of_pulses_add_up(isa, plain):
     _, pixels, profiles = plain
     whole = native.form(native.prepare(profiles), ecef(pixels))
-    parts = [native.form(native.prepare(profiles, pulses=cut), ecef(pixels)) for cut in (slice(0, 33), slice(33, None))]
+    blocks = (profiles.of_pulses(slice(0, 33)), profiles.of_pulses(slice(33, None)))
+    parts = [native.form(native.prepare(block), ecef(pixels)) for block in blocks]
     assert decibels(sum(parts) - whole, whole) <= -110
 
 
@@ -394,7 +395,7 @@ def test_bad_input_is_refused(plain):
     with pytest.raises(ValueError, match="degree=3"):
         native.prepare(profiles, degree=3)
     with pytest.raises(ValueError, match="holds no pulse"):
-        native.prepare(profiles, pulses=slice(0, 0))
+        native.prepare(profiles.of_pulses(slice(0, 0)))
     with pytest.raises(ValueError, match="must be finite"):
         native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
     with pytest.raises(ValueError, match="oversampling"):

@@ -10,7 +10,8 @@ from conftest import copy_writable
 
 from apertura.campaign import Campaign
 from apertura.steps.plan import plan_pair
-from apertura.study.speed_accuracy import Point, _with_front, speed_accuracy, write_points
+from apertura.study.pareto import Point, with_front, write_points
+from apertura.study.speed_accuracy import speed_accuracy
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def test_the_page_holds_every_point_and_asks_no_other_machine(charted):
 def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
     point = Point("native", "a", 1, 1.0, 1e9, -60.0, 1.0, -60.0, on_front=False, planned=False)
     points = [point, replace(point, seconds=2.0), replace(point, seconds=3.0, error_db=-60.1)]
-    marked = _with_front(points)
+    marked = with_front(points)
     assert [one.on_front for one in marked] == [True, False, True]
     write_points(marked, tmp_path / "points.csv")
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]

@@ -1,16 +1,12 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-from pydantic import BaseModel, ValidationError
-
 from apertura.errors import CampaignError
 from apertura.flights import FLIGHTS, Flight, read_flights
-from apertura.settings import Antenna, OfdmWaveform, Settings
+from apertura.settings import Antenna, OfdmWaveform, Settings, read_settings
 
 CONFIG = Path("config/config.yaml")
 
@@ -35,7 +31,7 @@ class Campaign:
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
         root = Path(root)
-        settings = _read_settings(root / CONFIG)
+        settings = read_settings(root / CONFIG)
         return cls(root, settings, tuple(read_flights(root / FLIGHTS, nodes=settings.nodes)))
 
     @property
@@ -215,73 +211,3 @@ class Campaign:
                 remedy="Copy the .mat files there, named <node>.<anything>.mat.",
             )
         return found
-
-
-def _read_settings(path: Path) -> Settings:
-    if not path.is_file():
-        raise CampaignError(
-            "no such file", where=path, expected="a campaign folder", remedy="`apertura init` writes a commented one."
-        )
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CampaignError(
-            f"not readable as YAML ({' '.join(str(error).split())})",
-            where=path,
-            expected="YAML",
-            remedy="Mend the line named.",
-        ) from error
-    return validated(document, where=path)
-
-
-def validated(document: object, *, where: object) -> Settings:
-    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
-
-    Raises
-    ------
-    CampaignError
-        With file, key, what was found and what was expected.
-
-    Examples
-    --------
-    >>> validated({"campaing": "x"}, where="config.yaml")
-    Traceback (most recent call last):
-    ...
-    apertura.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); campaign: missing; ...
-    """
-    try:
-        return Settings.model_validate(document)
-    except ValidationError as error:
-        wrong = [_complaint(dict(item)) for item in error.errors(include_url=False)]
-        raise CampaignError(
-            "; ".join(sorted(wrong, key=lambda line: "unknown key" not in line)),
-            where=where,
-            expected="the keys and values of config/config.yaml as `apertura init` writes it",
-            remedy="Correct what is named.",
-        ) from error
-
-
-def _complaint(item: dict[str, Any]) -> str:
-    location = [str(part) for part in item["loc"] if part not in {"ofdm", "phase_history"}]
-    key = ".".join(location) or "the whole file"
-    if item["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(location[-1], _known_keys(Settings), n=1, cutoff=0.5)
-        return f"{key}: unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
-    if item["type"] == "missing":
-        return f"{key}: missing"
-    found = "" if isinstance(item["input"], dict | BaseModel) else f" (found {item['input']!r})"
-    return f"{key}: {item['msg'].removeprefix('Value error, ')}{found}"
-
-
-def _known_keys(model: type[BaseModel]) -> list[str]:
-    return sorted(_walk_keys(model.model_json_schema()))
-
-
-def _walk_keys(schema: object) -> set[str]:
-    if isinstance(schema, list):
-        return set().union(*map(_walk_keys, schema))
-    if not isinstance(schema, dict):
-        return set()
-    nested = set().union(*map(_walk_keys, schema.values()))
-    properties = schema.get("properties", {})
-    return nested | set(properties) if isinstance(properties, dict) else nested

@@ -90,7 +90,7 @@ def chart(
 def calibrate_cost() -> None:
     """Measure what imaging costs on this machine, for the planner; takes less than a minute."""
     from apertura.image.calibration import measure_costs
-    from apertura.image.cost import write_costs
+    from apertura.image.machine import write_costs
 
     costs = measure_costs()
     for name, seconds in sorted(costs.seconds.items()):

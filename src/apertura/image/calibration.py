@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.image.beam import Beam, Beams
-from apertura.image.cost import Costs, default_costs, machine
+from apertura.image.cost import Costs
 from apertura.image.engines import ENGINES, native, numba, reference
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.history import Profiles, Spectra
+from apertura.image.machine import default_costs, machine
 from apertura.image.thinning import design, thin
 
 BANDWIDTH_HZ, CENTRE_HZ = 400e6, 1.2e9

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.image.models import phase_rates, upward
+from apertura.image.view import phase_rates, upward
 
 
 def crossed_edges(

@@ -14,6 +14,9 @@ from apertura.image.history import Profiles
 from apertura.image.illumination import Illumination
 from apertura.image.models import Decision, plane_through
 from apertura.image.thinning import Presum, thin
+from apertura.image.view import View, look
+
+_VIEW_PULSES = 48
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,13 @@ class Job:
         rows, columns = self.shape
         tiles = -(-rows // self.tile_px) * -(-columns // self.tile_px)
         return Load(rows * columns, len(self.tx_position_m), self.subcarriers, tiles, 0, self.frame)
+
+    @property
+    def view(self) -> View:
+        """How the scene is seen, from some of the pulses."""
+        some = slice(None, None, max(1, len(self.tx_position_m) // _VIEW_PULSES))
+        beams = self.beams and self.beams.at(some)
+        return look(self.tx_position_m[some], self.rx_position_m[some], self.net_m, self.spacing_m, beams)
 
     @property
     def band_hz(self) -> tuple[float, float]:

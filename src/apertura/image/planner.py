@@ -1,42 +1,26 @@
 """The planner: how an image will be formed, why, how exact and how costly, before anything runs."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.image.budget import block_decision, blocked, bytes_needed, setting_decisions, wall_seconds
-from apertura.image.candidates import Setting, candidates, power_sum_db
-from apertura.image.cost import Costs, tile_seconds
+from apertura.image.budget import block_decision, bytes_needed, setting_decisions, wall_seconds
+from apertura.image.candidates import Setting, power_sum_db
+from apertura.image.cost import Costs
+from apertura.image.desk import Desk
 from apertura.image.edges import crossed_edges
 from apertura.image.illumination import decide_antennas
-from apertura.image.models import (
-    Decision,
-    decide_midpoint,
-    decide_terrain,
-    midpoint_error_db,
-    phase_rates,
-    upward,
-)
+from apertura.image.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db
 from apertura.image.plan import Job, Plan
 from apertura.image.thinning import Presum, design, presum_error_db
-from apertura.image.view import View, look
+from apertura.image.view import phase_rates, upward
 
 MARGIN_DB = 3.0
 """Predicted errors lie this far below what is asked."""
 
-UNSEEN_DB = 3.0
-"""And this much further before the echo is there: at random pixels of a sparse scene errors weigh more."""
-
-NEAR = 1.3
-"""A setting that costs no more than this times the cheapest is near it."""
-
-ALIKE = 1.05
-"""And one that costs no more than this times the chosen is as cheap: the most exact of them is taken."""
-
 THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
-_NET_PULSES = 48
 
 
 def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[str, Any] | None = None) -> Plan:
@@ -73,10 +57,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         band_hz=job.band_hz,
         path_limit_m=job.path_limit_m,
     )
-    some = slice(None, None, max(1, len(job.tx_position_m) // _NET_PULSES))
-    beams = job.beams and job.beams.at(some)
-    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
-    desk = _Desk(job, view, costs, asked)
+    desk = Desk(job, job.view, costs, asked)
     whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
     thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
     midpoint = _decide_midpoint(desk, accuracy_db)
@@ -110,71 +91,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     )
 
 
-def ladder(plan: Plan) -> tuple[Setting, ...]:
-    """Return the plan's next better settings, in the order to try them; they take the profiles as they are."""
-    return plan.better
-
-
-@dataclass(frozen=True)
-class _Desk:
-    """What every decision looks at."""
-
-    job: Job
-    view: View
-    costs: Costs
-    asked: Mapping[str, Any]
-
-    @property
-    def content_db(self) -> float:
-        """How much more errors may weigh at the scene's pixels than at those of a flat, incoherent one."""
-        return UNSEEN_DB if self.job.content_db is None else max(0.0, self.job.content_db)
-
-    def cheapest(self, pulses: int, target_db: float) -> Setting:
-        """Return the cheapest setting that meets the target, or the best there is.
-
-        What the content may cost is paid for as long as it is cheap: beyond that the certificate decides, and tiles
-        that need it are redone.
-        """
-        load = replace(self.job.load, pulses=pulses)
-        options = candidates(self.view, self.job.signal, load, self.costs, asked=self.asked)
-        if not options:
-            raise CampaignError(
-                f"engine {self.asked.get('engine')} was not built when apertura was installed",
-                where="config/config.yaml: processing.engine",
-                expected="an engine that can run here",
-                remedy="Install with a C++ compiler, or choose another engine.",
-            )
-        exact = [setting for setting in options if setting.error_db <= target_db]
-        if not exact:
-            return min(options, key=lambda setting: setting.error_db)
-        near = [setting for setting in exact if setting.seconds <= NEAR * exact[0].seconds]
-        sure = (setting for setting in near if setting.error_db <= target_db - self.content_db)
-        chosen = next(sure, min(near, key=lambda setting: setting.error_db))
-        alike = (setting for setting in exact if setting.seconds <= ALIKE * chosen.seconds)
-        return min(alike, key=lambda setting: setting.error_db)
-
-    def ladder(self, error_db: float, engine: str) -> tuple[Setting, ...]:
-        """Return per 6 dB gained the cheapest setting, ending with the reference."""
-        options = candidates(self.view, self.job.signal, self.job.load, self.costs)
-        rungs: list[Setting] = []
-        while error_db > -130:
-            better = [s for s in options if s.error_db <= error_db - 6 and s.engine != "reference"]
-            if not better or engine == "reference":
-                break
-            rungs.append(better[0])
-            error_db = better[0].error_db
-        last = [setting for setting in options if setting.engine == "reference" and engine != "reference"]
-        return (*(self.fitted(rung, None) for rung in rungs), *last)
-
-    def fitted(self, setting: Setting, presum: Presum | None) -> Setting:
-        """Return the setting in as many pulse blocks as fit into memory; each one places the tiles anew."""
-        found = blocked(setting, self.job, presum, asked=self.asked.get("pulse_blocks"))
-        return replace(
-            found, seconds=found.seconds + (found.pulse_blocks - 1) * tile_seconds(self.costs, self.job.load)
-        )
-
-
-def _decide_thinning(desk: _Desk, whole: Setting, accuracy_db: float) -> tuple[Decision, Presum | None, Setting]:
+def _decide_thinning(desk: Desk, whole: Setting, accuracy_db: float) -> tuple[Decision, Presum | None, Setting]:
     job, asked = desk.job, desk.asked.get("pulse_thinning")
     tx_m, rx_m, pulses = job.tx_position_m, job.rx_position_m, len(job.tx_position_m)
     _, widest = phase_rates(tx_m, rx_m, job.place_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
@@ -221,7 +138,7 @@ def _presum(job: Job, factors: tuple[int, ...], widest: float, limit_db: float) 
     return None
 
 
-def _decide_midpoint(desk: _Desk, accuracy_db: float) -> Decision:
+def _decide_midpoint(desk: Desk, accuracy_db: float) -> Decision:
     job = desk.job
     some = slice(None, None, max(1, len(job.tx_position_m) // 256))
     found = decide_midpoint(
@@ -240,7 +157,7 @@ def _decide_midpoint(desk: _Desk, accuracy_db: float) -> Decision:
     return Decision("midpoint", bool(asked), f"asked for in config/config.yaml; {found.reason}", error_db)
 
 
-def _decide_terrain(desk: _Desk) -> Decision:
+def _decide_terrain(desk: Desk) -> Decision:
     job = desk.job
     found = decide_terrain(
         job.heights_m,

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.image.beam import Beams
-from apertura.image.cost import machine
 from apertura.image.illumination import NO_BEAMS, Footprint, footprint
+from apertura.image.machine import machine
 
 
 @dataclass(frozen=True)
@@ -84,3 +84,55 @@ def forms(
     parts = (float(fast.mean()), float((alike & ~fast).mean() + alone.mean()))
     error = np.where(alike, shared, np.where(alone, own, 0.0))
     return (*parts, float(1 - sum(parts))), float(np.sqrt((error**2).mean()))
+
+
+def phase_rates(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64], *, wavelength_m: float
+) -> tuple[float, float]:
+    """Return the widest spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
+
+    Parameters
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, metres; consecutive pulses.
+    place_m
+        (place, 3) float64, metres: a net over the scene, its middle at the middle of the array.
+    wavelength_m
+        Of the highest frequency.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities.
+
+    Examples
+    --------
+    >>> track = np.stack([0.05 * np.arange(50.0), np.zeros(50), np.full(50, 10.0)], -1)
+    >>> places = np.array([[-5.0, 10, 0], [1.25, 10, 0], [7.5, 10, 0]])
+    >>> spread, widest = phase_rates(track, track, places, wavelength_m=0.25)
+    >>> 0.3 < spread < 0.4, widest < spread
+    (True, True)
+    """
+    spread = widest = 0.0
+    for first in range(0, len(tx_m) - 1, 256):
+        part = slice(first, first + 257)
+        path = sum(np.linalg.norm(place_m - antenna[part, None], axis=-1) for antenna in (tx_m, rx_m))
+        rate = np.diff(path, axis=0)
+        spread = max(spread, float(np.ptp(rate, axis=1).max()))
+        widest = max(widest, float(np.abs(rate - rate[:, [len(place_m) // 2]]).max()))
+    return spread / wavelength_m, widest / wavelength_m
+
+
+def upward(net_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit normal of a net of places (row, column, 3) whose rows go south and columns east.
+
+    Examples
+    --------
+    >>> east, south = np.meshgrid(np.arange(3.0), np.arange(2.0))
+    >>> upward(np.stack([east, -south, 0 * east], -1))
+    array([0., 0., 1.])
+    """
+    if min(net_m.shape[:2]) < 2:
+        first = net_m[0, 0]
+        return np.asarray(first / np.linalg.norm(first)) if np.linalg.norm(first) > 6e6 else np.array([0.0, 0.0, 1.0])
+    normal = np.cross(net_m[0, -1] - net_m[0, 0], net_m[0, 0] - net_m[-1, 0])
+    return np.asarray(normal / np.linalg.norm(normal))

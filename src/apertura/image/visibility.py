@@ -87,13 +87,11 @@ class Relief:
     Attributes
     ----------
     height_m
-        (row, column) float32, metres above `base_m`.
+        (row, column) float32, metres above the grid's flat model, `grid.height_m`.
     highest_m
         (block row, block column) float32: highest ground of each block of 16 × 16 pixels and one pixel around it.
     lowest_m
         Lowest ground.
-    base_m
-        Height that the others count from.
     spacing_m
         Of the pixels.
     curvature_per_m
@@ -103,18 +101,16 @@ class Relief:
     height_m: NDArray[np.float32]
     highest_m: NDArray[np.float32]
     lowest_m: float
-    base_m: float
     spacing_m: float
     curvature_per_m: float
 
     @classmethod
     def of(cls, grid: SceneGrid, heights: Callable[[Window], Floats]) -> "Relief":
         """Return the relief of a scene from what gives the heights (m) of a window; they are read by strips."""
-        base = float(grid.height_m)
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
-            relative[strip] = heights(strip) - base
+            relative[strip] = heights(strip) - float(grid.height_m)
         rows, columns = (-(-size // BLOCK) for size in grid.shape)
         highest = np.empty((rows, columns), np.float32)
         for row in range(rows):
@@ -125,7 +121,6 @@ class Relief:
             relative,
             highest,
             float(relative.min()),
-            base,
             grid.spacing_m,
             0.0 if grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M,
         )

@@ -7,9 +7,10 @@ import numpy as np
 
 from apertura.errors import CampaignError
 from apertura.geodesy import geodetic_from_ecef
+from apertura.image.dem import open_terrain
 from apertura.image.geoid import geoid_file, undulation
 from apertura.image.grid import SceneGrid
-from apertura.image.terrain import Terrain, open_terrain
+from apertura.image.terrain import Terrain
 from apertura.provenance import sha256_file
 from apertura.settings import Scene
 

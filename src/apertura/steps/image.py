@@ -5,7 +5,6 @@ from pathlib import Path
 import zarr
 
 from apertura.campaign import Campaign
-from apertura.image.planner import ladder
 from apertura.steps.antennas import antennas_report
 from apertura.steps.forming import Work
 from apertura.steps.quality import certified, measures
@@ -29,7 +28,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "engine": plan.engine,
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
-            **certified(work, target, ladder(plan), campaign.settings.processing.accuracy_db),
+            **certified(work, target, plan.better, campaign.settings.processing.accuracy_db),
             **measures(work, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.heights.report,

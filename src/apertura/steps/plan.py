@@ -20,9 +20,9 @@ from apertura.image.engines import reference
 from apertura.image.extent import swath
 from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.history import Spectra
-from apertura.image.models import content_loss_db
 from apertura.image.plan import Job, Plan
 from apertura.image.planner import make_plan
+from apertura.image.quality import content_loss_db
 from apertura.steps.antennas import lit
 from apertura.steps.costs import campaign_costs
 from apertura.steps.ground import Ground

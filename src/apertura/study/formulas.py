@@ -154,23 +154,12 @@ def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture
     return HALF_POWER_OF_SINC * wavelength_m * slant_range_m / (2 * aperture_m)
 
 
-def expected_coherence_factor(snr: float, pulses: int) -> float:
-    """Return E|Σs|²/(M·E Σ|s|²) of M equal echoes in white noise: (SNR + 1/M)/(SNR + 1), 1/M without echo.
+def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
+    """Return the power SNR of one compressed pulse at which M equal echoes in white noise are so coherent.
 
     Notes
     -----
-    Source: docs/theory/study.md, "Coherence factor".
-
-    Examples
-    --------
-    >>> round(expected_coherence_factor(70.0, 200), 3), expected_coherence_factor(0.0, 200)
-    (0.986, 0.005)
-    """
-    return (snr + 1 / pulses) / (snr + 1)
-
-
-def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
-    """Return the power SNR of one compressed pulse at which `expected_coherence_factor` is `coherence`.
+    Source: docs/theory/study.md, "Coherence factor": Γ = E|Σs|²/(M·E Σ|s|²) = (SNR + 1/M)/(SNR + 1).
 
     Examples
     --------

@@ -103,7 +103,7 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
     Parameters
     ----------
     points
-        Fields of `apertura.study.speed_accuracy.Point`.
+        Fields of `apertura.study.pareto.Point`.
     path
         HTML to write.
     title

@@ -1,9 +1,11 @@
-"""The speed-accuracy chart as a PNG: a point per setting, the Pareto front, the planner's choice."""
+"""The points of the speed-accuracy chart, a setting each: the Pareto front among them, as CSV and as PNG."""
 
+import csv
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Protocol
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from apertura.study.charts import save
@@ -15,26 +17,42 @@ LOOKS = {
 }
 
 
-class Charted(Protocol):
-    """What a point must have."""
+@dataclass(frozen=True)
+class Point:
+    """One setting: seconds are for the whole image on one thread, from what its part took."""
 
-    @property
-    def engine(self) -> str: ...  # noqa: D102
-    @property
-    def setting(self) -> str: ...  # noqa: D102
-    @property
-    def pulse_thinning(self) -> int: ...  # noqa: D102
-    @property
-    def seconds(self) -> float: ...  # noqa: D102
-    @property
-    def error_db(self) -> float: ...  # noqa: D102
-    @property
-    def on_front(self) -> bool: ...  # noqa: D102
-    @property
-    def planned(self) -> bool: ...  # noqa: D102
+    engine: str
+    setting: str
+    pulse_thinning: int
+    seconds: float
+    pixel_pulses_per_s: float
+    error_db: float
+    predicted_seconds: float
+    predicted_error_db: float
+    on_front: bool
+    planned: bool
 
 
-def draw_points(points: Sequence[Charted], path: Path, *, title: str, accuracy_db: float) -> None:
+def with_front(points: Sequence[Point]) -> list[Point]:
+    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
+    best, marked = np.inf, []
+    for point in points:
+        marked.append(replace(point, on_front=point.error_db < best))
+        best = min(best, point.error_db)
+    return marked
+
+
+def write_points(points: Sequence[Point], path: Path) -> None:
+    """Write the points as CSV, one line each."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
+        table.writeheader()
+        for point in points:
+            row = asdict(point)
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
     """Draw error against seconds.
 
     Parameters

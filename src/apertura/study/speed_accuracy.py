@@ -1,8 +1,7 @@
 """Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,7 +18,6 @@ from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles, Spectra
 from apertura.image.plan import Job, Plan
 from apertura.image.quality import numerical_error
-from apertura.image.view import look
 from apertura.steps.costs import campaign_costs
 from apertura.steps.history import profiles_of
 from apertura.steps.outlook import campaign_grid, outlook_of
@@ -27,29 +25,13 @@ from apertura.steps.plan import campaign_job, plan_job
 from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.interactive import write_page
-from apertura.study.pareto import draw_points
+from apertura.study.pareto import Point, draw_points, with_front, write_points
 
 FOLDER = Path("results/study")
 PULSES, SIDE_PX, PIXELS = 1024, 256, 200
 _TOLERANCES_RAD = (1.5e-3, 1.5e-4)
 _SLOW_SECONDS = 0.3
 """A former slower than this on the window is timed on fewer of its rows."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """One setting: seconds are for the whole image on one thread, from what its part took."""
-
-    engine: str
-    setting: str
-    pulse_thinning: int
-    seconds: float
-    pixel_pulses_per_s: float
-    error_db: float
-    predicted_seconds: float
-    predicted_error_db: float
-    on_front: bool
-    planned: bool
 
 
 @dataclass(frozen=True)
@@ -134,13 +116,9 @@ def _part(
 
 def _settings(job: Job, costs: Costs) -> list[Setting]:
     """Return the settings to measure, cheapest first."""
-    some = slice(None, None, max(1, len(job.tx_position_m) // 48))
-    beams = job.beams and job.beams.at(some)
-    view = look(job.tx_position_m[some], job.rx_position_m[some], job.net_m, job.spacing_m, beams)
-    every = candidates(view, job.signal, job.load, costs)
     return [
         setting
-        for setting in every
+        for setting in candidates(job.view, job.signal, job.load, costs)
         if setting.engine == "numba" or setting.form_options.get("tolerance_rad") in _TOLERANCES_RAD
     ]
 
@@ -163,7 +141,7 @@ def measure(
             break
         points.append(_measured(part, setting, None))
     points = [replace(point, predicted_seconds=point.predicted_seconds - shared_seconds) for point in points]
-    return _with_front(sorted(points, key=lambda point: point.seconds))
+    return with_front(sorted(points, key=lambda point: point.seconds))
 
 
 def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
@@ -234,22 +212,3 @@ def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
         result = work()
         times.append(perf_counter() - begin)
     return min(times), result
-
-
-def _with_front(points: Sequence[Point]) -> list[Point]:
-    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
-    best, marked = np.inf, []
-    for point in points:
-        marked.append(replace(point, on_front=point.error_db < best))
-        best = min(best, point.error_db)
-    return marked
-
-
-def write_points(points: Sequence[Point], path: Path) -> None:
-    """Write the points as CSV, one line each."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
-        table.writeheader()
-        for point in points:
-            row = asdict(point)
-            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})

@@ -29,7 +29,7 @@ __all__ = ["INSTRUCTION_SETS", "PATCH", "available", "form", "instruction_set", 
 PATCH = 16  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
 
 
-def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2, pulses: slice = slice(None)) -> Tables:
+def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Tables:
     """Turn range profiles into tables of polynomials with the carrier folded in.
 
     Parameters
@@ -41,8 +41,6 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2, pulse
         -75 dB, 10 with degree 1 by -62 dB; `Tables.error_db` predicts it.
     degree
         Of the polynomials, 1 or 2.
-    pulses
-        Which pulses; images of pulse blocks add up to the image of all, so that memory stays bounded.
 
     Returns
     -------
@@ -63,11 +61,11 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2, pulse
         raise ValueError(f"{degree=}: must be 1 or 2")
     if not profiles.oversampling >= 1.5:
         raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
-    samples = np.ascontiguousarray(profiles.samples[pulses], np.complex64)
-    start_m = np.ascontiguousarray(profiles.start_m[pulses], np.float64)
-    places = [np.asarray(p[pulses], np.float64) for p in (profiles.tx_position_m, profiles.rx_position_m)]
+    samples = np.ascontiguousarray(profiles.samples, np.complex64)
+    start_m = np.ascontiguousarray(profiles.start_m, np.float64)
+    places = [np.asarray(p, np.float64) for p in (profiles.tx_position_m, profiles.rx_position_m)]
     if not len(samples):
-        raise ValueError(f"{pulses=}: holds no pulse")
+        raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
     if not all(np.isfinite(values).all() for values in (start_m, *places)):
         raise ValueError("phase centres and starts of the profiles must be finite")
     wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S

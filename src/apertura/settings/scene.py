@@ -1,0 +1,70 @@
+"""Section `scene`: the grid of every raster, and the ground under it."""
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from apertura.settings.section import Section
+
+
+class Scene(Section):
+    """The campaign's output grid."""
+
+    crs: str = Field(
+        "auto", description="EPSG code, auto (UTM zone of the track) or local (a frame without a place on Earth)"
+    )
+    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
+        "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
+    )
+    spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
+    height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
+    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
+    dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
+    dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(
+        None, description="what the heights of dem count from; carried: its own CRS says it"
+    )
+    geoid: str | None = Field(
+        None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
+    )
+
+    @model_validator(mode="after")
+    def _datum_is_stated(self) -> Self:
+        if self.dem is not None and self.dem_datum is None:
+            raise ValueError(
+                "dem is given without dem_datum: state what its heights count from "
+                "(ellipsoid, egm96, egm2008, or carried where its CRS says it); it is never guessed"
+            )
+        if self.dem is None and self.dem_datum is not None:
+            raise ValueError(f"dem_datum={self.dem_datum} is given without dem")
+        stated = {self.dem_datum, self.height_datum}
+        if self.crs == "local" and stated & {"egm96", "egm2008"}:
+            raise ValueError(
+                "heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _bounds_are_pixels(self) -> Self:
+        if self.spacing_m != "auto" and self.spacing_m <= 0:
+            raise ValueError(f"spacing_m={self.spacing_m}: must be positive")
+        if self.bounds_m == "auto":
+            return self
+        xmin, ymin, xmax, ymax = self.bounds_m
+        if xmin >= xmax or ymin >= ymax:
+            sorted_m = [min(xmin, xmax), min(ymin, ymax), max(xmin, xmax), max(ymin, ymax)]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max, in order {sorted_m}"
+            )
+        if self.spacing_m != "auto":
+            self._divisible(xmin, ymin, xmax, ymax, self.spacing_m)
+        return self
+
+    def _divisible(self, xmin: float, ymin: float, xmax: float, ymax: float, spacing: float) -> None:
+        counts = ((xmax - xmin) / spacing, (ymax - ymin) / spacing)
+        if any(abs(count - round(count)) > 1e-6 * max(count, 1.0) for count in counts):
+            columns, rows = (max(1, round(count)) for count in counts)
+            nearest = [xmin, round(ymax - rows * spacing, 9), round(xmin + columns * spacing, 9), ymax]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)} is {counts[0]:.6g} × {counts[1]:.6g} pixels of {spacing} m; "
+                f"the nearest whole grid is {nearest}"
+            )
