@@ -10,6 +10,7 @@ from conftest import run_steps
 
 from apertura.campaign import Campaign
 from apertura.echo.compression import compress, range_step, window_weights
+from apertura.echo.sidelink import METHODS
 from apertura.image.engines import ENGINES, reference
 from apertura.image.history import Profiles, Spectra
 from apertura.image.peaks import Patch, find_peak, ground_position
@@ -63,7 +64,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
     grid = scene_grid(finished_sample)
     with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
     uncorrected: list[xr.Dataset] = []
-    monkeypatch.setitem(echo.METHODS, "divide", lambda radar, _: radar)
+    monkeypatch.setitem(METHODS, "divide", lambda radar, _: radar)
     monkeypatch.setattr(echo, "save_stage", lambda dataset, _: uncorrected.append(dataset))
     echo.echo(finished_sample, *pair)
     peaks = []
