@@ -1,4 +1,4 @@
-"""Forms 8192 × 8192 pixels from 4096 pulses, tile by tile into zarr: `python benchmarks/size.py`.
+"""Forms 8192 × 8192 UTM pixels from 4096 pulses, tile by tile into zarr: `python benchmarks/size.py`.
 
 Peak memory is that of the process; the rate is compared with the kernel's own on tiles spread over the same image, on
 as many threads, timed after each block of pulses. Samples are random: neither time nor memory depends on them. Prints
@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.geodesy import ecef_from_projected
 from apertura.image.engines import native
 from apertura.image.engines.tables import Tables
 from apertura.image.grid import SceneGrid
 from apertura.image.history import Profiles
-from apertura.image.tiles import form_tiles
+from apertura.image.tiles import Former, form_blocks
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 
@@ -37,10 +37,11 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
     generator = np.random.default_rng(1)
     west, south, east, north = grid.bounds_m
     along = np.linspace(south, north, pulses)
-    tx = np.stack([np.full(pulses, west - 200.0), along, np.full(pulses, height_m)], 1)
-    rx = tx + [0.0, 5.0, 1.0]
+    tx = ecef_from_projected(grid.crs, np.full(pulses, west - 200.0), along, np.full(pulses, height_m))
+    rx = tx + 5 * (tx[-1] - tx[0]) / np.linalg.norm(tx[-1] - tx[0])
     step_m = C / BANDWIDTH_HZ / 2
-    edge = np.array([[x, y, 0.0] for x in (west, east) for y in np.linspace(south, north, 33)])
+    y, x = np.meshgrid(np.linspace(south, north, 33), (west, east))
+    edge = ecef_from_projected(grid.crs, x.ravel(), y.ravel(), np.zeros(x.size))
     nearest = np.hypot(200.0, height_m) * 2 - 20
     farthest = max(np.linalg.norm(edge - antenna, axis=1).max() for antenna in (tx[0], tx[-1])) * 2 + 20
     shape = (pulses, int((farthest - nearest) / step_m))
@@ -60,29 +61,24 @@ def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
     return (time.perf_counter() - begin) * grid.shape[0] * grid.shape[1] / (TILE * TILE * len(tiles))
 
 
-def image_seconds(parts: list[slice], history: Profiles, grid: SceneGrid, threads: int) -> tuple[float, float]:
-    """Return seconds of forming into zarr, tables and all, and of the kernel alone, blocks of pulses one by one."""
-    spent = alone = 0.0
+def image_seconds(history: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
+    """Return seconds of forming into zarr, tables, places and all, and of the kernel alone, block after block."""
+    alone = paused = 0.0
+
+    def former(part: slice) -> Former:
+        nonlocal alone, paused
+        tables = native.prepare(history.of_pulses(part))
+        begin = time.perf_counter()
+        alone += kernel_seconds(tables, grid, threads)
+        paused += time.perf_counter() - begin
+        return partial(native.form, tables)
+
     with tempfile.TemporaryDirectory() as folder:
         array = zarr.create_array(folder, shape=grid.shape, chunks=(TILE, TILE), dtype="complex64")
-
-        def write(window: tuple[slice, slice], image: NDArray[np.complex64]) -> None:
-            array[window] = image if part is parts[0] else array[window] + image
-
-        for part in parts:
-            begin = time.perf_counter()
-            tables = native.prepare(history.of_pulses(part))
-            form_tiles(
-                partial(native.form, tables),
-                grid,
-                grid.tiles(TILE),
-                write=write,
-                threads=threads,
-                seconds_between_reports=10,
-            )
-            spent += time.perf_counter() - begin
-            alone += kernel_seconds(tables, grid, threads)
-    return spent, alone
+        begin, scratch, pulses = time.perf_counter(), Path(folder), len(history.samples)
+        how = {"blocks": blocks, "write": array.__setitem__, "scratch": scratch, "threads": threads}
+        form_blocks(former, pulses, grid, grid.tiles(TILE), **how)
+        return time.perf_counter() - begin - paused, alone
 
 
 def main() -> None:
@@ -90,13 +86,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=8192)
     parser.add_argument("--pulses", type=int, default=4096)
-    parser.add_argument("--at-once", type=int, default=2048, help="pulses whose tables are held at once")
+    parser.add_argument("--blocks", type=int, default=2, help="of pulses, whose tables are held one after the other")
     parser.add_argument("--threads", type=int, default=2)
     asked = parser.parse_args()
-    grid = SceneGrid("local", 0.0, asked.size * SPACING_M, SPACING_M, (asked.size, asked.size), 0.0)
+    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size), 0.0)
     history = profiles(grid, asked.pulses)
-    parts = [slice(at, at + asked.at_once) for at in range(0, asked.pulses, asked.at_once)]
-    spent, alone = image_seconds(parts, history, grid, asked.threads)
+    spent, alone = image_seconds(history, grid, blocks=asked.blocks, threads=asked.threads)
     found = {
         "pixels": asked.size**2,
         "pulses": asked.pulses,

@@ -27,7 +27,7 @@ def form_tiles(
     write: Callable[[Window, NDArray[np.complex64]], None],
     threads: int,
     heights: Callable[[Window], NDArray[np.float64]] | None = None,
-    seconds_between_reports: float = 0.25,
+    seconds_between_reports: float = 0.1,
 ) -> None:
     """Form each window of `grid` and write it as soon as it is done.
 
