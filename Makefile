@@ -26,7 +26,7 @@ demo: $(SETUP)
 	$(BIN)/apertura verify demo
 
 run: $(SETUP)
-	$(BIN)/apertura run $(CAMPAIGN)
+	$(BIN)/apertura run $(or $(CAMPAIGN),$(error which campaign? make run CAMPAIGN=folder))
 
 # The paper's claims and the stability atlas, into results/study/; killed runs go on where they were.
 paper stability: $(SETUP)

@@ -102,6 +102,20 @@ def test_a_raised_target_focuses_where_geometry_predicts():
     assert 14.0 - (peak.row + 0.5) * 0.1 == pytest.approx(predicted, abs=0.03)
 
 
+def test_an_error_says_how_far_it_hangs_on_the_choice_of_pixels():
+    """The spread over draws of pixels is what leaving out pixels tells: on speckle, and on a few targets."""
+    generator = np.random.default_rng(4)
+    for targets, least, most in ((0, 0.3, 0.8), (300, 2.0, 8.0)):
+        scene = generator.standard_normal(40_000) + 1j * generator.standard_normal(40_000)
+        scene[:targets] *= 100
+        noise = 1e-3 * (generator.standard_normal(40_000) + 1j * generator.standard_normal(40_000))
+        draws = [generator.integers(0, scene.size, 256) for _ in range(200)]
+        found = [numerical_error((scene + noise)[draw].astype(np.complex128), scene[draw]) for draw in draws]
+        spread = np.std([one.rms_db for one in found])
+        assert least < spread < most
+        assert np.median([one.std_db for one in found]) == pytest.approx(spread, rel=0.4)
+
+
 def test_the_grid_is_anchored_at_its_north_west_corner():
     grid = SceneGrid.from_bounds("EPSG:32632", (570656.9, 5363687.65, 570670.9, 5363701.65), spacing_m=0.05, height_m=1)
     assert grid.shape == (280, 280)

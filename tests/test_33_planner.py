@@ -429,6 +429,8 @@ def test_a_platform_over_the_scene_is_flagged_and_one_below_the_ground_is_refuse
     over = track() + np.array([0.0, 25.0, 0.0])
     assert "300 of 300 pulses" in plan(tx_position_m=over, rx_position_m=over).flags["platform_inside_scene"]
     assert "platform_inside_scene" not in plan().flags
+    for narrow in (np.s_[4:5, 4:5], np.s_[4:5], np.s_[:, 4:5]):  # a row, a column or a pixel has no side of its own
+        assert "platform_inside_scene" not in plan(net_m=net()[narrow]).flags
     sunk = track(height_m=-0.5)
     with pytest.raises(CampaignError, match=r"receiver is -0.50 m above the ground at pulse"):
         plan(rx_position_m=sunk)
@@ -454,6 +456,13 @@ def test_an_aperture_sampled_below_the_scenes_doppler_band_is_flagged(spread, fl
         found, _ = phase_rates(apart, apart, net().reshape(-1, 3), wavelength_m=C / 1.4e9)
         apart[:, 0] *= spread / found
     assert ("pulses_sparse" in plan(tx_position_m=apart, rx_position_m=apart).flags) == flagged
+
+
+def test_an_override_that_is_predicted_to_miss_is_flagged():
+    apart = track() + [0.0, 6.0, 0.0]
+    missed = plan(rx_position_m=apart, overrides={"midpoint": True})
+    assert "dB, -60 dB asked: tiles that miss it are formed again" in missed.flags["prediction_misses"]
+    assert "prediction_misses" not in plan(rx_position_m=apart).flags
 
 
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():

@@ -385,7 +385,7 @@ def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(isa, plain, nowhe
 
 def test_an_unknown_instruction_set_is_refused(monkeypatch):
     monkeypatch.setenv("APERTURA_ISA", "sse9")
-    with pytest.raises(ValueError, match="APERTURA_ISA='sse9': must be one of avx512, avx2, portable"):
+    with pytest.raises(ValueError, match="APERTURA_ISA: 'sse9'; expected one of avx512, avx2, portable"):
         native.instruction_set()
 
 

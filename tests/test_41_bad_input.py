@@ -235,6 +235,15 @@ def test_bounds_that_are_no_multiple_of_the_spacing_propose_the_nearest(tiny):
     assert "[570658.3, 5363704.2, 570664.3, 5363710.2]" in message
 
 
+def test_a_value_of_no_alternative_is_named_by_its_key_alone(tiny):
+    edit_config(tiny, lambda document: document.setdefault("processing", {}).update(table_degree=5))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert (
+        "processing.table_degree: Input should be less than or equal to 2 (found 5) or Input should be 'auto'"
+        in message
+    )
+
+
 def test_swapped_bounds_are_refused_and_put_in_order(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570664.3, 5363704.2, 570658.3, 5363710.2]))
     assert "in order [570658.3, 5363704.2, 570664.3, 5363710.2]" in complaint(lambda: Campaign.load(tiny))

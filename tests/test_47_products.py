@@ -37,6 +37,9 @@ def test_a_raster_says_where_it_comes_from(finished_tiny, name):
     assert {"raw/codes.npy", "raw/f01/uav1.sigmf-data", "raw/f01/uav1.track.csv"} <= set(inputs)
     assert all(len(digest) == 64 for digest in [*inputs.values(), tags["APERTURA_CODE_SHA256"]])
     assert float(tags["APERTURA_ERROR_DB"]) < -60
+    assert float(tags["APERTURA_PEAK_ERROR_DB"]) < -50
+    assert json.loads(tags["APERTURA_MODELS"])
+    assert "APERTURA_REDONE" not in tags
 
 
 def test_power_and_db_are_the_slc_squared(finished_tiny):

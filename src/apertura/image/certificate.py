@@ -1,7 +1,7 @@
 """The image's own measured error: pixels recomputed by the reference, and the tiles that fail the accuracy asked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,7 @@ class Certificate:
         values = self._values(image)
         some = slice(0, self.random)
         rms = numerical_error(values[some], self.exact[some])
-        return NumericalError(rms.rms_db, numerical_error(values, self.exact).peak_db)
+        return replace(rms, peak_db=numerical_error(values, self.exact).peak_db)
 
     def failing(
         self, image: Raster, windows: Sequence[Window], accuracy_db: float

@@ -41,7 +41,8 @@ def crossed_edges(
     _check_finite(tx_m, rx_m)
     place_m, up = net_m.reshape(-1, 3), upward(net_m)
     inside = [
-        _check_above(position, net_m, up, which) for position, which in ((tx_m, "transmitter"), (rx_m, "receiver"))
+        _check_above(position, net_m, up, which, spacing_m)
+        for position, which in ((tx_m, "transmitter"), (rx_m, "receiver"))
     ]
     flags = {}
     over = int((inside[0] | inside[1]).sum())
@@ -79,7 +80,7 @@ def _check_finite(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
 
 
 def _check_above(
-    position_m: NDArray[np.float64], net_m: NDArray[np.float64], up: NDArray[np.float64], which: str
+    position_m: NDArray[np.float64], net_m: NDArray[np.float64], up: NDArray[np.float64], which: str, spacing_m: float
 ) -> NDArray[np.bool_]:
     """Raise where a platform is not above the ground; return which pulses are over the scene."""
     corner = net_m[0, 0]
@@ -93,10 +94,15 @@ def _check_above(
             remedy="Check height_m and its datum (logs may count from the geoid), and the heights in the flight log.",
         )
     over = np.ones(len(position_m), bool)
-    for side in (net_m[0, -1] - corner, net_m[-1, 0] - corner):
-        length = float(np.linalg.norm(side))
-        along = (position_m - corner) @ side / max(length, 1e-9)
-        over &= (along >= 0) & (along <= length)
+    right, down = net_m[0, -1] - corner, net_m[-1, 0] - corner
+    lengths = [float(np.linalg.norm(side)) for side in (right, down)]
+    if not lengths[1]:  # one row or column is as wide as a pixel
+        down = np.cross(right if lengths[0] else np.eye(3)[np.abs(up).argmin()], up)
+    if not lengths[0]:
+        right = np.cross(down, up)
+    for side, length in zip((right, down), lengths, strict=True):
+        along = (position_m - corner) @ side / np.linalg.norm(side)
+        over &= np.abs(along - length / 2) <= (length + spacing_m) / 2
     return over
 
 

@@ -90,7 +90,7 @@ def decide_midpoint(
     worst = float(np.abs(midpoint_error(tx_m, rx_m, place_m)).max()) / wavelength_m
     error_db = midpoint_error_db(tx_m, rx_m, place_m, wavelength_m=wavelength_m)
     allowed = worst < MIDPOINT_WAVELENGTHS
-    line = f"baseline {baseline:.2f} m makes b²/4R up to λ/{1 / max(worst, 1e-9):.3g}, limit λ/16"
+    line = f"baseline {baseline:.2f} m makes b²/4R up to {worst:.3g} λ, limit λ/16 = {MIDPOINT_WAVELENGTHS} λ"
     if allowed and error_db <= accuracy_db - 6 and bistatic_costs:
         return Decision("midpoint", True, f"{line}; error {error_db:.1f} dB, and one leg is cheaper", error_db)
     why = "the rule forbids it" if not allowed else f"it would err by {error_db:.1f} dB"

@@ -65,6 +65,11 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     antennas, missed = decide_antennas(job.beams, job.illumination, asked)
     chosen = desk.fitted(chosen, presum)
     models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
+    expected_db = power_sum_db(chosen.error_db, *models)
+    if expected_db > accuracy_db:
+        flags["prediction_misses"] = (
+            f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
+        )
     memory, disk = bytes_needed(job, chosen, presum)
     return Plan(
         setting=chosen,
@@ -77,7 +82,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
             terrain,
             *antennas,
         ),
-        predicted_error_db=power_sum_db(chosen.error_db, *models) + max(0.0, job.content_db or 0.0),
+        predicted_error_db=expected_db + max(0.0, job.content_db or 0.0),
         predicted_seconds=wall_seconds(chosen, job),
         memory_bytes=memory,
         disk_bytes=disk,
@@ -112,11 +117,14 @@ def _decide_thinning(desk: Desk, whole: Setting, accuracy_db: float) -> tuple[De
         raise CampaignError(
             f"pulse_thinning is {asked}",
             where="config/config.yaml: processing.pulse_thinning",
-            expected=f"a factor that the low-pass sum can follow: {oversampled}, at most {0.3 / max(widest, 1e-9):.1f}",
+            expected=f"at most {0.3 / max(widest, 1e-9):.1f} pulses made one: {oversampled}",
             remedy="Use a smaller factor or auto.",
         )
     if found is None:
-        return keep(f"fewer pulses would err by more than {limit_db:.0f} dB even after a low-pass sum")
+        return keep(
+            f"a low-pass sum of fewer pulses would err by more than {limit_db:.0f} dB, "
+            f"which leaves room for tables and for what is weak in the scene"
+        )
     presum, error_db = found
     spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
     less = desk.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)

@@ -1,6 +1,7 @@
 """From a config file to `Settings`, or to the one message that says all that is wrong with it."""
 
 import difflib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ from pydantic import BaseModel, ValidationError
 
 from apertura.errors import CampaignError
 from apertura.settings.config import Settings
+
+_TYPE = r"(ofdm|phase_history|constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
+"""What pydantic adds to the way to a key where it may hold one of several types."""
 
 
 def read_settings(path: Path) -> Settings:
@@ -53,26 +57,31 @@ def validated(document: object, *, where: object) -> Settings:
     try:
         return Settings.model_validate(document)
     except ValidationError as error:
-        wrong = [_complaint(dict(item)) for item in error.errors(include_url=False)]
+        wrong: dict[str, list[str]] = {}
+        for item in error.errors(include_url=False):
+            key, line = _complaint(dict(item))
+            wrong.setdefault(key, []).append(line)
+        lines = [f"{key}: {' or '.join(found)}" for key, found in wrong.items()]
         raise CampaignError(
-            "; ".join(sorted(wrong, key=lambda line: "unknown key" not in line)),
+            "; ".join(sorted(lines, key=lambda line: "unknown key" not in line)),
             where=where,
             expected="the keys and values of config/config.yaml as `apertura init` writes it",
             remedy="Correct what is named.",
         ) from error
 
 
-def _complaint(item: dict[str, Any]) -> str:
-    location = [str(part) for part in item["loc"] if part not in {"ofdm", "phase_history"}]
+def _complaint(item: dict[str, Any]) -> tuple[str, str]:
+    """Return the key and what is wrong with it; the names of alternative types are no keys."""
+    location = [str(part) for part in item["loc"] if not re.match(_TYPE, str(part))]
     key = ".".join(location) or "the whole file"
     if item["type"] == "extra_forbidden":
         known = sorted(_known_keys(Settings.model_json_schema()))
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.5)
-        return f"{key}: unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
+        return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":
-        return f"{key}: missing"
+        return key, "missing"
     found = "" if isinstance(item["input"], dict | BaseModel) else f" (found {item['input']!r})"
-    return f"{key}: {item['msg'].removeprefix('Value error, ')}{found}"
+    return key, f"{item['msg'].removeprefix('Value error, ')}{found}"
 
 
 def _known_keys(schema: object) -> set[str]:

@@ -1,5 +1,6 @@
 """Rules of the export wing: rasters and pictures of one image, or of what a flight's images add up to."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ class Amplitude:
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     """Write slc, power and db GeoTIFFs and the quicklook of one pair; return their paths."""
     dataset = open_stage(campaign.stage("image", flight, pair), "image")
-    tags = _tags(dataset, dataset.attrs["quality"]["numerical_error_db"])
+    tags = _tags(dataset, dataset.attrs["quality"])
     title = f"{campaign.settings.campaign} · flight {flight} · {pair}"
     folder = campaign.results / flight / pair
     return [_write(campaign, folder / name, dataset.image, tags, title) for name in EXPORTS]
@@ -53,8 +54,8 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     coherent, amplitude = dataset.coherent[index], Amplitude(dataset.noncoherent[index])
     pairs = campaign.flight(flight).pairs
     images = [open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs]
-    error = max(image.attrs["quality"]["numerical_error_db"] for image in images)
-    tags, folder = _tags(dataset, error), campaign.results / flight / "fused"
+    quality = _worst(images)
+    tags, folder = _tags(dataset, quality), campaign.results / flight / "fused"
     title = f"{campaign.settings.campaign} · flight {flight} · coherent sum of {' + '.join(pairs)}"
     sums: dict[str, Raster] = {"coherent": coherent, "noncoherent": amplitude}
     written = [
@@ -63,7 +64,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         for name in names
     ]
     report = folder / "image.json"
-    write_json(report, _fused_report(campaign, flight, sums, images, error))
+    write_json(report, quality | _fused_report(campaign, flight, sums, images))
     return [*written, _write(campaign, folder / "quicklook.png", coherent, tags, title), report]
 
 
@@ -75,9 +76,7 @@ def _write(campaign: Campaign, path: Path, image: Raster, tags: dict[str, str], 
     return path
 
 
-def _fused_report(
-    campaign: Campaign, flight: str, sums: dict[str, Raster], images: list[xr.Dataset], error: float
-) -> dict[str, Any]:
+def _fused_report(campaign: Campaign, flight: str, sums: dict[str, Raster], images: list[xr.Dataset]) -> dict[str, Any]:
     grid = scene_grid(campaign)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     found = {kind: survey(layer, windows) for kind, layer in sums.items()}
@@ -92,8 +91,6 @@ def _fused_report(
     return {
         "flight": flight,
         "pairs": list(campaign.flight(flight).pairs),
-        "models": {"fusion": "mean of the peak-normalised images, with and without phase"},
-        "numerical_error_db": error,
         "entropy": {kind: round(layer.entropy, 6) for kind, layer in found.items()},
         "noise_floor_db": top.noise_floor_db,
         "brightest": {
@@ -106,12 +103,26 @@ def _fused_report(
     }
 
 
-def _tags(dataset: xr.Dataset, error_db: float) -> dict[str, str]:
+def _worst(images: list[xr.Dataset]) -> dict[str, Any]:
+    """Return what the errors and models of some images say of their sum."""
+    errors = ("numerical_error_db", "peak_error_db")
+    fusion = "mean of the peak-normalised images, with and without phase"
+    return {
+        "models": {"fusion": fusion, "numerical_error": "that of the worst pair"},
+        **{name: max(image.attrs["quality"][name] for image in images) for name in errors},
+        "redone": [one for image in images for one in image.attrs["quality"]["redone"]],
+    }
+
+
+def _tags(dataset: xr.Dataset, quality: Mapping[str, Any]) -> dict[str, str]:
     """Return the tags of DESIGN section 6; the export's own code ends the chain."""
     return {
         "APERTURA_RUNSPEC": dataset.attrs["runspec"],
         "APERTURA_INPUTS": canonical_json(dataset.attrs["inputs"]),
         "APERTURA_CODE_SHA256": chained_sha256(code_sha256(__name__), [dataset.attrs["code_sha256"]]),
         "APERTURA_VERSION": __version__,
-        "APERTURA_ERROR_DB": f"{error_db:.2f}",
+        "APERTURA_ERROR_DB": f"{quality['numerical_error_db']:.2f}",
+        "APERTURA_PEAK_ERROR_DB": f"{quality['peak_error_db']:.2f}",
+        "APERTURA_MODELS": canonical_json(quality["models"]),
+        **({"APERTURA_REDONE": canonical_json(quality["redone"])} if quality["redone"] else {}),
     }

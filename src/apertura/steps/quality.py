@@ -43,12 +43,13 @@ def certified(work: Work, target: Any, better: tuple[Setting, ...], accuracy_db:
         print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {choice.line}", flush=True)
         work.form(target, choice, uncertified)
         work.form(target, choice, worse)  # last: while one fails, a run that was killed here does all of it again
-        redone.append({"tiles": len(worse) + len(uncertified), "with": choice.line})
+        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{choice.line}, every pulse, both legs"})
     error = certificate.error(target)
     missed = error.rms_db > accuracy_db
     line = f"numerical error {error.rms_db:.1f} dB, {accuracy_db:.1f} dB asked"
     return {
         "numerical_error_db": round(error.rms_db, 2),
+        "numerical_error_std_db": round(error.std_db, 2),
         "peak_error_db": round(error.peak_db, 2),
         "certified_pixels": len(pixels),
         "redone": redone,

@@ -18,7 +18,8 @@ td:first-child,th:first-child{text-align:left} tr.planned{background:#fbe5d6} tr
 th{cursor:pointer}
 </style>
 <h1 style="font-size:18px">@TITLE@</h1>
-<p>Each point is an engine with one setting: seconds for the whole image on one thread, and the error on random pixels
+<p>Each point is an engine with one setting: seconds of its tables and sums for the whole image on one
+thread, and the error on random pixels
 against the double sum. The line is the Pareto front, the star the planner's choice, the dashes what is asked.</p>
 <div id="filters"></div><svg id="chart" viewBox="0 0 960 560" role="img" aria-label="error against seconds"></svg>
 <p id="tip">Point at a mark to read it.</p><table id="rows"></table>
@@ -56,7 +57,7 @@ function draw() {
   make("line",{x1:box.left,x2:box.right,y1:Y(asked),y2:Y(asked),stroke:"#009e73","stroke-dasharray":"6 4"});
   make("text",{x:box.right-4,y:Y(asked)-5,"text-anchor":"end"},`asked: ${asked} dB`);
   make("text",{x:(box.left+box.right)/2,y:box.bottom+40,"text-anchor":"middle"},
-    "seconds for the whole image, one thread");
+    "seconds of tables and sums for the whole image, one thread");
   const seen = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
   for (const p of seen) if (p.error_db<best) {
     path += path ? `H${X(p.seconds)}V${Y(p.error_db)}` : `M${X(p.seconds)},${Y(p.error_db)}`; best = p.error_db;

@@ -95,7 +95,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
     axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")
     axes.set_xscale("log")
-    axes.set_xlabel("Seconds for the whole image, one thread")
+    axes.set_xlabel("Seconds of tables and sums for the whole image, one thread")
     axes.set_ylabel("Error on random pixels against the double sum, dB")
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)

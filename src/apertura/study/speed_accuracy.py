@@ -75,6 +75,11 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         Whose echo and profile stages are used; they must be finished.
     seconds
         When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
+
+    Notes
+    -----
+    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
+    adds to the planned error is added to that of every setting.
     """
     outlook = outlook_of(campaign, flight, pair)
     grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
@@ -89,7 +94,14 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     job = campaign_job(campaign, pair, outlook, grid, heights)
     plan, costs = plan_job(campaign, job), campaign_costs(campaign)
     part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
-    points = measure(part, plan, _settings(job, costs), seconds=seconds, shared_seconds=tile_seconds(costs, job.load))
+    points = [
+        replace(
+            point,
+            predicted_seconds=point.predicted_seconds - tile_seconds(costs, job.load),
+            predicted_error_db=point.predicted_error_db + (0.0 if point.planned else max(0.0, job.content_db or 0.0)),
+        )
+        for point in measure(part, plan, _settings(job, costs), seconds=seconds)
+    ]
     size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
@@ -123,14 +135,8 @@ def _settings(job: Job, costs: Costs) -> list[Setting]:
     ]
 
 
-def measure(
-    part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float, shared_seconds: float = 0.0
-) -> list[Point]:
-    """Return what the plan, the reference and as many settings as time allows take and err, fastest first.
-
-    The chart times engines: `shared_seconds`, which every engine spends on placing pixels and storing tiles, is taken
-    off what was predicted.
-    """
+def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
+    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
     begin = perf_counter()
     points = [_reference_point(part, plan)]
     if plan.engine != "reference":
@@ -140,7 +146,6 @@ def measure(
         if perf_counter() - begin > seconds:
             break
         points.append(_measured(part, setting, None))
-    points = [replace(point, predicted_seconds=point.predicted_seconds - shared_seconds) for point in points]
     return with_front(sorted(points, key=lambda point: point.seconds))
 
 

@@ -9,6 +9,8 @@ from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 
+from apertura.errors import CampaignError
+
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
 _pointer = ctypes.c_void_p
@@ -71,7 +73,7 @@ def instruction_set() -> str:
     ------
     RuntimeError
         If the kernel was not compiled.
-    ValueError
+    CampaignError
         If APERTURA_ISA names none, or one that this machine lacks.
 
     Examples
@@ -81,11 +83,15 @@ def instruction_set() -> str:
     """
     asked = os.environ.get("APERTURA_ISA", "")
     if asked and asked not in INSTRUCTION_SETS:
-        raise ValueError(f"APERTURA_ISA={asked!r}: must be one of {', '.join(INSTRUCTION_SETS)}, or unset")
+        raise _unfit(asked, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
     found = _library().apertura_form(asked.encode())
     if found is None:
-        raise ValueError(f"APERTURA_ISA={asked!r}: this machine has no such instructions; unset it")
+        raise _unfit(asked, "instructions that this machine has")
     return str(found.decode())
+
+
+def _unfit(asked: str, expected: str) -> CampaignError:
+    return CampaignError(f"{asked!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it.")
 
 
 def call(function: str, job: ctypes.Structure) -> None:
