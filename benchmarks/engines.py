@@ -204,7 +204,7 @@ def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
 def main() -> None:
     """Run all contestants in turn, print and save."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--pulses", type=int, default=1024)
     asked = parser.parse_args()
