@@ -173,6 +173,22 @@ def test_a_void_reaches_as_far_as_its_post_counts_and_no_further(tmp_path, void)
     np.testing.assert_array_equal(np.isnan(found), near)
 
 
+@pytest.mark.parametrize("wild", [-9999.0, -32768.0, 3.4e38, 29029.0])
+def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
+    """Posts 20 and 21 of row 30 are under the scene, row 2 is not; in a local frame anything goes."""
+    heights = np.full((60, 60), 600.0)
+    heights[2] = wild
+    path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
+    assert np.all(open_terrain(write_dem(path, heights, corner), GRID.crs, datum="ellipsoid").heights(GRID) == 600)
+    heights[30, 20:22] = wild
+    terrain = open_terrain(write_dem(path, heights, corner), GRID.crs, datum="ellipsoid")
+    with pytest.raises(CampaignError, match=r"dem\.tif: 2 of the \d+ posts in rows ") as caught:
+        terrain.heights(GRID)
+    assert f"most often {wild:g} m" in str(caught.value)
+    local = open_terrain(write_dem(path, heights, corner, crs=None), "local", datum="carried")
+    assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90), 0.0))).all()
+
+
 def test_a_file_that_is_no_dem_is_refused(tmp_path):
     (tmp_path / "dem.tif").write_text("not a raster")
     for path, expected in (
@@ -270,7 +286,9 @@ def test_clearance_is_height_above_the_pixel_below_on_earth_too():
     antenna = SceneGrid(GRID.crs, GRID.west_m, GRID.north_m, 0.5, (70, 90), 0.0).positions_at(
         [10, 10.3, 500], [7, 80, 3], np.array([12.0, 15.0, 20.0])
     )
-    np.testing.assert_allclose(clearance(GRID, antenna, heights=lambda window: heights[window]), [2, 5, np.nan])
+    above, ground = clearance(GRID, antenna, heights=lambda window: heights[window])
+    np.testing.assert_allclose(above, [2, 5, 20 - 600])  # beside the scene: above its reference height
+    np.testing.assert_allclose(ground, [10, 10, 600])
 
 
 # Seeing

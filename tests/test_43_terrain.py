@@ -16,11 +16,13 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geodesy import projected_from_ecef
 from apertura.image.engines import ENGINES
+from apertura.image.grid import SceneGrid
 from apertura.simulate.campaign import write_campaign
 from apertura.simulate.plan import grid_around
 from apertura.simulate.presets import DEMO_ORIGIN, tandem
 from apertura.simulate.scene import PointTarget, Scene
 from apertura.steps import outlook, profile, scene, terrain
+from apertura.steps.ground import Ground, on_the_ground
 from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.outlook import outlook_of
 from apertura.steps.plan import job_of, plan_pair
@@ -30,6 +32,7 @@ from apertura.steps.verify import verify
 from apertura.store import open_stage
 
 UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
+PAIR = ("f01", "uav1-uav2")
 SLOPE = np.tan(np.radians(20.0))
 ALONG = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0))])
 UPHILL = np.array([ALONG[1], -ALONG[0]]) * 0.8 + ALONG * 0.6  # away from the track and along it
@@ -43,17 +46,19 @@ def edit_scene(root, **keys):
     return Campaign.load(root)
 
 
-def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=False):
-    """A DEM of the plane through the demo's origin, posts every metre, 20 m around."""
+def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=None, keep=slice(None)):
+    """A DEM of the plane through the demo's origin, posts every metre, 20 m around; `keep` rows and columns of it."""
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     west, top = np.floor(east) - 20, np.ceil(north) + 20
     x, y = np.meshgrid(west + 0.5 + np.arange(40), top - 0.5 - np.arange(40))
     heights = height_m + slope * ((x - east) * UPHILL[0] + (y - north) * UPHILL[1])
-    if void:
-        heights[20, 20] = np.nan
+    if void is not None:
+        heights[20, 20] = void
+    down, right = keep if isinstance(keep, tuple) else (keep, keep)
+    heights, corner = heights[down, right], (west + (right.start or 0), top - (down.start or 0))
     with rasterio.open(
-        root / name, "w", "GTiff", width=40, height=40, count=1, dtype="float64", crs="EPSG:32632",
-        transform=from_origin(west, top, 1, 1),
+        root / name, "w", "GTiff", width=heights.shape[1], height=heights.shape[0], count=1, dtype="float64",
+        crs="EPSG:32632", transform=from_origin(*corner, 1, 1),
     ) as raster:  # fmt: skip
         raster.write(heights, 1)
     return root / name
@@ -200,9 +205,11 @@ def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
 
 
 def test_a_void_in_the_scene_is_counted_and_placed(tiny):
-    write_plane(tiny, void=True)
+    write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
+    planned = complaint(lambda: plan_pair(campaign, *PAIR))  # before anything ran
     message = complaint(lambda: ground(campaign))
+    assert planned == message
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
@@ -221,6 +228,76 @@ def test_a_dem_that_misses_part_of_the_scene_is_refused_when_the_grid_is_settled
     assert "% of the scene lies outside the DEM, to the east" in message
 
 
+def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
+    """The height under the track is asked for only where the track decides where the scene lies."""
+    write_plane(tiny, keep=slice(16, 25))
+    for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
+        campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
+        seen = outlook_of(campaign, *PAIR)
+        grid = outlook.campaign_grid(campaign, seen)
+        assert grid.height_m == pytest.approx(620.0, abs=0.1)
+        assert not np.isfinite(
+            Ground.of(campaign.settings.scene, tiny, crs=grid.crs).terrain.heights(under(grid, seen))
+        )
+    campaign = edit_scene(tiny, bounds_m="auto")
+    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    assert "under the track, where scene.bounds_m: auto starts from" in message
+    assert "% of the scene" not in message
+
+
+def under(grid, seen):
+    """A pixel below the middle of the track."""
+    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate([seen.tx, seen.rx]), axis=0))
+    return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1), 0.0)
+
+
+@pytest.mark.parametrize("spacing_m", [0.1, "auto"])
+def test_plan_and_run_say_alike_which_half_of_the_scene_a_dem_misses(tiny, spacing_m):
+    write_plane(tiny, keep=(slice(None), slice(20, None)))
+    campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
+    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    share, rest = message.split(": ", 1)[1].split(" % of the scene lies outside the DEM, ")
+    assert rest.startswith("to the west: ")
+    (west, _, east, _), (start, *_) = campaign.settings.scene.bounds_m, rasterio.open(tiny / "dem.tif").bounds
+    assert float(share) == pytest.approx(100 * (start - west) / (east - west), abs=1.0)
+    if spacing_m != "auto":
+        assert complaint(lambda: scene.scene(campaign)) == message
+
+
+def test_a_scene_much_longer_than_wide_lies_at_the_mean_of_its_dem(tiny):
+    write_plane(tiny, slope=0.0, height_m=623.0)
+    middle = Campaign.load(tiny).settings.scene.bounds_m
+    asked = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
+    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100), 0.0)
+    assert on_the_ground(strip, Ground.of(asked, tiny, crs=strip.crs))[0].height_m == 623.0
+
+
+def test_a_void_undeclared_is_no_height_on_earth(tiny):
+    """-9999 without nodata is refused as it stands, wherever the DEM is first read."""
+    write_plane(tiny, void=-9999.0)
+    campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
+    for work in (lambda: plan_pair(campaign, *PAIR), lambda: ground(campaign)):
+        message = complaint(work)
+        assert "dem.tif: 1 of the " in message
+        assert "no height on Earth, most often -9999 m" in message
+        assert "nodata" in message
+
+
+def test_a_dem_in_feet_is_blamed_and_not_the_height_of_flat_ground(tiny):
+    """620 m are 2034 ft: the antennas, beside the scene and above it, are below that."""
+    write_plane(tiny, height_m=620.0 / 0.3048)
+    campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
+    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    assert "config/config.yaml: scene.dem: " in message
+    assert "the DEM has 2034" in message
+    assert "dem_datum" in message
+    assert "height_m" not in message
+    campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
+    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    assert "config/config.yaml: scene.height_m: " in message
+    assert "the ground has 2034.00 m" in message
+
+
 def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):
     """The hill is moved over the track; the scene is widened to hold it."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
@@ -228,9 +305,15 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
         round(edge + by, 6) for edge, by in zip(hillside.settings.scene.bounds_m, (-12, -12, 12, 12), strict=True)
     ]
     write_plane(root, slope=-1.5 * SLOPE)
+    shutil.rmtree(root / "results")
     campaign = edit_scene(root, bounds_m=bounds)
+    planned = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))  # before anything ran
+    assert "flight f01, pair uav1-uav1: at " in planned
+    assert "transmitter is in or below the ground" in planned
+    shutil.copytree(hillside.results / "f01", root / "results" / "f01")
     ground(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
+    assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]
     assert "transmitter is in or below the ground" in message
     assert "worst at pulse" in message
 

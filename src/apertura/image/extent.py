@@ -178,8 +178,8 @@ def clearance(
     antenna: NDArray[np.float64],
     *,
     heights: Callable[[Window], NDArray[np.float64]] | None = None,
-) -> NDArray[np.float64]:
-    """Return how high each phase centre is above the pixel under it.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how high each phase centre is above the pixel under it, and how high that pixel is.
 
     Parameters
     ----------
@@ -192,24 +192,23 @@ def clearance(
 
     Returns
     -------
-    ndarray
-        (pulse,) float64 metres; NaN beside the scene.
+    tuple of ndarray
+        (pulse,) float64 metres each; beside the scene, the ground is at `grid.height_m`.
 
     Examples
     --------
     >>> grid = SceneGrid("local", 0.0, 10.0, 1.0, (10, 10), 3.0)
     >>> clearance(grid, np.array([[5.0, 5.0, 7.0], [-20.0, 5.0, 7.0]]))
-    array([ 4., nan])
+    (array([4., 4.]), array([3., 3.]))
     """
     place = antenna if grid.crs == LOCAL else projected_from_ecef(grid.crs, antenna)
     west, _, _, north = grid.bounds_m
     row, column = (np.floor(side / grid.spacing_m).astype(int) for side in (north - place[:, 1], place[:, 0] - west))
-    above = np.full(len(antenna), np.nan)
+    under = np.full(len(antenna), grid.height_m)
     for window in grid.tiles(512):
         inside = (row >= window[0].start) & (row < window[0].stop)
         inside &= (column >= window[1].start) & (column < window[1].stop)
         if inside.any():
             ground = np.full(grid[window].shape, grid.height_m) if heights is None else heights(window)
-            under = ground[row[inside] - window[0].start, column[inside] - window[1].start]
-            above[inside] = place[inside, 2] - under
-    return above
+            under[inside] = ground[row[inside] - window[0].start, column[inside] - window[1].start]
+    return place[:, 2] - under, under

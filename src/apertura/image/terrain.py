@@ -20,6 +20,9 @@ LATTICE_M = 50.0
 COVER_NODES = 129
 """Nodes along each side of the scene at which coverage is looked at."""
 
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Land on Earth lies between (Dead Sea −430 m, Everest 8849 m), above whichever datum."""
+
 Floats = NDArray[np.float64]
 
 
@@ -70,6 +73,11 @@ class Terrain:
         ndarray
             (row, column) float64, metres above the ellipsoid of `grid.crs` (z in a local frame), bilinear between
             posts; NaN outside the DEM and where one of the posts is a void.
+
+        Raises
+        ------
+        CampaignError
+            If a post that counts has a height that no land on Earth has: a void undeclared, or another unit.
         """
         side = max(1, int(LATTICE_M / grid.spacing_m))
         rows, columns = (np.arange(size) + first for size, first in zip(grid.shape, grid.first, strict=True))
@@ -79,7 +87,7 @@ class Terrain:
         on_nodes = np.stack([*self._pixels(grid.crs, place[..., 0], place[..., 1]), self._shift(grid.crs, place)])
         share = [(axis / side - node[0]) for axis, node in zip((rows, columns), nodes, strict=True)]
         column, row, shift = _bilinear(on_nodes, share[0][:, None], share[1][None, :])
-        return np.asarray(self._sample(row, column) * self.metres_per_unit + shift)
+        return np.asarray(self._sample(row, column) + shift)
 
     def check_cover(self, grid: SceneGrid) -> None:
         """Raise CampaignError unless the DEM reaches over the whole grid; say how much is missing and where."""
@@ -146,8 +154,25 @@ class Terrain:
         with rasterio.open(self.path) as raster:
             posts = raster.read(1, window=Window(start[1], start[0], count[1], count[0]), masked=True)
             posts = posts.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
-        sampled[inside] = _bilinear(posts[None], row - start[0], column - start[1])[0]
+        posts *= self.metres_per_unit
+        place = (row - start[0], column - start[1])
+        wild = (posts < LOWEST_M) | (posts > HIGHEST_M)
+        if self.horizontal and wild.any() and np.isnan(_bilinear(np.where(wild, np.nan, 0.0)[None], *place)).any():
+            raise self._unearthly(posts, wild, start)
+        sampled[inside] = _bilinear(posts[None], *place)[0]
         return sampled
+
+    def _unearthly(self, posts: Floats, wild: NDArray[np.bool_], start: list[int]) -> CampaignError:
+        values, counts = np.unique(posts[wild], return_counts=True)
+        (top, left), (rows, columns) = start, posts.shape
+        return CampaignError(
+            f"{wild.sum()} of the {wild.size} posts in rows {top} to {top + rows - 1}, columns {left} to "
+            f"{left + columns - 1} have no height on Earth, most often {values[counts.argmax()]:g} m",
+            where=self.path,
+            expected=f"heights between {LOWEST_M:g} m and {HIGHEST_M:g} m",
+            remedy="Declare the value that stands for a void as nodata (and fill the voids under the scene), or mend "
+            "the unit of the heights.",
+        )
 
 
 def _transformer(source: str | CRS, target: str | CRS) -> Transformer:

@@ -59,15 +59,14 @@ class Ground:
         """Return the ellipsoidal height (m) of the ground at a place in the scene's CRS."""
         place = SceneGrid(self.crs, x_m - 0.5, y_m + 0.5, 1.0, (1, 1), 0.0)
         if self.terrain:
-            self.terrain.check_cover(place)
             height_m = float(self.terrain.heights(place)[0, 0])
             if np.isfinite(height_m):
                 return height_m
             raise CampaignError(
-                f"no height at ({x_m:.1f}, {y_m:.1f}) under the track",
+                f"no height at ({x_m:.1f}, {y_m:.1f}) under the track, where scene.bounds_m: auto starts from",
                 where=self.terrain.path,
-                expected="heights where scene.bounds_m: auto puts the scene",
-                remedy="Fill the voids of the DEM, or state scene.bounds_m and scene.spacing_m.",
+                expected="a DEM that reaches there and has no void there",
+                remedy="Get the missing part, fill the void, or state scene.bounds_m.",
             )
         if self.geoid is None:
             return self.flat_m
@@ -84,8 +83,8 @@ def on_the_ground(grid: SceneGrid, ground: Ground) -> tuple[SceneGrid, dict[str,
         return replace(grid, height_m=height_m), why
     ground.terrain.check_cover(grid)
     side = max(1, max(grid.shape) // _COARSE)
-    places = replace(grid, spacing_m=grid.spacing_m * side, shape=(grid.shape[0] // side, grid.shape[1] // side))
-    heights = ground.terrain.heights(places)
+    rows, columns = (max(1, size // side) for size in grid.shape)
+    heights = ground.terrain.heights(replace(grid, spacing_m=grid.spacing_m * side, shape=(rows, columns)))
     known = np.isfinite(heights)
     height_m = round(float(heights[known].mean()), 3) if known.any() else 0.0
     return replace(grid, height_m=height_m), {"height_m": "mean of the DEM over the scene"}

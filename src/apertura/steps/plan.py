@@ -27,7 +27,7 @@ from apertura.steps.antennas import lit
 from apertura.steps.costs import campaign_costs
 from apertura.steps.ground import Ground
 from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
-from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
+from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING, check_clearance
 from apertura.steps.terrain import Heights, expected_heights
 from apertura.store import manifest_of
 
@@ -43,8 +43,6 @@ OVERRIDES = (
     "terrain",
 )
 _NET = 9
-
-
 _BLOCKS = 33
 _CONTENT_PIXELS = 128
 
@@ -76,8 +74,9 @@ def plan_pair(
     """
     outlook = outlook_of(campaign, flight, pair, echo=echo)
     grid = campaign_grid(campaign, outlook)
-    job = campaign_job(campaign, pair, outlook, grid, heights or expected_heights(campaign, grid), threads=threads)
-    plan = plan_job(campaign, job)
+    heights = heights or expected_heights(campaign, grid)
+    check_clearance(grid, outlook.tx, outlook.rx, heights=heights, where=f"flight {flight}, pair {pair}")
+    plan = plan_job(campaign, campaign_job(campaign, pair, outlook, grid, heights, threads=threads))
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()
     check_fits(plan, free_disk=None if written else shutil.disk_usage(campaign.root).free, where=f"{flight}/{pair}")
     return plan
@@ -148,6 +147,7 @@ def _relief(campaign: Campaign, grid: SceneGrid) -> dict[str, Any]:
     side = max(1, max(grid.shape) // _BLOCKS)
     rows, columns = (max(1, size // side) for size in grid.shape)
     found = terrain.heights(replace(grid, spacing_m=grid.spacing_m * side, shape=(rows, columns))) - grid.height_m
+    # Voids at pixels are refused by now; one between them is not imaged.
     return {"heights_m": np.where(np.isfinite(found), found, 0.0), "heights_step_px": side}
 
 

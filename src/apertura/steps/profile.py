@@ -9,9 +9,10 @@ from apertura.campaign import Campaign
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.errors import CampaignError
 from apertura.image.extent import clearance, swath
+from apertura.image.grid import SceneGrid
 from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
 from apertura.steps.stamping import stamped
-from apertura.steps.terrain import open_heights
+from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage, save_stage
 
 GUARD_SAMPLES = 32
@@ -25,8 +26,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     source, grid = open_stage(campaign.stage("echo", flight, pair), "echo"), scene_grid(campaign)
     window, frequency = campaign.settings.processing.window, source.frequency.values
     ground, places = open_heights(campaign), (source.tx_position.values, source.rx_position.values)
-    for position, which in zip(places, ("transmitter", "receiver"), strict=True):
-        _check_clearance(clearance(grid, position, heights=ground.of), which, where=f"flight {flight}, pair {pair}")
+    check_clearance(grid, *places, heights=ground, where=f"flight {flight}, pair {pair}")
     nearest, farthest = swath(grid, *places, heights=ground.of)
     _check_prefix(farthest, source.path_limit.values, where=f"flight {flight}, pair {pair}")
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
@@ -58,16 +58,36 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     return folder
 
 
-def _check_clearance(above: NDArray[np.float64], which: str, *, where: str) -> None:
-    if (above <= 0).any():
-        pulse = int(np.nanargmin(above))
-        raise CampaignError(
-            f"at {int((above <= 0).sum())} pulses the {which} is in or below the ground of the scene, worst at pulse "
-            f"{pulse}: {above[pulse]:.2f} m above it",
-            where=where,
-            expected="an antenna above the ground",
-            remedy="Check scene.height_m or scene.dem, their datums (logs may count from the geoid), and the track.",
-        )
+def check_clearance(
+    grid: SceneGrid, tx: NDArray[np.float64], rx: NDArray[np.float64], *, heights: Heights, where: str
+) -> None:
+    """Raise CampaignError where an antenna is not above the ground; it names what said how high the ground is.
+
+    Parameters
+    ----------
+    grid, heights
+        The scene and its ground.
+    tx, rx
+        (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
+    where
+        Flight and pair.
+    """
+    source, keys = ("the ground", "scene.height_m and scene.height_datum")
+    if heights.of is not None:
+        source, keys = ("the DEM", "scene.dem (metres, not feet) and scene.dem_datum")
+    for antenna, which in ((tx, "transmitter"), (rx, "receiver")):
+        above, ground = clearance(grid, antenna, heights=heights.of)
+        low = above <= 0
+        if low.any():
+            pulse = int(np.nanargmin(above))
+            raise CampaignError(
+                f"{where}: at {int(low.sum())} pulses the {which} is in or below the ground of the scene, worst at "
+                f"pulse {pulse}: {above[pulse]:.2f} m above it, its height {above[pulse] + ground[pulse]:.2f} m where "
+                f"{source} has {ground[pulse]:.2f} m",
+                where=f"config/config.yaml: scene.{'height_m' if heights.of is None else 'dem'}",
+                expected="an antenna above the ground, beside the scene above its mean height",
+                remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
+            )
 
 
 def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:

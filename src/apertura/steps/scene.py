@@ -13,6 +13,7 @@ from apertura.campaign import Campaign
 from apertura.geodesy import local_crs, projected_from_ecef
 from apertura.image.extent import auto_bounds, auto_spacing, utm_crs
 from apertura.image.grid import LOCAL, SceneGrid
+from apertura.image.terrain import COVER_NODES
 from apertura.settings import Scene
 from apertura.steps.ground import Ground, on_the_ground
 from apertura.store import open_stage, write_json
@@ -59,17 +60,19 @@ def settle(
         Campaign folder, where the DEM and the grid of the geoid are looked for.
     """
     chosen: dict[str, str] = {}
-    crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
+    crs, bounds, spacing, height_m = asked.crs, asked.bounds_m, asked.spacing_m, asked.height_m
     middle = np.median(np.concatenate([tx, rx]), axis=0)
     if crs == "auto":
         crs = utm_crs(middle)
         chosen["crs"] = "UTM zone of the first image flight"
     ground = Ground.of(asked, root, crs=crs)
-    east, north = (middle if crs == LOCAL else projected_from_ecef(crs, middle))[:2]
-    height_m = ground.height_under(float(east), float(north))
     if bounds == "auto":
+        east, north = (middle if crs == LOCAL else projected_from_ecef(crs, middle))[:2]
+        height_m = ground.height_under(float(east), float(north))
         bounds = auto_bounds(tx, rx, crs=crs, height_m=height_m, path_limit_m=path_limit_m)
         chosen["bounds_m"] = "ground that the first image flight sees well (docs/theory.md, eq. 8)"
+    elif spacing == "auto":
+        height_m = _level(crs, bounds, ground)
     if spacing == "auto":
         spacing = auto_spacing(tx, rx, frequency_hz, crs=crs, bounds_m=bounds, height_m=height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
@@ -111,6 +114,13 @@ def _first_flight(
     tx, rx = (np.concatenate([echo[name].values for echo in echoes]) for name in ("tx_position", "rx_position"))
     frequency = echoes[0].frequency.values
     return tx, rx, frequency, float(min(echo.path_limit.min() for echo in echoes))
+
+
+def _level(crs: str, bounds: tuple[float, float, float, float], ground: Ground) -> float:
+    """Return the reference height (m) of bounds whose spacing is still open, from pixels just for that."""
+    xmin, ymin, xmax, ymax = bounds
+    spacing = min(xmax - xmin, ymax - ymin) / COVER_NODES
+    return on_the_ground(SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, height_m=0.0), ground)[0].height_m
 
 
 def _whole(bounds: tuple[float, float, float, float], spacing: float) -> tuple[float, float, float, float]:

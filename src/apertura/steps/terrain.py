@@ -1,6 +1,6 @@
 """Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from apertura.steps.ground import Ground
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
 from apertura.store import finish, manifest_of, open_stage, tiles_missing, writing
+
+_TILE_PX = 512
 
 
 def terrain(campaign: Campaign) -> Path:
@@ -57,17 +59,19 @@ def terrain(campaign: Campaign) -> Path:
         target = zarr.open_array(wip / "height", mode="r+")
         for window in missing:
             target[window] = ground.terrain.heights(grid[window])
-        report = _report(target, windows, grid, ground.terrain)
+        report = _report(lambda window: np.asarray(target[window]), windows, grid, ground.terrain)
         zarr.open_group(wip, mode="r+").attrs["terrain"] = report | {"datum": campaign.settings.scene.dem_datum}
         finish(wip, folder)
     return folder
 
 
-def _report(target: Any, windows: list[Window], grid: SceneGrid, source: Terrain) -> dict[str, Any]:
+def _report(
+    heights_of: Callable[[Window], NDArray[np.float64]], windows: Iterable[Window], grid: SceneGrid, source: Terrain
+) -> dict[str, Any]:
     """Return what image.json may say of the terrain; raise where a pixel has no height."""
     voids, first, low, high = 0, "", np.inf, -np.inf
     for window in windows:
-        heights = np.asarray(target[window])
+        heights = heights_of(window)
         void = np.isnan(heights)
         if void.any() and not voids:
             row, column = np.argwhere(void)[0]
@@ -139,7 +143,7 @@ def open_heights(campaign: Campaign) -> Heights:
 
 
 def expected_heights(campaign: Campaign, grid: SceneGrid) -> Heights:
-    """Return the ground as `open_heights`, or before stage `terrain` is made what it will hold; voids at the mean."""
+    """Return the ground as `open_heights`, or before stage `terrain` is made what it will hold; refuse its voids."""
     if campaign.settings.scene.dem is None or manifest_of(campaign.stage("terrain")).is_file():
         return open_heights(campaign)
     source = Ground.of(campaign.settings.scene, campaign.root, crs=grid.crs).terrain
@@ -147,6 +151,12 @@ def expected_heights(campaign: Campaign, grid: SceneGrid) -> Heights:
         return Heights((), None)
 
     def read(window: Window) -> NDArray[np.float64]:
-        return np.nan_to_num(source.heights(grid[window]), nan=grid.height_m)
+        return source.heights(grid[window])
 
-    return Heights((), read)
+    def checked(window: Window) -> NDArray[np.float64]:
+        heights = read(window)
+        if np.isnan(heights).any():  # to be refused as the stage will be, with the count over the whole scene
+            _report(read, grid.tiles(_TILE_PX), grid, source)
+        return heights
+
+    return Heights((), checked)
