@@ -287,8 +287,9 @@ def test_clearance_is_height_above_the_pixel_below_on_earth_too():
         [10, 10.3, 500], [7, 80, 3], np.array([12.0, 15.0, 20.0])
     )
     above, ground = clearance(GRID, antenna, heights=lambda window: heights[window])
-    np.testing.assert_allclose(above, [2, 5, 20 - 600])  # beside the scene: above its reference height
-    np.testing.assert_allclose(ground, [10, 10, 600])
+    np.testing.assert_allclose(above, [2, 5, np.nan])  # beside the scene: not known
+    np.testing.assert_allclose(ground, [10, 10, np.nan])
+    np.testing.assert_allclose(clearance(GRID, antenna)[0][2], 20 - 600)  # but flat ground goes on
 
 
 # Seeing

@@ -16,6 +16,7 @@ def crossed_edges(
     spacing_m: float,
     band_hz: tuple[float, float],
     path_limit_m: float = np.inf,
+    lowest_m: float | None = None,
 ) -> dict[str, str]:
     """Return flags: name → what was found, in one line.
 
@@ -31,20 +32,29 @@ def crossed_edges(
         Lowest and highest frequency.
     path_limit_m
         Longest total path inside the cyclic prefix.
+    lowest_m
+        Lowest height of a DEM over the net, metres: a platform beside it may be lower. None: the ground is flat.
 
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, a platform is at or below the ground, or no echo of the scene
+        If there is no pulse, a position is not finite, a platform is at or below flat ground, or no echo of the scene
         arrives inside the prefix.
     """
     _check_finite(tx_m, rx_m)
     place_m, up = net_m.reshape(-1, 3), upward(net_m)
-    inside = [
-        _check_above(position, net_m, up, which, spacing_m)
-        for position, which in ((tx_m, "transmitter"), (rx_m, "receiver"))
-    ]
     flags = {}
+    platforms = ((tx_m, "transmitter"), (rx_m, "receiver"))
+    for position, which in platforms:
+        height = (position - net_m[0, 0]) @ up
+        if lowest_m is None:
+            _check_above(height, which)
+        elif height.min() <= lowest_m:
+            flags["platform_below_scene"] = (
+                f"the {which} is {lowest_m - height.min():.1f} m below the lowest ground of the scene: check the unit "
+                f"and the datum of the DEM, unless the radar looks up a hillside"
+            )
+    inside = [_over(position, net_m, up, spacing_m) for position, _ in platforms]
     over = int((inside[0] | inside[1]).sum())
     if over:
         flags["platform_inside_scene"] = (
@@ -79,21 +89,22 @@ def _check_finite(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
         )
 
 
-def _check_above(
-    position_m: NDArray[np.float64], net_m: NDArray[np.float64], up: NDArray[np.float64], which: str, spacing_m: float
-) -> NDArray[np.bool_]:
-    """Raise where a platform is not above the ground; return which pulses are over the scene."""
-    corner = net_m[0, 0]
-    height = (position_m - corner) @ up
-    low = int(height.argmin())
-    if height[low] <= 0:
+def _check_above(height_m: NDArray[np.float64], which: str) -> None:
+    low = int(height_m.argmin())
+    if height_m[low] <= 0:
         raise CampaignError(
-            f"the {which} is {height[low]:.2f} m above the ground at pulse {low}",
+            f"the {which} is {height_m[low]:.2f} m above the ground at pulse {low}",
             where="config/config.yaml: scene.height_m",
             expected="a platform above the ground",
             remedy="Check height_m and its datum (logs may count from the geoid), and the heights in the flight log.",
         )
-    over = np.ones(len(position_m), bool)
+
+
+def _over(
+    position_m: NDArray[np.float64], net_m: NDArray[np.float64], up: NDArray[np.float64], spacing_m: float
+) -> NDArray[np.bool_]:
+    """Return which pulses are above the scene."""
+    corner, over = net_m[0, 0], np.ones(len(position_m), bool)
     right, down = net_m[0, -1] - corner, net_m[-1, 0] - corner
     lengths = [float(np.linalg.norm(side)) for side in (right, down)]
     if not lengths[1]:  # one row or column is as wide as a pixel
@@ -143,6 +154,7 @@ def _unseen(
             f"zero pulses see the scene: the shortest total path is {shortest.min():.1f} m",
             where="config/config.yaml: scene.bounds_m",
             expected=f"at most {path_limit_m:.1f} m, the cyclic prefix",
-            remedy="Correct scene.bounds_m (easting before northing) and scene.crs.",
+            remedy="Correct scene.bounds_m (easting before northing), scene.crs, or the height of the ground: "
+            "scene.height_m, or unit and datum of scene.dem.",
         )
     return float(beyond.mean())

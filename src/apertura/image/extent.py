@@ -193,7 +193,8 @@ def clearance(
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each; beside the scene, the ground is at `grid.height_m`.
+        (pulse,) float64 metres each. Beside the scene flat ground goes on at `grid.height_m`; what lies beside a DEM is
+        not known: NaN.
 
     Examples
     --------
@@ -204,7 +205,7 @@ def clearance(
     place = antenna if grid.crs == LOCAL else projected_from_ecef(grid.crs, antenna)
     west, _, _, north = grid.bounds_m
     row, column = (np.floor(side / grid.spacing_m).astype(int) for side in (north - place[:, 1], place[:, 0] - west))
-    under = np.full(len(antenna), grid.height_m)
+    under = np.full(len(antenna), grid.height_m if heights is None else np.nan)
     for window in grid.tiles(512):
         inside = (row >= window[0].start) & (row < window[0].stop)
         inside &= (column >= window[1].start) & (column < window[1].stop)

@@ -56,6 +56,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         spacing_m=job.spacing_m,
         band_hz=job.band_hz,
         path_limit_m=job.path_limit_m,
+        lowest_m=None if job.heights_m is None else float(job.heights_m.min()),
     )
     desk = Desk(job, job.view, costs, asked)
     whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)

@@ -1,6 +1,7 @@
 """Terrain under the scene: a DEM in any CRS becomes ellipsoidal heights at the pixels of the grid."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,7 @@ class Terrain:
         )
 
 
+@lru_cache(maxsize=64)
 def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
     try:
         return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)

@@ -85,7 +85,7 @@ def check_clearance(
                 f"pulse {pulse}: {above[pulse]:.2f} m above it, its height {above[pulse] + ground[pulse]:.2f} m where "
                 f"{source} has {ground[pulse]:.2f} m",
                 where=f"config/config.yaml: scene.{'height_m' if heights.of is None else 'dem'}",
-                expected="an antenna above the ground, beside the scene above its mean height",
+                expected="an antenna above the ground",
                 remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
             )
 
