@@ -112,10 +112,8 @@ def call(function: str, job: ctypes.Structure) -> None:
 @lru_cache(maxsize=1)
 def _library_path() -> Path | None:
     named = os.environ.get("APERTURA_KERNEL")  # another build, such as one with sanitizers
-    beside = Path(__file__).with_name("_backprojection.so")
-    installed = Path(str(files("apertura.image.engines") / "_backprojection.so"))
-    places = [Path(named)] if named else [beside, installed]
-    return next((place for place in places if place.is_file()), None)
+    path = Path(named or str(files("apertura.image.engines") / "_backprojection.so"))
+    return path if path.is_file() else None
 
 
 @lru_cache(maxsize=1)
