@@ -95,7 +95,7 @@ def calibrate_cost() -> None:
     costs = measure_costs()
     for name, seconds in sorted(costs.seconds.items()):
         print(f"{name:<24}{1e9 * seconds:>12.3g} ns")
-    print(write_costs(costs))
+    print(write_costs(costs), "(a campaign that ran keeps its own: delete its results/costs.json to plan anew)")
 
 
 @app.command()

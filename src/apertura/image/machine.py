@@ -119,7 +119,7 @@ def kept_costs(path: Path) -> Costs:
     All jobs of a campaign plan with the same costs, on whatever machines they run: so they plan the same.
     """
     found = _stored(path)
-    return read_costs() if found is None else Costs(found["seconds"], found["source"])
+    return read_costs() if found is None else Costs(found["seconds"], f"{found['source']}, as {path.name} keeps them")
 
 
 def _stored(path: Path) -> dict[str, Any] | None:
