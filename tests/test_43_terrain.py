@@ -25,7 +25,7 @@ from apertura.steps import outlook, profile, scene, terrain
 from apertura.steps.ground import Ground, on_the_ground
 from apertura.steps.history import profiles_of, spectra_of
 from apertura.steps.outlook import outlook_of
-from apertura.steps.plan import job_of, plan_pair
+from apertura.steps.plan import job_of, plan_known, plan_pair
 from apertura.steps.scene import scene_grid
 from apertura.steps.terrain import Heights, expected_heights
 from apertura.steps.verify import verify
@@ -177,7 +177,7 @@ def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
     monkeypatch.setattr(outlook, "open_stage", None)
     found = outlook.outlook_of(hillside, "f01", "uav1-uav2", echo=echo)
     assert np.shares_memory(found.spectra.transfer, held)
-    plan_pair(hillside, "f01", "uav1-uav2", echo=echo, heights=terrain.open_heights(hillside))
+    plan_known(hillside, "f01", "uav1-uav2", found, scene_grid(hillside), terrain.open_heights(hillside))
 
 
 # Bad input

@@ -116,7 +116,7 @@ rule tiles:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.forming"),
+        code=code_sha256("apertura.steps.image"),
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:

@@ -17,9 +17,9 @@ from apertura.image.grid import LOCAL, SceneGrid
 from apertura.image.plan import Plan
 from apertura.image.tiles import Former, form_blocks
 from apertura.provenance import sha256_file
-from apertura.steps.antennas import beams_of, body_axes
-from apertura.steps.history import profiles_of, spectra_of
-from apertura.steps.plan import plan_pair, planned_heights
+from apertura.steps.history import profiles_of
+from apertura.steps.outlook import outlook_of
+from apertura.steps.plan import plan_known, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
 from apertura.steps.terrain import Heights, open_heights
@@ -64,26 +64,29 @@ class Work:
     threads: int
 
     @classmethod
-    def of(cls, campaign: Campaign, flight: str, pair: str, *, threads: int) -> "Work":
-        """Open what a pair's image is made from, and plan it."""
+    def of(cls, campaign: Campaign, flight: str, pair: str, *, module: str, threads: int) -> "Work":
+        """Open what a pair's image is made from, and plan it; `module` as `apertura.steps.stamping.stamped`."""
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-        grid, heights, processing = scene_grid(campaign), open_heights(campaign), campaign.settings.processing
-        history = {"echo": spectra_of(echo, processing.window), "profile": profiles_of(profile)}
-        plan = plan_pair(campaign, flight, pair, threads=threads, echo=echo, heights=heights)
+        grid, heights, outlook = (
+            scene_grid(campaign),
+            open_heights(campaign),
+            outlook_of(campaign, flight, pair, echo=echo),
+        )
+        history = {"echo": outlook.spectra, "profile": profiles_of(profile)}
+        plan = plan_known(campaign, flight, pair, outlook, grid, heights, threads=threads)
         heights = planned_heights(plan, heights, grid)
         # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
         choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
         empty = stamped(
             _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
             "image",
-            module=__name__,
+            module=module,
             parents=[echo, profile, *heights.parents],
             inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
             settings={**campaign.relevant("image", pair), "grid": grid_spec(grid), "plan": choices},
         )
-        folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(processing.tile_px))
-        beams = beams_of(campaign, pair, body_axes(echo))
-        return cls(folder, echo, history, beams, grid, heights, plan, empty, windows, threads)
+        folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(campaign.settings.processing.tile_px))
+        return cls(folder, echo, history, outlook.beams, grid, heights, plan, empty, windows, threads)
 
     def form(self, target: Any, setting: Setting, windows: list[Window], *, planned: bool = False) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.

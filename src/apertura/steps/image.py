@@ -18,7 +18,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
-    work = Work.of(campaign, flight, pair, threads=threads)
+    work = Work.of(campaign, flight, pair, module=__name__, threads=threads)
     folder, echo, plan = work.folder, work.echo, work.plan
     with writing(folder) as wip:
         missing = tiles_missing(wip, work.empty, "image", work.windows)
@@ -61,7 +61,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     number, jobs = (int(part) for part in share.split("-of-"))
     if not 1 <= number <= jobs:
         raise ValueError(f"{share=}: must be one of 1-of-{jobs} to {jobs}-of-{jobs}")
-    work = Work.of(campaign, flight, pair, threads=threads)
+    work = Work.of(campaign, flight, pair, module=__name__, threads=threads)
     mine = work.windows[number - 1 :: jobs]
     with sharing(work.folder, work.empty, "image", work.windows) as (wip, missing):
         todo = [window for window in mine if window in missing]

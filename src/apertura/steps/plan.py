@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -47,34 +46,42 @@ _BLOCKS = 33
 _CONTENT_PIXELS = 128
 
 
-def plan_pair(
+def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
+    """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran.
+
+    Parameters and errors as `plan_known`.
+    """
+    outlook = outlook_of(campaign, flight, pair)
+    grid = campaign_grid(campaign, outlook)
+    return plan_known(campaign, flight, pair, outlook, grid, expected_heights(campaign, grid), threads=threads)
+
+
+def plan_known(
     campaign: Campaign,
     flight: str,
     pair: str,
+    outlook: Outlook,
+    grid: SceneGrid,
+    heights: Heights,
     *,
     threads: int = 1,
-    echo: xr.Dataset | None = None,
-    heights: Heights | None = None,
 ) -> Plan:
-    """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran.
+    """Return how a pair will be imaged of which all that is known is open.
 
     Parameters
     ----------
     campaign, flight, pair
         Which.
+    outlook, grid, heights
+        Its echo or what the logs promise, the campaign's grid and the ground.
     threads
         Tiles formed at once: for seconds and bytes; nothing is chosen by it.
-    echo, heights
-        The pair's echo and the ground, where they are open already.
 
     Raises
     ------
     CampaignError
         If the job cannot fit in memory or on the disk, or its geometry is impossible.
     """
-    outlook = outlook_of(campaign, flight, pair, echo=echo)
-    grid = campaign_grid(campaign, outlook)
-    heights = heights or expected_heights(campaign, grid)
     check_clearance(grid, outlook.tx, outlook.rx, heights=heights, where=f"flight {flight}, pair {pair}")
     plan = plan_job(campaign, campaign_job(campaign, pair, outlook, grid, heights, threads=threads))
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()
