@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.image.extent import swath
-from apertura.image.grid import SceneGrid
-from apertura.image.history import Profiles, Spectra
-from apertura.image.plan import Job
-from apertura.steps.outlook import Outlook
+from apertura.focus.inputs import Profiles, Spectra
+from apertura.load.pair import Outlook
+from apertura.planning.plan import Job
+from apertura.scene.auto_grid import swath
+from apertura.scene.grid import SceneGrid
 from apertura.steps.plan import job_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
 from apertura.steps.terrain import Heights

@@ -26,7 +26,7 @@ from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import compress, window_weights
-from apertura.image.engines import native, numba
+from apertura.focus.engines import native, numba
 
 
 @dataclass

@@ -11,8 +11,8 @@ import numpy as np
 from job import GUARD, Job, exact, response, total_path
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.image.engines import native
-from apertura.image.history import Profiles
+from apertura.focus.engines import native
+from apertura.focus.inputs import Profiles
 
 RANGES_M = (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
 CARRIERS_HZ = (0.4e9, 1.2e9, 3.5e9, 10e9)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.image.history import Profiles
+from apertura.focus.inputs import Profiles
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from campaigns import Drawn, draw
 
-from apertura.image.candidates import Setting, candidates
-from apertura.image.engines import ENGINES, numba, reference
-from apertura.image.machine import read_costs
-from apertura.image.plan import Plan
-from apertura.image.planner import make_plan
-from apertura.image.quality import numerical_error
-from apertura.image.view import look
+from apertura.focus.engines import ENGINES, numba, reference
+from apertura.planning.candidates import Setting, candidates
+from apertura.planning.machine import read_costs
+from apertura.planning.plan import Plan
+from apertura.planning.planner import make_plan
+from apertura.planning.view import look
+from apertura.quality.measures import numerical_error
 
 
 @dataclass

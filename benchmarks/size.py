@@ -22,12 +22,12 @@ import numpy as np
 import zarr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.geodesy import ecef_from_projected
-from apertura.image.engines import native
-from apertura.image.engines.tables import Tables
-from apertura.image.grid import SceneGrid
-from apertura.image.history import Profiles
-from apertura.image.tiles import Former, form_blocks
+from apertura.focus.engines import native
+from apertura.focus.engines.tables import Tables
+from apertura.focus.inputs import Profiles
+from apertura.focus.tiles import Former, form_blocks
+from apertura.geometry.geodesy import ecef_from_projected
+from apertura.scene.grid import SceneGrid
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 

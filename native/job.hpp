@@ -1,4 +1,4 @@
-// What Python hands over, mirrored field by field in src/apertura/image/engines/binding.py.
+// What Python hands over, mirrored field by field in src/apertura/focus/engines/binding.py.
 #pragma once
 #include <cstdint>
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from apertura.campaign import Campaign
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.plan import grid_around
-from apertura.simulate.presets import DEMO_ORIGIN, tandem
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.plan import grid_around
+from apertura.simulation.presets import DEMO_ORIGIN, tandem
 from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"

@@ -9,7 +9,7 @@ import yaml
 
 from apertura.errors import CampaignError
 from apertura.settings import Processing, Settings, validated
-from apertura.template import config_schema, config_template, flights_template
+from apertura.settings.template import config_schema, config_template, flights_template
 
 ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}

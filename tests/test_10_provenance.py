@@ -29,16 +29,16 @@ def touched(copied, file, module):
 @pytest.mark.parametrize(
     ("edited", "step", "reruns"),
     [
-        ("image/engines/numba.py", "image", True),
-        ("image/engines/numba.py", "echo", False),
-        ("cube/fusion.py", "cube", True),
-        ("cube/fusion.py", "image", False),
+        ("focus/engines/numba.py", "image", True),
+        ("focus/engines/numba.py", "echo", False),
+        ("fusion/sums.py", "cube", True),
+        ("fusion/sums.py", "image", False),
         ("echo/sidelink.py", "echo", True),
         ("echo/sidelink.py", "image", False),
         ("export/cog.py", "export", True),
         ("export/cog.py", "cube", False),
         ("ingest/rtklib.py", "ingest", True),
-        ("simulate/presets.py", "image", False),
+        ("simulation/presets.py", "image", False),
         ("constants.py", "image", True),
         ("settings/node.py", "ingest", True),
         ("store/locks.py", "ingest", True),
@@ -51,7 +51,7 @@ def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, ed
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
 def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
-    digests = copied / "image/engines/_backprojection.sha256"
+    digests = copied / "focus/engines/_backprojection.sha256"
     digests.write_text("of other sources")
     assert touched(copied, digests, f"apertura.steps.{step}") is reruns
 
@@ -59,7 +59,7 @@ def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
 def test_every_step_stands_on_modules_that_were_found():
     closure = provenance._closure(["apertura.steps.image"])
     loaded = {name for name in closure if name in sys.modules}
-    assert {"apertura.store", "apertura.image.engines.reference", "apertura.geodesy"} <= set(closure)
+    assert {"apertura.store", "apertura.focus.engines.reference", "apertura.geometry.geodesy"} <= set(closure)
     assert loaded <= set(closure)
 
 

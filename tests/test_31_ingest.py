@@ -9,7 +9,7 @@ import pytest
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.contracts import check
 from apertura.errors import CampaignError
-from apertura.geodesy import geodetic_from_ecef
+from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.ingest import PHASE_HISTORIES, TRACKS, read_sigmf
 
 HEADER = (

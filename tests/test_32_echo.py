@@ -6,9 +6,9 @@ import pytest
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.echo.demodulate import demodulate, remove_path, subcarrier_numbers
-from apertura.echo.geometry import phase_centres
 from apertura.errors import CampaignError
-from apertura.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.geometry.phase_centres import phase_centres
 
 RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
 

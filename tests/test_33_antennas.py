@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from test_33_planner import COSTS, compiled, draw, job, net, plan, track
 
+from apertura.antenna.beam import Beam, Beams
+from apertura.antenna.illumination import Footprint, footprint, illuminate
+from apertura.antenna.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
 from apertura.errors import CampaignError
-from apertura.geodesy import body_axes
-from apertura.image.beam import Beam, Beams
-from apertura.image.cost import seconds
-from apertura.image.engines import ENGINES, native, reference
-from apertura.image.illumination import Footprint, footprint, illuminate
-from apertura.image.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
-from apertura.image.planner import make_plan
-from apertura.image.quality import numerical_error
+from apertura.focus.engines import ENGINES, native, reference
+from apertura.geometry.geodesy import body_axes
+from apertura.planning.cost import seconds
+from apertura.planning.planner import make_plan
+from apertura.quality.measures import numerical_error
 
 
 def side(width_deg=(40.0, 60.0), *, boresight_deg=(-90.0, -25.0), pulses=300, cutoff_db=-20.0):

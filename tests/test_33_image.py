@@ -7,16 +7,16 @@ from pyproj import Geod, Transformer
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.geodesy import ecef_from_projected, projected_from_ecef
-from apertura.image.certificate import Certificate, certified_pixels
-from apertura.image.engines import ENGINES, reference
-from apertura.image.extent import auto_bounds, auto_spacing, swath, utm_crs
-from apertura.image.grid import SceneGrid
-from apertura.image.history import Profiles, Spectra
-from apertura.image.peaks import Patch, cut_through, find_peak
-from apertura.image.placement import block
-from apertura.image.quality import coherence_factor, numerical_error, survey
-from apertura.image.tiles import form_tiles
+from apertura.focus.engines import ENGINES, reference
+from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.tiles import form_tiles
+from apertura.geometry.geodesy import ecef_from_projected, projected_from_ecef
+from apertura.quality.error_check import Certificate, certified_pixels
+from apertura.quality.measures import coherence_factor, numerical_error, survey
+from apertura.quality.point_targets import Patch, cut_through, find_peak
+from apertura.scene.auto_grid import auto_bounds, auto_spacing, swath, utm_crs
+from apertura.scene.grid import SceneGrid
+from apertura.scene.pixel_positions import block
 
 FREQUENCY = 1.2e9 + 1.6e6 * np.arange(256)
 GRID = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80), 0.0)

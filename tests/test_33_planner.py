@@ -11,21 +11,21 @@ import pytest
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.echo.compression import window_weights
 from apertura.errors import CampaignError
-from apertura.image.budget import memory_limit
-from apertura.image.candidates import Signal, candidates
-from apertura.image.cost import Costs
-from apertura.image.edges import crossed_edges, finest_cell_m
-from apertura.image.engines import ENGINES, native, reference
-from apertura.image.grid import SceneGrid
-from apertura.image.history import Profiles
-from apertura.image.machine import default_costs, kept_costs, machine, read_costs, write_costs
-from apertura.image.models import decide_midpoint, decide_terrain, midpoint_error
-from apertura.image.plan import Job
-from apertura.image.planner import make_plan
-from apertura.image.quality import numerical_error
-from apertura.image.thinning import design, presum_error_db, thin
-from apertura.image.tiles import form_blocks
-from apertura.image.view import forms, look, phase_rates
+from apertura.focus.engines import ENGINES, native, reference
+from apertura.focus.inputs import Profiles
+from apertura.focus.presum import design, presum_error_db, thin
+from apertura.focus.tiles import form_blocks
+from apertura.planning.candidates import Signal, candidates
+from apertura.planning.checks import crossed_edges, finest_cell_m
+from apertura.planning.cost import Costs
+from apertura.planning.machine import default_costs, kept_costs, machine, read_costs, write_costs
+from apertura.planning.memory import memory_limit
+from apertura.planning.models import decide_midpoint, decide_terrain, midpoint_error
+from apertura.planning.plan import Job
+from apertura.planning.planner import make_plan
+from apertura.planning.view import forms, look, phase_rates
+from apertura.quality.measures import numerical_error
+from apertura.scene.grid import SceneGrid
 from apertura.steps.plan import check_fits, planned_heights
 from apertura.steps.terrain import Heights
 

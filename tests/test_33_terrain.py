@@ -11,15 +11,15 @@ from rasterio.transform import from_origin
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.export import layers as exported
-from apertura.geodesy import projected_from_ecef
-from apertura.image import geoid, sightlines
-from apertura.image.dem import open_terrain
-from apertura.image.engines import reference
-from apertura.image.extent import clearance, swath
-from apertura.image.grid import SceneGrid
-from apertura.image.history import Spectra
-from apertura.image.peaks import find_peak, ground_position
-from apertura.image.visibility import (
+from apertura.focus.engines import reference
+from apertura.focus.inputs import Spectra
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.quality.point_targets import find_peak, ground_position
+from apertura.scene import geoid, sightlines
+from apertura.scene.auto_grid import clearance, swath
+from apertura.scene.dem import open_terrain
+from apertura.scene.grid import SceneGrid
+from apertura.scene.visibility import (
     Relief,
     antennas_over,
     bistatic_angle_deg,

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from test_34_engine_native import AXES, Scene, _runs, decibels, ecef, fly, grid, scatter
 
-from apertura.image.beam import Beam, Beams
-from apertura.image.engines import native, numba, reference
-from apertura.image.history import Spectra
+from apertura.antenna.beam import Beam, Beams
+from apertura.focus.engines import native, numba, reference
+from apertura.focus.inputs import Spectra
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -5,7 +5,7 @@ import pytest
 from test_34_engine_native import ecef, error_db, fly, grid, scatter
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.image.engines import native
+from apertura.focus.engines import native
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.image.engines import binding, native
-from apertura.image.history import Profiles
+from apertura.focus.engines import binding, native
+from apertura.focus.inputs import Profiles
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -12,19 +12,19 @@ import yaml
 from numpy.testing import assert_allclose
 
 from apertura.errors import CampaignError
-from apertura.geodesy import ecef_from_geodetic, ecef_from_projected
-from apertura.simulate.antenna import Antenna
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.continuous import continuous_blocks, pulse_samples
-from apertura.simulate.flight import Straight, follow_log, phase_centre, wobble
-from apertura.simulate.frame import Framing
-from apertura.simulate.impairments import Adc, Clock, Impairments, Localization, TimeTag, Timing
-from apertura.simulate.plan import Flight, Node, Simulation, fly, grid_around
-from apertura.simulate.presets import tandem, tandem_demo
-from apertura.simulate.radar import Waveform, qpsk_codes
-from apertura.simulate.recording import full_scale
-from apertura.simulate.scene import Clutter, Line, Origin, Plate, PointTarget, Scene
-from apertura.simulate.synthesis import samples
+from apertura.geometry.geodesy import ecef_from_geodetic, ecef_from_projected
+from apertura.simulation.antenna import Antenna
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.continuous import continuous_blocks, pulse_samples
+from apertura.simulation.flight import Straight, follow_log, phase_centre, wobble
+from apertura.simulation.frame import Framing
+from apertura.simulation.impairments import Adc, Clock, Impairments, Localization, TimeTag, Timing
+from apertura.simulation.plan import Flight, Node, Simulation, fly, grid_around
+from apertura.simulation.presets import tandem, tandem_demo
+from apertura.simulation.radar import Waveform, qpsk_codes
+from apertura.simulation.recording import full_scale
+from apertura.simulation.scene import Clutter, Line, Origin, Plate, PointTarget, Scene
+from apertura.simulation.synthesis import samples
 
 C = 299_792_458.0
 SHARED = Path(__file__).parents[2] / "shared" / "data"
@@ -255,7 +255,7 @@ def test_a_smaller_block_changes_nothing_but_the_memory(monkeypatch):
     noisy = Impairments(radar_snr_db=20.0, sidelink_snr_db=20.0)
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=noisy)
     whole, _, _, blocks = stream_of(simulation, "b")
-    monkeypatch.setattr("apertura.simulate.continuous._SAMPLES_AT_ONCE", 3000)
+    monkeypatch.setattr("apertura.simulation.continuous._SAMPLES_AT_ONCE", 3000)
     pieces, _, _, small = stream_of(simulation, "b")
     assert (pieces == whole).all()
     assert max(map(len, small)) <= 3000 < max(map(len, blocks))

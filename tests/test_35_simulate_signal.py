@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apertura.simulate.frame import Framing
-from apertura.simulate.hidden import draw
-from apertura.simulate.impairments import (
+from apertura.simulation.frame import Framing
+from apertura.simulation.hidden import draw
+from apertura.simulation.impairments import (
     Adc,
     Blockage,
     Clock,
@@ -21,12 +21,12 @@ from apertura.simulate.impairments import (
     Timing,
     UniformPhase,
 )
-from apertura.simulate.observation import observe
-from apertura.simulate.presets import paper_scene, paper_waveform
-from apertura.simulate.radar import Paths, Waveform, qpsk_codes
-from apertura.simulate.recording import Geometry, digitize, full_scale
-from apertura.simulate.scene import Scatterers
-from apertura.simulate.synthesis import Channel, samples, transfer_functions
+from apertura.simulation.observation import observe
+from apertura.simulation.presets import paper_scene, paper_waveform
+from apertura.simulation.radar import Paths, Waveform, qpsk_codes
+from apertura.simulation.recording import Geometry, digitize, full_scale
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import Channel, samples, transfer_functions
 
 C = 299_792_458.0
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.cube.fusion import coherent_sum, noncoherent_sum
+from apertura.fusion.sums import coherent_sum, noncoherent_sum
 
 
 def test_images_in_phase_keep_their_peak_and_images_out_of_phase_cancel():

@@ -14,15 +14,15 @@ import rasterio
 import zarr
 from rasterio import Affine
 
+from apertura.atomic import whole
 from apertura.errors import CampaignError, ContractError
 from apertura.export import EXPORTS, LAYERS
 from apertura.export.cog import READ, write_power, write_slc
 from apertura.export.db import write_db
-from apertura.export.draft import whole
 from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
+from apertura.export.map_layout import DPI, LEFT, TOP
 from apertura.export.quicklook import _below_peak, shrink, write_quicklook
-from apertura.export.sheet import DPI, LEFT, TOP
-from apertura.geodesy import local_crs
+from apertura.geometry.geodesy import local_crs
 
 UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
 TAGS = {

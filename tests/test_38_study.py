@@ -4,25 +4,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from apertura.study.stability.atlas import edge_of, join_parts, part_path, read_outcomes, write_outcomes
+from apertura.study.stability.charts import draw_impairment
+from apertura.study.stability.outcomes import Outcome, correct, crossing, run_sweep
+from apertura.study.stability.sweeps import CHOICES, SWEEPS
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
-from apertura.simulate.impairments import Clock, Impairments, Localization, Timing, UniformPhase
-from apertura.simulate.observation import observe
-from apertura.simulate.synthesis import samples
-from apertura.study import commands, formulas
-from apertura.study.atlas import edge_of, join_parts, part_path, read_outcomes, write_outcomes
+from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
+from apertura.simulation.observation import observe
+from apertura.simulation.synthesis import samples
+from apertura.study import commands
 from apertura.study.bench import Case, paper_bench, receive_pair
-from apertura.study.charts import draw_impairment
-from apertura.study.claims import Claim, compare, read_claims, write_claims
-from apertura.study.coherence import coherence_claims
-from apertura.study.corrected import clock_claims, corrected_claims
 from apertura.study.focus import coherence_factors, decibels, find_peaks, half_power_widths, history, range_tables
-from apertura.study.losses import DESTROYED_DB, ERRORS, loss_claims
-from apertura.study.parameters import parameter_claims
-from apertura.study.resolution import simulated_table, uav_table
-from apertura.study.stability import Outcome, correct, crossing, run_sweep
-from apertura.study.sweeps import CHOICES, SWEEPS
+from apertura.study.paper import formulas
+from apertura.study.paper.claims import Claim, compare, read_claims, write_claims
+from apertura.study.paper.coherence import coherence_claims
+from apertura.study.paper.corrected import clock_claims, corrected_claims
+from apertura.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
+from apertura.study.paper.parameters import parameter_claims
+from apertura.study.paper.resolution import simulated_table, uav_table
 from apertura.study.window import demodulated, window_samples
 
 

@@ -11,10 +11,10 @@ from conftest import run_steps
 from apertura.campaign import Campaign
 from apertura.echo.compression import compress, range_step, window_weights
 from apertura.echo.sidelink import METHODS
-from apertura.image.engines import ENGINES, reference
-from apertura.image.history import Profiles, Spectra
-from apertura.image.peaks import Patch, find_peak, ground_position
-from apertura.image.quality import numerical_error
+from apertura.focus.engines import ENGINES, reference
+from apertura.focus.inputs import Profiles, Spectra
+from apertura.quality.measures import numerical_error
+from apertura.quality.point_targets import Patch, find_peak, ground_position
 from apertura.steps import echo
 from apertura.steps.scene import scene_grid
 from apertura.steps.verify import verify

@@ -10,8 +10,8 @@ from conftest import copy_writable
 
 from apertura.campaign import Campaign
 from apertura.steps.plan import plan_pair
-from apertura.study.pareto import Point, with_front, write_points
-from apertura.study.speed_accuracy import speed_accuracy
+from apertura.study.chart.pareto import Point, with_front, write_points
+from apertura.study.chart.speed_accuracy import speed_accuracy
 
 
 @pytest.fixture(scope="module")

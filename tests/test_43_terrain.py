@@ -14,17 +14,18 @@ from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.geodesy import projected_from_ecef
-from apertura.image.engines import ENGINES
-from apertura.image.grid import SceneGrid
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.plan import grid_around
-from apertura.simulate.presets import DEMO_ORIGIN, tandem
-from apertura.simulate.scene import PointTarget, Scene
-from apertura.steps import outlook, profile, scene, terrain
-from apertura.steps.ground import Ground, on_the_ground
-from apertura.steps.history import profiles_of, spectra_of
-from apertura.steps.outlook import outlook_of
+from apertura.focus.engines import ENGINES
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.load import pair as outlook
+from apertura.load.ground import Ground, on_the_ground
+from apertura.load.inputs import profiles_of, spectra_of
+from apertura.load.pair import outlook_of
+from apertura.scene.grid import SceneGrid
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.plan import grid_around
+from apertura.simulation.presets import DEMO_ORIGIN, tandem
+from apertura.simulation.scene import PointTarget, Scene
+from apertura.steps import profile, scene, terrain
 from apertura.steps.plan import job_of, plan_known, plan_pair
 from apertura.steps.scene import scene_grid
 from apertura.steps.terrain import Heights, expected_heights

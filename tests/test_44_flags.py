@@ -8,10 +8,10 @@ import pytest
 from test_41_bad_input import complaint, edit_config, ingest_all
 
 from apertura.campaign import Campaign
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag
-from apertura.simulate.plan import grid_around
-from apertura.simulate.presets import DEMO_ORIGIN, tandem
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag
+from apertura.simulation.plan import grid_around
+from apertura.simulation.presets import DEMO_ORIGIN, tandem
 from apertura.steps import echo, image, profile, scene
 from apertura.store import open_stage
 

@@ -10,9 +10,9 @@ from test_35_simulate_campaign import small_simulation
 from test_41_bad_input import complaint, edit_data
 
 from apertura.campaign import Campaign
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.frame import Framing
-from apertura.simulate.impairments import Impairments
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.frame import Framing
+from apertura.simulation.impairments import Impairments
 from apertura.steps import ingest
 from apertura.store import open_stage
 

@@ -9,10 +9,10 @@ import yaml
 from test_41_bad_input import complaint, edit_config
 
 from apertura.campaign import Campaign
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.plan import grid_around
-from apertura.simulate.presets import DEMO_ORIGIN, tandem
-from apertura.simulate.scene import PointTarget
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.plan import grid_around
+from apertura.simulation.presets import DEMO_ORIGIN, tandem
+from apertura.simulation.scene import PointTarget
 from apertura.steps import calibration, echo, ingest
 from apertura.store import open_stage
 

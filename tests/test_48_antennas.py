@@ -10,14 +10,14 @@ from conftest import copy_writable
 from test_41_bad_input import complaint, edit_config
 
 from apertura.campaign import Campaign
-from apertura.image.peaks import cut_through, find_peak
-from apertura.simulate.antenna import Antenna
-from apertura.simulate.campaign import write_campaign
-from apertura.simulate.flight import Straight
-from apertura.simulate.impairments import Impairments
-from apertura.simulate.plan import Flight, Node, grid_around
-from apertura.simulate.presets import DEMO_ORIGIN, tandem
-from apertura.simulate.scene import PointTarget, Scene
+from apertura.quality.point_targets import cut_through, find_peak
+from apertura.simulation.antenna import Antenna
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.flight import Straight
+from apertura.simulation.impairments import Impairments
+from apertura.simulation.plan import Flight, Node, grid_around
+from apertura.simulation.presets import DEMO_ORIGIN, tandem
+from apertura.simulation.scene import PointTarget, Scene
 from apertura.steps import echo, image, ingest, profile, scene
 from apertura.steps.plan import plan_pair
 from apertura.store import open_stage

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from apertura.errors import CampaignError
-from apertura.flights import FLIGHTS, Flight, read_flights
 from apertura.settings import Antenna, OfdmWaveform, Settings, read_settings
+from apertura.settings.flights import FLIGHTS, Flight, read_flights
 
 CONFIG = Path("config/config.yaml")
 

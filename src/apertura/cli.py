@@ -89,8 +89,8 @@ def chart(
 @app.command("calibrate-cost")
 def calibrate_cost() -> None:
     """Measure what imaging costs on this machine, for the planner; takes less than a minute."""
-    from apertura.image.calibration import measure_costs
-    from apertura.image.machine import write_costs
+    from apertura.planning.calibration import measure_costs
+    from apertura.planning.machine import write_costs
 
     costs = measure_costs()
     for name, seconds in sorted(costs.seconds.items()):
@@ -111,7 +111,7 @@ def verify(
 @app.command()
 def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> None:
     """Write the commented config of a new campaign folder."""
-    from apertura.template import config_template, flights_template
+    from apertura.settings.template import config_template, flights_template
 
     folder = directory / "config"
     for path, text in ((folder / "config.yaml", config_template()), (folder / "flights.tsv", flights_template())):
@@ -130,7 +130,7 @@ def simulate(
     """Write a small tandem flight as a campaign folder of raw IQ, with truth.json."""
     import numpy as np
 
-    from apertura.simulate.presets import tandem_demo
+    from apertura.simulation.presets import tandem_demo
 
     print(tandem_demo(directory, np.random.default_rng(seed)))
 
@@ -226,7 +226,7 @@ def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, thread
 @step.command("chart")
 def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
     """Time and measure every engine and setting on a pair, for at most so many seconds."""
-    from apertura.study.speed_accuracy import speed_accuracy
+    from apertura.study.chart.speed_accuracy import speed_accuracy
 
     print(*speed_accuracy(Campaign.load(campaign), flight, pair, seconds=seconds), sep="\n")
 

@@ -23,7 +23,7 @@ rule speed_accuracy:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        code=code_sha256("apertura.study.speed_accuracy"),
+        code=code_sha256("apertura.study.chart.speed_accuracy"),
         flight=campaign.image_flights[0].name,
         pair=campaign.image_flights[0].pairs[-1],
     message:

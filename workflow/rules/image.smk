@@ -40,7 +40,7 @@ rule costs:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.image.machine"),
+        code=code_sha256("apertura.planning.machine"),
     message:
         "keeping what imaging costs here, so that all jobs plan alike"
     shell:

@@ -1,7 +1,7 @@
 # The studies need no campaign: `snakemake --snakefile workflow/rules/study.smk --cores 2 paper stability`.
 from apertura.provenance import code_sha256
 from apertura.study.commands import PAPER_PARTS
-from apertura.study.sweeps import CHOICES, SWEEPS
+from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
 ERRORS = [part.removeprefix("loss_") for part in PAPER_PARTS if part.startswith("loss_")]
 
@@ -65,7 +65,7 @@ rule paper_claims:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.study.claims"),
+        code=code_sha256("apertura.study.paper.claims"),
     message:
         "putting the claims together"
     shell:
@@ -85,7 +85,7 @@ rule paper_figure:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.study.figures"),
+        code=code_sha256("apertura.study.paper.figures"),
     message:
         "drawing what {wildcards.error} does"
     shell:
@@ -105,7 +105,7 @@ rule stability_sweep:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.study.stability"),
+        code=code_sha256("apertura.study.stability.outcomes"),
     message:
         "sweeping {wildcards.impairment} under {wildcards.method}"
     shell:
@@ -128,7 +128,7 @@ rule stability_chart:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.study.charts"),
+        code=code_sha256("apertura.study.stability.charts"),
     message:
         "charting {wildcards.impairment}"
     shell:
@@ -153,7 +153,7 @@ rule stability_summary:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.study.charts"),
+        code=code_sha256("apertura.study.stability.charts"),
     message:
         "where each correction fails"
     shell:

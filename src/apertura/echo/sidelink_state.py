@@ -9,14 +9,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import gamma
 
-from apertura.echo.line_of_sight import (
-    LOCK_FALSE_ALARM,
-    Complexes,
-    Floats,
-    LineOfSight,
-    fit_line_of_sight,
-    phasor,
-)
+from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_line_of_sight, phasor
 from apertura.errors import CampaignError
 
 GATE_CELLS = 16

@@ -19,8 +19,8 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
+from apertura.atomic import whole
 from apertura.errors import CampaignError, ContractError
-from apertura.export.draft import whole
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
 READ = 4 * BLOCK  # pixels along a side of what is held in memory at once
@@ -81,7 +81,7 @@ def write_slc(
     transform
         Outer corner of the north-west pixel, and spacing; metres in `crs`.
     crs
-        Such as ``EPSG:32632``, or the result of `apertura.geodesy.local_crs`.
+        Such as ``EPSG:32632``, or the result of `apertura.geometry.geodesy.local_crs`.
     tags
         Provenance, name → text.
     title

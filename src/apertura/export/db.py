@@ -10,8 +10,8 @@ from rasterio import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window
 
+from apertura.atomic import whole
 from apertura.export.cog import BLOCK, GDAL, POWER, Band, Block, Pixels, Raster, described, fill, finish, placed, power
-from apertura.export.draft import whole
 
 DB = Band("float32", np.nan, "dB", "power of the focused scene, 10 log10", "AVERAGE")
 

@@ -11,10 +11,10 @@ from pyproj import CRS
 from rasterio import Affine
 from rasterio.transform import array_bounds
 
+from apertura.atomic import whole
 from apertura.export.cog import READ, Raster, placed, power
 from apertura.export.db import decibels
-from apertura.export.draft import whole
-from apertura.export.sheet import DPI, PICTURE_DOTS, Marker, Sheet
+from apertura.export.map_layout import DPI, PICTURE_DOTS, Marker, Sheet
 
 
 def write_quicklook(

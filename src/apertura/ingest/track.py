@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
-from apertura.geodesy import ecef_from_geodetic
+from apertura.geometry.geodesy import ecef_from_geodetic
 
 
 def make_track(

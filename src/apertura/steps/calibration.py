@@ -12,10 +12,10 @@ from apertura.campaign import Campaign
 from apertura.contracts import canonical_json
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
-from apertura.geodesy import ecef_from_projected
-from apertura.image.grid import LOCAL
-from apertura.image.quality import coherence_factor
+from apertura.geometry.geodesy import ecef_from_projected
 from apertura.provenance import chained_sha256, code_sha256
+from apertura.quality.measures import coherence_factor
+from apertura.scene.grid import LOCAL
 from apertura.settings import Calibration
 from apertura.store import open_stage, write_json
 

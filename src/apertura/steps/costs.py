@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from apertura.campaign import Campaign
-from apertura.image.cost import Costs
-from apertura.image.machine import kept_costs, read_costs, write_costs
+from apertura.planning.cost import Costs
+from apertura.planning.machine import kept_costs, read_costs, write_costs
 
 PATH = Path("results/costs.json")
 

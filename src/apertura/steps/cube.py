@@ -7,7 +7,7 @@ import xarray as xr
 import zarr
 
 from apertura.campaign import Campaign
-from apertura.cube.fusion import coherent_sum, noncoherent_sum
+from apertura.fusion.sums import coherent_sum, noncoherent_sum
 from apertura.steps.scene import scene_grid
 from apertura.steps.stamping import stamped
 from apertura.store import finish, lay_out, open_stage, writing

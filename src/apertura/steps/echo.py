@@ -13,10 +13,10 @@ from apertura.echo.association import Association, associate
 from apertura.echo.demodulate import remove_path
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES
+from apertura.load.recording import Recording, open_recording
 from apertura.provenance import merged, sha256_file
 from apertura.settings import OfdmWaveform, PathOffsets, PhaseHistoryWaveform, Processing
 from apertura.steps.calibration import calibrated, calibration_spec
-from apertura.steps.recording import Recording, open_recording
 from apertura.steps.stamping import stamped
 from apertura.steps.transfer import Transfer, by_code, by_sidelink
 from apertura.store import save_stage

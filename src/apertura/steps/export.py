@@ -14,11 +14,11 @@ from apertura import __version__
 from apertura.campaign import Campaign
 from apertura.contracts import canonical_json
 from apertura.export import EXPORTS
-from apertura.geodesy import local_crs
-from apertura.image.grid import LOCAL
-from apertura.image.peaks import Patch, find_peak, ground_position
-from apertura.image.quality import Raster, coherence_factor, survey
+from apertura.geometry.geodesy import local_crs
 from apertura.provenance import chained_sha256, code_sha256
+from apertura.quality.measures import Raster, coherence_factor, survey
+from apertura.quality.point_targets import Patch, find_peak, ground_position
+from apertura.scene.grid import LOCAL
 from apertura.steps.scene import scene_grid
 from apertura.store import open_stage, write_json
 

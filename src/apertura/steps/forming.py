@@ -8,17 +8,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.contracts import Window
-from apertura.image.beam import Beams
-from apertura.image.candidates import Setting
-from apertura.image.engines import ENGINES
-from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.plan import Plan
-from apertura.image.tiles import Former, form_blocks
+from apertura.focus.engines import ENGINES
+from apertura.focus.tiles import Former, form_blocks
+from apertura.load.inputs import profiles_of
+from apertura.load.pair import outlook_of
+from apertura.planning.candidates import Setting
+from apertura.planning.plan import Plan
 from apertura.provenance import sha256_file
-from apertura.steps.history import profiles_of
-from apertura.steps.outlook import outlook_of
+from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.steps.plan import plan_known, planned_heights
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped

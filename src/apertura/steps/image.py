@@ -5,7 +5,7 @@ from pathlib import Path
 import zarr
 
 from apertura.campaign import Campaign
-from apertura.steps.antennas import antennas_report
+from apertura.load.antennas import antennas_report
 from apertura.steps.forming import Work
 from apertura.steps.quality import certified, measures
 from apertura.store import finish, sharing, tiles_missing, write_json, writing

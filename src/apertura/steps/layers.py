@@ -21,9 +21,10 @@ from apertura import __version__
 from apertura.campaign import Campaign
 from apertura.contracts import Window, canonical_json
 from apertura.export import LAYERS
-from apertura.geodesy import local_crs
-from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.visibility import (
+from apertura.geometry.geodesy import local_crs
+from apertura.provenance import chained_sha256, code_sha256, merged
+from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.scene.visibility import (
     Relief,
     antennas_over,
     bistatic_angle_deg,
@@ -31,7 +32,6 @@ from apertura.image.visibility import (
     surface_normals,
     visibility,
 )
-from apertura.provenance import chained_sha256, code_sha256, merged
 from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
 from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage

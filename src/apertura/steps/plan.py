@@ -13,19 +13,19 @@ from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
-from apertura.image.budget import memory_limit, size_text
-from apertura.image.candidates import Signal
-from apertura.image.engines import reference
-from apertura.image.extent import swath
-from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.history import Spectra
-from apertura.image.plan import Job, Plan
-from apertura.image.planner import make_plan
-from apertura.image.quality import content_loss_db
-from apertura.steps.antennas import lit
+from apertura.focus.engines import reference
+from apertura.focus.inputs import Spectra
+from apertura.load.antennas import lit
+from apertura.load.ground import Ground
+from apertura.load.pair import Outlook, campaign_grid, outlook_of
+from apertura.planning.candidates import Signal
+from apertura.planning.memory import memory_limit, size_text
+from apertura.planning.plan import Job, Plan
+from apertura.planning.planner import make_plan
+from apertura.quality.measures import content_loss_db
+from apertura.scene.auto_grid import swath
+from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.steps.costs import campaign_costs
-from apertura.steps.ground import Ground
-from apertura.steps.outlook import Outlook, campaign_grid, outlook_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING, check_clearance
 from apertura.steps.terrain import Heights, expected_heights
 from apertura.store import manifest_of

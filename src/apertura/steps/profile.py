@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.image.extent import clearance, swath
-from apertura.image.grid import SceneGrid
+from apertura.scene.auto_grid import clearance, swath
+from apertura.scene.grid import SceneGrid
 from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
 from apertura.steps.stamping import stamped
 from apertura.steps.terrain import Heights, open_heights

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from apertura.image.candidates import Setting
-from apertura.image.certificate import Certificate, certified_pixels
-from apertura.image.engines import reference
-from apertura.image.history import Spectra
-from apertura.image.peaks import cut_through, find_peak, ground_position
-from apertura.image.quality import coherence_factor, survey
+from apertura.focus.engines import reference
+from apertura.focus.inputs import Spectra
+from apertura.planning.candidates import Setting
+from apertura.quality.error_check import Certificate, certified_pixels
+from apertura.quality.measures import coherence_factor, survey
+from apertura.quality.point_targets import cut_through, find_peak, ground_position
 from apertura.steps.forming import Work
 
 CERTIFIED_PIXELS = 256

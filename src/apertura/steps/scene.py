@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 
 from apertura.campaign import Campaign
-from apertura.geodesy import local_crs, projected_from_ecef
-from apertura.image.extent import auto_bounds, auto_spacing, utm_crs
-from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.terrain import COVER_NODES
+from apertura.geometry.geodesy import local_crs, projected_from_ecef
+from apertura.load.ground import Ground, on_the_ground
+from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
+from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.scene.terrain import COVER_NODES
 from apertura.settings import Scene
-from apertura.steps.ground import Ground, on_the_ground
 from apertura.store import open_stage, write_json
 
 PATH = Path("results/scene.json")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.errors import CampaignError
-from apertura.image.grid import LOCAL, SceneGrid
-from apertura.image.terrain import Terrain
-from apertura.steps.ground import Ground
+from apertura.load.ground import Ground
+from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.scene.terrain import Terrain
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
 from apertura.store import finish, manifest_of, open_stage, tiles_missing, writing

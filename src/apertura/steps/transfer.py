@@ -13,8 +13,8 @@ from apertura.echo.clock import decide_clock, estimate_clock
 from apertura.echo.resampling import Waveform, correct_clock
 from apertura.echo.sidelink import METHODS, choose, edges, measure
 from apertura.echo.sidelink_state import SidelinkState
+from apertura.load.recording import Recording
 from apertura.settings import OfdmWaveform, Processing
-from apertura.steps.recording import Recording
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from rich.table import Table
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.flights import Flight
-from apertura.geodesy import projected_from_ecef
-from apertura.image.grid import LOCAL
-from apertura.image.peaks import cut_through, find_peak
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.quality.point_targets import cut_through, find_peak
+from apertura.scene.grid import LOCAL
+from apertura.settings.flights import Flight
 from apertura.steps.scene import scene_grid
 from apertura.store import open_stage
 

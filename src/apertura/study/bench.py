@@ -6,13 +6,13 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.simulate.impairments import Impairments
-from apertura.simulate.observation import Observation, observe
-from apertura.simulate.presets import paper_scene, paper_waveform
-from apertura.simulate.radar import Waveform, newman_codes, qpsk_codes
-from apertura.simulate.recording import Geometry, digitize, full_scale
-from apertura.simulate.scene import Scatterers
-from apertura.simulate.synthesis import transfer_functions
+from apertura.simulation.impairments import Impairments
+from apertura.simulation.observation import Observation, observe
+from apertura.simulation.presets import paper_scene, paper_waveform
+from apertura.simulation.radar import Waveform, newman_codes, qpsk_codes
+from apertura.simulation.recording import Geometry, digitize, full_scale
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import transfer_functions
 from apertura.study.window import demodulated, window_samples
 
 Complexes = NDArray[np.complex64]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from apertura.study.claims import Claim
+    from apertura.study.paper.claims import Claim
 
 app = typer.Typer(no_args_is_help=True, help="The paper's claims and the stability atlas.")
 
@@ -26,7 +26,7 @@ PAPER_PARTS = (
     "corrected",
     "clock",
 )
-"""Files of rows that make up claims.csv, in its order; `loss_…` for each of `apertura.study.losses.ERRORS`."""
+"""Files of rows that make up claims.csv, in its order; `loss_…` for each of `apertura.study.paper.losses.ERRORS`."""
 
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
 
@@ -34,14 +34,14 @@ Folder = Annotated[Path, typer.Option("--folder", help="where results are writte
 @app.command()
 def paper_part(part: str, folder: Folder = PAPER) -> None:
     """Compute some rows of the claims table, parts/PART.csv."""
-    from apertura.study.claims import write_claims
+    from apertura.study.paper.claims import write_claims
 
     write_claims(folder / "parts" / f"{part}.csv", _claims(part)())
     typer.echo(folder / "parts" / f"{part}.csv")
 
 
 def _claims(part: str) -> "Callable[[], list[Claim]]":
-    from apertura.study import coherence, corrected, losses, parameters, resolution
+    from apertura.study.paper import coherence, corrected, losses, parameters, resolution
 
     if part.startswith("loss_"):
         return lambda: losses.loss_claims(part.removeprefix("loss_"))
@@ -58,7 +58,7 @@ def _claims(part: str) -> "Callable[[], list[Claim]]":
 @app.command()
 def paper_claims(folder: Folder = PAPER) -> None:
     """Put the parts together: claims.csv."""
-    from apertura.study.claims import read_claims, write_claims
+    from apertura.study.paper.claims import read_claims, write_claims
 
     write_claims(
         folder / "claims.csv", [row for part in PAPER_PARTS for row in read_claims(folder / "parts" / f"{part}.csv")]
@@ -69,7 +69,7 @@ def paper_claims(folder: Folder = PAPER) -> None:
 @app.command()
 def paper_figure(error: str, folder: Folder = PAPER) -> None:
     """Draw range-compressed data beside the image of one error, ERROR.png."""
-    from apertura.study.figures import draw_error
+    from apertura.study.paper.figures import draw_error
 
     typer.echo(draw_error(error, folder / f"{error}.png"))
 
@@ -77,8 +77,8 @@ def paper_figure(error: str, folder: Folder = PAPER) -> None:
 @app.command()
 def stability_sweep(impairment: str, method: str, folder: Folder = STABILITY) -> None:
     """Sweep one impairment under one correction, parts/IMPAIRMENT.METHOD.csv."""
-    from apertura.study.atlas import part_path, write_outcomes
-    from apertura.study.stability import run_sweep
+    from apertura.study.stability.atlas import part_path, write_outcomes
+    from apertura.study.stability.outcomes import run_sweep
 
     path = part_path(folder, impairment, method)
     write_outcomes(path, run_sweep(impairment, method))
@@ -88,8 +88,8 @@ def stability_sweep(impairment: str, method: str, folder: Folder = STABILITY) ->
 @app.command()
 def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
     """Put the corrections of one impairment together: IMPAIRMENT.csv and .png."""
-    from apertura.study.atlas import join_parts
-    from apertura.study.charts import draw_impairment
+    from apertura.study.stability.atlas import join_parts
+    from apertura.study.stability.charts import draw_impairment
 
     outcomes = join_parts(folder, impairment)
     draw_impairment(impairment, outcomes, folder / f"{impairment}.png")
@@ -99,8 +99,8 @@ def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
 @app.command()
 def stability_summary(folder: Folder = STABILITY) -> None:
     """Where the loss passes 1 and 3 dB, and how far `auto` is from the best: summary.csv, .png, sidelink.csv."""
-    from apertura.study.atlas import write_sidelink_table, write_summary
-    from apertura.study.charts import draw_summary
+    from apertura.study.stability.atlas import write_sidelink_table, write_summary
+    from apertura.study.stability.charts import draw_summary
 
     draw_summary(write_summary(folder), folder / "summary.png")
     typer.echo(write_sidelink_table(folder))

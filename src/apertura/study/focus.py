@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.echo.demodulate import remove_path
-from apertura.image.engines import numba, reference
-from apertura.image.history import Profiles, Spectra
-from apertura.image.peaks import half_power_width
-from apertura.image.quality import coherence_factor
+from apertura.focus.engines import numba, reference
+from apertura.focus.inputs import Profiles, Spectra
+from apertura.quality.measures import coherence_factor
+from apertura.quality.point_targets import half_power_width
 from apertura.study.bench import Bench, Complexes
 
 Floats = NDArray[np.float64]

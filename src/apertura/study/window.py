@@ -9,8 +9,8 @@ from scipy import fft
 from scipy.signal import CZT
 
 from apertura.echo.demodulate import subcarrier_numbers
-from apertura.simulate.radar import Waveform
-from apertura.simulate.synthesis import Channel, noise, path_spectrum, sampling_rate
+from apertura.simulation.radar import Waveform
+from apertura.simulation.synthesis import Channel, noise, path_spectrum, sampling_rate
 
 _PULSES_AT_ONCE = 32
 _DOPPLER_ORDER = 3
@@ -19,7 +19,7 @@ _DOPPLER_ORDER = 3
 def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.complex128]:
     """Return the (pulse, sample) complex128 samples of every capture that the DFT takes.
 
-    Equal to `apertura.simulate.synthesis.samples` from the end of the prefix on, as long as every path has
+    Equal to `apertura.simulation.synthesis.samples` from the end of the prefix on, as long as every path has
     arrived by then; twenty times faster, because no edge of any path has to be placed.
 
     Parameters

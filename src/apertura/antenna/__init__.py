@@ -1,0 +1,1 @@
+"""Beams: where antennas look, and how they weigh pulses."""

@@ -1,0 +1,164 @@
+"""Backprojection by interpolation in an oversampled range table, compiled by numba."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beams
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.inputs import Profiles
+
+_HALF_TAPS = 10
+_PIXELS_AT_ONCE = 1024  # whose weights are held at once
+_KAISER_BETA = 10.0  # -100 dB, with half the band free for the transition
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Range profiles, finely sampled.
+
+    Attributes
+    ----------
+    samples
+        (pulse, range) complex64.
+    start_m
+        (pulse,) float64, total path of sample 0.
+    step_m
+        Total path between samples.
+    wavenumber_rad_m
+        2πf_mid/c.
+    tx_position_m, rx_position_m
+        (pulse, 3) float64.
+    """
+
+    samples: NDArray[np.complex64]
+    start_m: NDArray[np.float64]
+    step_m: float
+    wavenumber_rad_m: float
+    tx_position_m: NDArray[np.float64]
+    rx_position_m: NDArray[np.float64]
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
+    """Return tables of `oversampling` samples per resolution cell.
+
+    Parameters
+    ----------
+    profiles
+        At least twice oversampled, so that half the band is left for the transition of the filter.
+    oversampling
+        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (DESIGN section 5).
+    """
+    factor = max(1, round(oversampling / profiles.oversampling))
+    fine = refine(profiles.samples, factor)
+    return Tables(
+        np.ascontiguousarray(fine, np.complex64),
+        profiles.start_m,
+        profiles.step_m / factor,
+        2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S,
+        profiles.tx_position_m,
+        profiles.rx_position_m,
+    )
+
+
+def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]:
+    """Return samples interpolated to `factor` times their rate by a windowed sinc; the first ones coincide.
+
+    Parameters
+    ----------
+    samples
+        (pulse, range) complex64, at least twice oversampled.
+    factor
+        New samples per old one.
+
+    Returns
+    -------
+    ndarray
+        (pulse, range·factor) complex64; within ten samples of an end the missing neighbours count as zero.
+
+    Examples
+    --------
+    >>> tone = np.exp(0.5j * np.arange(64)).astype(np.complex64)[None]
+    >>> exact = np.exp(0.5j * np.arange(256) / 4)
+    >>> bool(np.abs(refine(tone, 4)[0] - exact)[64:192].max() < 2e-5)
+    True
+    """
+    padded = np.pad(samples, ((0, 0), (_HALF_TAPS, _HALF_TAPS)))
+    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * _HALF_TAPS, axis=1)[:, 1:]
+    fine = np.empty((*samples.shape, factor), np.complex64)
+    for phase in range(factor):
+        distance = phase / factor - np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
+        shape = np.sqrt(np.clip(1 - (distance / _HALF_TAPS) ** 2, 0, None))
+        taps = np.sinc(distance) * np.i0(_KAISER_BETA * shape) / np.i0(_KAISER_BETA)
+        fine[..., phase] = near @ taps.astype(np.float32)
+    return fine.reshape(len(samples), -1)
+
+
+def form(tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex64]:
+    """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, R the total path.
+
+    Parameters
+    ----------
+    tables
+        From `prepare`.
+    pixels
+        (y, x, 3) float64, metres, in the frame of the phase centres.
+    beams
+        Weight of each pulse at each pixel by its antennas; none by default.
+
+    Returns
+    -------
+    ndarray
+        (y, x) complex64. A path outside the table adds nothing.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 6; four-point Lagrange interpolation.
+    """
+    flat = np.ascontiguousarray(pixels.reshape(-1, 3))
+    image = np.zeros(len(flat), np.complex128)
+    centres = (tables.tx_position_m, tables.rx_position_m)
+    none, at_once = np.empty((0, 0)), len(flat) if beams is None else _PIXELS_AT_ONCE
+    for first in range(0, len(flat), at_once):
+        part = slice(first, first + at_once)
+        _accumulate(
+            tables.samples,
+            tables.start_m,
+            tables.step_m,
+            tables.wavenumber_rad_m,
+            *centres,
+            flat[part],
+            none if beams is None else beams.weight(*centres, flat[part]),
+            image[part],
+        )
+    return image.reshape(pixels.shape[:-1]).astype(np.complex64)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _accumulate(samples, start, step, wavenumber, tx, rx, pixels, weights, image):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    pulses, length = samples.shape
+    for i in range(len(pixels)):
+        x, y, z = pixels[i, 0], pixels[i, 1], pixels[i, 2]
+        total = 0.0 + 0.0j
+        for p in range(pulses):
+            path = np.sqrt((x - tx[p, 0]) ** 2 + (y - tx[p, 1]) ** 2 + (z - tx[p, 2]) ** 2) + np.sqrt(
+                (x - rx[p, 0]) ** 2 + (y - rx[p, 1]) ** 2 + (z - rx[p, 2]) ** 2
+            )
+            place = (path - start[p]) / step
+            k = int(np.floor(place))
+            if k < 1 or k > length - 3:
+                continue
+            u = place - k
+            value = (
+                samples[p, k - 1] * (-u * (u - 1) * (u - 2) / 6)
+                + samples[p, k] * ((u + 1) * (u - 1) * (u - 2) / 2)
+                - samples[p, k + 1] * ((u + 1) * u * (u - 2) / 2)
+                + samples[p, k + 2] * ((u + 1) * u * (u - 1) / 6)
+            )
+            phase = wavenumber * path
+            if weights.size:
+                value *= weights[p, i]
+            total += value * (np.cos(phase) + 1j * np.sin(phase))
+        image[i] += total

@@ -1,0 +1,1 @@
+"""Opening a campaign: its grid, ground, pairs and antennas, once."""

@@ -1,0 +1,128 @@
+"""Antennas of a pair: from what the config states of them to the beams that weigh its pulses."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beam, Beams
+from apertura.antenna.illumination import Illumination, illuminate
+from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, read_pattern
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.scene.grid import SceneGrid
+from apertura.settings import Antenna
+
+_STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
+_NET = 33
+
+
+def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
+    """Return what an echo stage holds of the bodies' attitude: radar_tx, radar_rx → (pulse, axis, body)."""
+    return {point: echo[name].values for point, name in _STAGED.items() if name in echo}
+
+
+def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float64]]) -> Beams | None:
+    """Return the beams of a pair; None where its antennas look everywhere alike.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    axes
+        radar_tx, radar_rx → (pulse, axis, body), forward, right and down of the body in the frame of the pixels.
+    """
+    stated = campaign.antennas(pair)
+    if not stated:
+        return None
+    found = {point: _beam(campaign, antenna, axes[point]) for point, (_, antenna) in stated.items()}
+    return Beams(found.get("radar_tx"), found.get("radar_rx"))
+
+
+def _beam(campaign: Campaign, antenna: Antenna, axes: NDArray[np.float64]) -> Beam:
+    if antenna.beamwidth_deg is None:
+        cuts = read_pattern(campaign.root / str(antenna.pattern), cutoff_db=antenna.cutoff_db)
+    else:
+        widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
+        azimuth, elevation = (
+            gaussian_cut(width, cutoff_db=antenna.cutoff_db, limit_rad=limit) for width, limit in widths
+        )
+        cuts = azimuth, elevation
+    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1])
+
+
+def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
+    """Return what image.json says of a pair's antennas: what was stated, and how many pulses see the scene."""
+    if illumination is None:
+        return {}
+    stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
+    return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
+
+
+def lit(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams | None,
+    grid: SceneGrid,
+    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> dict[str, Any]:
+    """Return beams and illumination as the planner's job takes them, nothing without beams.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    beams
+        Of the pair.
+    grid
+        The campaign's.
+    places
+        Phase centres of transmitter and receiver, (pulse, 3) float64 metres.
+
+    Raises
+    ------
+    CampaignError
+        If no pulse sees anything of the scene.
+    """
+    if beams is None:
+        return {}
+    rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
+    net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij"))
+    illumination = illuminate(beams, *places, net.reshape(-1, 3))
+    if illumination.unseen == 1:
+        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], places)
+    return {"beams": beams, "illumination": illumination}
+
+
+def _refuse(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams,
+    middle_m: NDArray[np.float64],
+    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
+    stated = campaign.antennas(pair)
+    keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
+    legs = {"radar_tx": (beams.transmit, places[0]), "radar_rx": (beams.receive, places[1])}
+    for point, (node, _) in stated.items():
+        beam, place = legs[point]
+        if beam is None:
+            continue
+        azimuth, elevation = beam.angles(place, middle_m[None])[..., 0]
+        off = np.degrees(np.arccos(np.cos(azimuth) * np.cos(elevation)))
+        best = int(off.argmin())
+        side, up, *ends = np.degrees([azimuth[best], elevation[best], beam.azimuth_rad[-1], beam.elevation_rad[-1]])
+        lines.append(
+            f"{off[best]:.0f}° from the boresight of {node}'s {point} at best: azimuth {side:+.0f}°, elevation "
+            f"{up:+.0f}°, while its pattern ends at {ends[0]:.0f}° and {ends[1]:.0f}°"
+        )
+    raise CampaignError(
+        f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
+        where=f"config/config.yaml: {', '.join(keys)}",
+        expected="a scene that both antennas of some pulse see",
+        remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
+        "log's yaw (clockwise from north) and scene.bounds_m.",
+    )

@@ -1,0 +1,112 @@
+"""What is known of a pair before and after its echo is formed: from the echo, or from what the flight logs promise."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beams
+from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.compression import window_weights
+from apertura.echo.demodulate import subcarrier_numbers
+from apertura.focus.inputs import Spectra
+from apertura.geometry.phase_centres import attitude_axes, phase_centres
+from apertura.ingest import PHASE_HISTORIES, TRACKS
+from apertura.load.antennas import beams_of, body_axes
+from apertura.load.inputs import spectra_of
+from apertura.scene.grid import SceneGrid
+from apertura.settings import OfdmWaveform
+from apertura.steps.scene import PATH, scene_grid, settle
+from apertura.store import manifest_of, open_stage
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is known of a pair's echo before it is formed, or after.
+
+    Attributes
+    ----------
+    tx, rx
+        (pulse, 3) float64, phase centres, metres.
+    frequency_hz, weight
+        (subcarrier,) float64, RF frequency and window.
+    path_limit_m
+        Longest total path inside the cyclic prefix.
+    spectra
+        The echo itself; None before it is formed.
+    beams
+        Of the antennas; None where they look everywhere alike.
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    frequency_hz: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    path_limit_m: float
+    spectra: Spectra | None = None
+    beams: Beams | None = None
+
+
+def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
+    """Return the campaign's grid, settled or as it will be."""
+    asked = campaign.settings.scene
+    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
+        return scene_grid(campaign)
+    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
+
+
+def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> Outlook:
+    """Return what is known of a pair: `echo`, its stage as far as it is formed, or what the logs promise."""
+    waveform = campaign.settings.waveform
+    if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
+        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
+    if echo is None:
+        if isinstance(waveform, OfdmWaveform):
+            return _expected(campaign, flight, pair, waveform)
+        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
+        echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
+    spectra = spectra_of(echo, campaign.settings.processing.window)
+    limit_m = float(echo.path_limit.values.min())
+    places, beams = (spectra.tx_position_m, spectra.rx_position_m), beams_of(campaign, pair, body_axes(echo))
+    return Outlook(*places, spectra.frequency_hz, spectra.weight, limit_m, spectra, beams)
+
+
+def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:
+    """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
+    tx, rx = pair.split("-")
+    logs = {node: campaign.track_file(flight, node) for node in (tx, rx)}
+    tracks = {node: TRACKS[log.suffix](log, node=node) for node, log in logs.items()}
+    first = max(track.time.values[0] for track in tracks.values())
+    last = min(track.time.values[-1] for track in tracks.values())
+    times = _pulse_times(campaign.raw_file(flight, tx, ".sigmf-meta"), first, last, waveform.prf_hz)
+    places, axes = [], {}
+    for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
+        track, settings = tracks[node], campaign.settings.nodes[node]
+        log = (track.time.values, track.position.values, track.attitude.values)
+        arm = getattr(settings.lever_arms_m, antenna)
+        stated: dict[str, Any] = {"at": times, "attitude_from": settings.attitude, "where": logs[node]}
+        places.append(phase_centres(*log, lever_arm_m=arm, **stated))
+        if antenna in campaign.antennas(pair):
+            axes[antenna] = attitude_axes(*log, **stated)
+    numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
+    frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
+    weight = window_weights(campaign.settings.processing.window, len(frequency))
+    limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
+    return Outlook(places[0], places[1], frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
+
+
+def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:
+    """Return the capture times of a recording inside the logs, or a regular series where it has none."""
+    captures: list[Mapping[str, str]] = json.loads(meta.read_text(encoding="utf-8")).get("captures", [])
+    stated = [capture["core:datetime"].removesuffix("Z") for capture in captures if "core:datetime" in capture]
+    times = np.array(stated, "datetime64[ns]")
+    if len(times) < 2:
+        count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
+        times = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
+    return times[(times >= first) & (times <= last)]

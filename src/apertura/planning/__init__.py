@@ -1,0 +1,1 @@
+"""How an image will be formed, why, and at what cost."""

@@ -1,0 +1,1 @@
+"""How good an image is: point targets, measures, numerical error."""

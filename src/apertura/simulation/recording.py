@@ -1,0 +1,182 @@
+"""What a node records of a flight, as arrays: scene and geometry, passed through what is wrong with the node."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.simulation.hidden import Hidden
+from apertura.simulation.impairments import Adc, Impairments
+from apertura.simulation.radar import Floats, Paths, Waveform, direct_path, echo_paths
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import Channel, Complex, path_spectrum
+
+_PULSES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """True phase centres at the start of each pulse.
+
+    Attributes
+    ----------
+    radar_tx, radar_rx
+        (pulse, 3) float64, metres, Cartesian, in the frame of the scatterers.
+    sidelink_tx, sidelink_rx
+        (pulse, 3) float64, ends of the direct path.
+    tx_velocity, rx_velocity
+        (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
+    gain
+        (pulse, point) float64, field of both radar antennas towards each scatterer, relative to their boresights.
+    """
+
+    radar_tx: Floats
+    radar_rx: Floats
+    sidelink_tx: Floats
+    sidelink_rx: Floats
+    tx_velocity: Floats | float = 0.0
+    rx_velocity: Floats | float = 0.0
+    gain: Floats | float = 1.0
+
+
+def receive(
+    waveform: Waveform,
+    scatterers: Scatterers,
+    geometry: Geometry,
+    *,
+    impairments: Impairments,
+    hidden: Hidden,
+    transmitter: Impairments | None = None,
+    path_offset_m: Mapping[str, float] | None = None,
+    sidelink: bool = True,
+) -> dict[str, Channel]:
+    """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.
+
+    Parameters
+    ----------
+    waveform
+        What is transmitted.
+    scatterers
+        The scene.
+    geometry
+        Where the antennas truly are.
+    impairments, hidden
+        What is wrong with the receiving node, and what was drawn of it.
+    transmitter
+        Impairments of the transmitting node, for its ripple; the receiving node itself if None.
+    path_offset_m
+        Electrical path beyond geometry per channel, metres; zero where missing.
+    sidelink
+        Whether the second channel is recorded.
+    """
+    offset = dict(path_offset_m or {})
+    velocity = (geometry.tx_velocity, geometry.rx_velocity) if impairments.doppler else (0.0, 0.0)
+    echoes = echo_paths(
+        geometry.radar_tx,
+        geometry.radar_rx,
+        scatterers,
+        path_offset_m=offset.get("radar", 0.0),
+        tx_velocity_m_s=velocity[0],
+        rx_velocity_m_s=velocity[1],
+    )
+    echoes = replace(echoes, amplitude=echoes.amplitude * geometry.gain)
+    direct = direct_path(
+        geometry.sidelink_tx,
+        geometry.sidelink_rx,
+        path_offset_m=offset.get("sidelink", 0.0),
+        relative_velocity_m_s=np.subtract(*velocity),
+    )
+    sent = (transmitter or impairments).transmit_ripple
+    transmitted = sent.response(waveform.frequency_hz) if sent else np.ones(len(waveform.codes), np.complex128)
+    power = spectral_power(waveform, echoes)
+    heard = {"radar": (_with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power), power)}
+    if sidelink:
+        heard["sidelink"] = (_sidelink(direct, impairments, hidden), spectral_power(waveform, direct))
+    return {
+        name: _channel(waveform, name, paths, level, transmitted=transmitted, impairments=impairments, hidden=hidden)
+        for name, (paths, level) in heard.items()
+    }
+
+
+def spectral_power(waveform: Waveform, paths: Paths, response: Complex | None = None) -> float:
+    """Return the mean of |Σ a·exp(-j2πfτ)|² over pulses and subcarriers."""
+    starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
+    parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
+    gain = 1.0 if response is None else response
+    total = sum(
+        float((np.abs(path_spectrum(waveform, part.delay_s, part.amplitude) * gain) ** 2).sum()) for part in parts
+    )
+    return total / (len(paths.delay_s) * len(waveform.codes))
+
+
+def full_scale(channel: Channel, adc: Adc) -> float:
+    """Return the amplitude of I or Q that the converter takes as full scale, set once per flight.
+
+    The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it.
+    """
+    power = spectral_power(channel.waveform, channel.paths, channel.response) * len(channel.waveform.codes)
+    rms = np.sqrt((power + channel.noise_variance) / 2)
+    return float(rms * 10 ** (adc.backoff_db / 20))
+
+
+def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray[np.int16]:
+    """Return (..., 2) int16 counts of I and Q, rounded and clipped to ±2^(bits-1).
+
+    Examples
+    --------
+    >>> digitize(np.array([0.5 - 2.0j]), Adc(bits=4), 1.0)
+    array([[ 4, -8]], dtype=int16)
+    """
+    limit = 2 ** (adc.bits - 1)
+    counts = np.rint(np.ascontiguousarray(samples)[..., None].view(np.float64) * (limit / full_scale_amplitude))
+    return np.asarray(np.clip(counts, -limit, limit - 1), np.int16)
+
+
+def _channel(
+    waveform: Waveform,
+    name: str,
+    paths: Paths,
+    power: float,
+    *,
+    transmitted: Complex,
+    impairments: Impairments,
+    hidden: Hidden,
+) -> Channel:
+    radar = name == "radar"
+    ripple = impairments.radar_ripple if radar else impairments.sidelink_ripple
+    snr_db = impairments.radar_snr_db if radar else impairments.sidelink_snr_db
+    return Channel(
+        waveform,
+        paths,
+        transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
+        hidden.phase_rad,
+        hidden.start_s,
+        cfo_hz=impairments.clock.cfo_hz,
+        sfo_hz=impairments.clock.sfo_hz,
+        noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
+    )
+
+
+def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, offset_m: float, power: float) -> Paths:
+    leakage = impairments.leakage
+    if leakage is None:
+        return echoes
+    direct = direct_path(geometry.radar_tx, geometry.radar_rx, path_offset_m=offset_m + leakage.path_m)
+    level = np.full(direct.amplitude.shape, np.sqrt(power) * 10 ** (leakage.level_db / 20), np.complex128)
+    return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
+
+
+def _sidelink(direct: Paths, impairments: Impairments, hidden: Hidden) -> Paths:
+    paths = direct
+    for reflection in impairments.sidelink_multipath:
+        later = Paths(
+            direct.delay_s + reflection.excess_m / SPEED_OF_LIGHT_M_S,
+            direct.amplitude * reflection.amplitude,
+            direct.delay_rate,
+        )
+        paths = paths.and_also(later)
+    shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
+    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * hidden.blocked) / 20)
+    return Paths(paths.delay_s, paths.amplitude * gain[:, None], paths.delay_rate)

@@ -1,0 +1,1 @@
+"""Speed against accuracy, on the user's own campaign."""

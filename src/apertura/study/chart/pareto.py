@@ -1,0 +1,103 @@
+"""The points of the speed-accuracy chart, a setting each: the Pareto front among them, as CSV and as PNG."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from apertura.study.stability.charts import save
+
+LOOKS = {
+    "native": ("#0072b2", "o"),
+    "numba": ("#e69f00", "s"),
+    "reference": ("#000000", "D"),
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting: seconds are for the whole image on one thread, from what its part took."""
+
+    engine: str
+    setting: str
+    pulse_thinning: int
+    seconds: float
+    pixel_pulses_per_s: float
+    error_db: float
+    predicted_seconds: float
+    predicted_error_db: float
+    on_front: bool
+    planned: bool
+
+
+def with_front(points: Sequence[Point]) -> list[Point]:
+    """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
+    best, marked = np.inf, []
+    for point in points:
+        marked.append(replace(point, on_front=point.error_db < best))
+        best = min(best, point.error_db)
+    return marked
+
+
+def write_points(points: Sequence[Point], path: Path) -> None:
+    """Write the points as CSV, one line each."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
+        table.writeheader()
+        for point in points:
+            row = asdict(point)
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
+    """Draw error against seconds.
+
+    Parameters
+    ----------
+    points
+        Fastest first.
+    path
+        PNG to write.
+    title
+        Of the chart.
+    accuracy_db
+        What the campaign asks for.
+    """
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    axes = figure.subplots()
+    for engine, (colour, marker) in LOOKS.items():
+        some = [point for point in points if point.engine == engine and not point.planned]
+        axes.plot(
+            [point.seconds for point in some],
+            [point.error_db for point in some],
+            linestyle="none",
+            color=colour,
+            marker=marker,
+            alpha=0.6,
+            label=engine,
+        )
+    front = [point for point in points if point.on_front]
+    axes.plot(
+        [point.seconds for point in front],
+        [point.error_db for point in front],
+        color="0.4",
+        drawstyle="steps-post",
+        zorder=0,
+        label="Pareto front",
+    )
+    for point in points:
+        if point.planned:
+            thin = f", {point.pulse_thinning}:1 pulses" if point.pulse_thinning > 1 else ""
+            label = f"planner's choice: {point.setting}{thin}"
+            axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
+    axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")
+    axes.set_xscale("log")
+    axes.set_xlabel("Seconds of tables and sums for the whole image, one thread")
+    axes.set_ylabel("Error on random pixels against the double sum, dB")
+    axes.set_title(title, fontsize=11)
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(fontsize=9)
+    save(figure, path)

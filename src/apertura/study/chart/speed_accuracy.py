@@ -1,0 +1,219 @@
+"""Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beams
+from apertura.campaign import Campaign
+from apertura.focus.engines import ENGINES, reference
+from apertura.focus.inputs import Profiles, Spectra
+from apertura.load.inputs import profiles_of
+from apertura.load.pair import campaign_grid, outlook_of
+from apertura.planning.candidates import Setting, candidates
+from apertura.planning.cost import Costs, Load, tile_seconds
+from apertura.planning.plan import Job, Plan
+from apertura.quality.measures import numerical_error
+from apertura.scene.grid import SceneGrid
+from apertura.steps.costs import campaign_costs
+from apertura.steps.plan import campaign_job, plan_job
+from apertura.steps.terrain import Heights, open_heights
+from apertura.store import open_stage
+from apertura.study.chart.interactive import write_page
+from apertura.study.chart.pareto import Point, draw_points, with_front, write_points
+
+FOLDER = Path("results/study")
+PULSES, SIDE_PX, PIXELS = 1024, 256, 200
+_TOLERANCES_RAD = (1.5e-3, 1.5e-4)
+_SLOW_SECONDS = 0.3
+"""A former slower than this on the window is timed on fewer of its rows."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a campaign that is measured: a block of pulses over a window of the image.
+
+    Attributes
+    ----------
+    spectra, profiles
+        Of the block.
+    pixels
+        (y, x, 3) float64, the window.
+    picked
+        (pixel, 2) int64, rows and columns in the window whose exact values are known.
+    exact
+        (pixel,) complex128.
+    whole
+        What the whole image is: pixels and pulses.
+    reference_seconds
+        What the exact values took.
+    beams
+        Of the antennas over the block, where they have any.
+    """
+
+    spectra: Spectra
+    profiles: Profiles
+    pixels: NDArray[np.float64]
+    picked: NDArray[np.int64]
+    exact: NDArray[np.complex128]
+    whole: Load
+    reference_seconds: float
+    beams: Beams | None = None
+
+
+def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> list[Path]:
+    """Write results/study/speed_accuracy.csv, .png and .html.
+
+    Parameters
+    ----------
+    campaign, flight, pair
+        Whose echo and profile stages are used; they must be finished.
+    seconds
+        When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
+
+    Notes
+    -----
+    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
+    adds to the planned error is added to that of every setting.
+    """
+    outlook = outlook_of(campaign, flight, pair)
+    grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
+    profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
+    middle = len(outlook.tx) // 2
+    block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
+    if outlook.spectra is None:
+        raise ValueError("the echo stage is not there")
+    spectra, beams = outlook.spectra.of_pulses(block), outlook.beams and outlook.beams.at(block)
+    outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra, beams=beams)
+    heights = open_heights(campaign)
+    job = campaign_job(campaign, pair, outlook, grid, heights)
+    plan, costs = plan_job(campaign, job), campaign_costs(campaign)
+    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
+    points = [
+        replace(
+            point,
+            predicted_seconds=point.predicted_seconds - tile_seconds(costs, job.load),
+            predicted_error_db=point.predicted_error_db + (0.0 if point.planned else max(0.0, job.content_db or 0.0)),
+        )
+        for point in measure(part, plan, _settings(job, costs), seconds=seconds)
+    ]
+    size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
+    title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
+    paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    write_points(points, paths[0])
+    draw_points(points, paths[1], title=title, accuracy_db=processing.accuracy_db)
+    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.accuracy_db)
+    return paths
+
+
+def _part(
+    spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load, beams: Beams | None
+) -> Part:
+    window = []
+    for size in grid.shape:
+        first = max(0, size - SIDE_PX) // 2 // 16 * 16
+        window.append(slice(first, min(size, first + SIDE_PX)))
+    pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
+    picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
+    begin = perf_counter()
+    exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]], beams=beams)
+    return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin, beams)
+
+
+def _settings(job: Job, costs: Costs) -> list[Setting]:
+    """Return the settings to measure, cheapest first."""
+    return [
+        setting
+        for setting in candidates(job.view, job.signal, job.load, costs)
+        if setting.engine == "numba" or setting.form_options.get("tolerance_rad") in _TOLERANCES_RAD
+    ]
+
+
+def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
+    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
+    begin = perf_counter()
+    points = [_reference_point(part, plan)]
+    if plan.engine != "reference":
+        points.append(_measured(part, plan.setting, plan))
+    unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
+    for setting in unplanned:
+        if perf_counter() - begin > seconds:
+            break
+        points.append(_measured(part, setting, None))
+    return with_front(sorted(points, key=lambda point: point.seconds))
+
+
+def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
+    engine = ENGINES[setting.engine]
+    thinning = 1 if plan is None or plan.presum is None else plan.presum.factor
+
+    def prepare() -> Any:
+        history = part.profiles if plan is None else plan.history(part.profiles)
+        return engine.prepare(history, **setting.options)
+
+    tables_s, prepared = _least(prepare, repeats=2)
+    rows = len(part.pixels)
+    if setting.engine == "numba":  # any shape of pixels will do, so errors need not wait for the whole window
+        engine.form(prepared, part.pixels[:1, :1], beams=part.beams)
+        rows = max(
+            1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.whole.pixels / part.pixels.shape[1]))
+        )
+        values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None], beams=part.beams)[0]
+        form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows], beams=part.beams), repeats=2)
+    else:
+        form_s, image = _least(
+            lambda: engine.form(prepared, part.pixels, beams=part.beams, **setting.form_options), repeats=3
+        )
+        values = image[part.picked[:, 0], part.picked[:, 1]]
+    pixels = rows * part.pixels.shape[1]
+    taken = tables_s + form_s * part.whole.pixels / pixels
+    error_db = numerical_error(values.astype(np.complex64), part.exact).rms_db
+    predicted_db = setting.error_db if plan is None else plan.predicted_error_db
+    return _point(part, setting, thinning, taken, error_db, predicted_db, planned=plan is not None)
+
+
+def _reference_point(part: Part, plan: Plan) -> Point:
+    setting = plan.better[-1] if plan.better else plan.setting
+    taken = part.reference_seconds * part.whole.pixels / PIXELS
+    values = part.exact.astype(np.complex64)
+    error_db = numerical_error(values, part.exact).rms_db
+    return _point(part, setting, 1, taken, error_db, setting.error_db, planned=plan.engine == "reference")
+
+
+def _point(
+    part: Part,
+    setting: Setting,
+    thinning: int,
+    taken: float,
+    error_db: float,
+    predicted_db: float,
+    *,
+    planned: bool,
+) -> Point:
+    return Point(
+        engine=setting.engine,
+        setting=setting.line,
+        pulse_thinning=thinning,
+        seconds=taken,
+        pixel_pulses_per_s=part.whole.pixels * part.whole.pulses / taken,
+        error_db=error_db,
+        predicted_seconds=setting.seconds,
+        predicted_error_db=predicted_db,
+        on_front=False,
+        planned=planned,
+    )
+
+
+def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
+    times = []
+    for _ in range(repeats):
+        begin = perf_counter()
+        result = work()
+        times.append(perf_counter() - begin)
+    return min(times), result

@@ -1,0 +1,1 @@
+"""The claims of the source paper, each computed."""

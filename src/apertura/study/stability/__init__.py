@@ -1,0 +1,1 @@
+"""Every impairment against every correction."""
