@@ -4,10 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from apertura.study.stability.atlas import edge_of, join_parts, part_path, read_outcomes, write_outcomes
-from apertura.study.stability.charts import draw_impairment
-from apertura.study.stability.outcomes import Outcome, correct, crossing, run_sweep
-from apertura.study.stability.sweeps import CHOICES, SWEEPS
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
@@ -24,6 +20,10 @@ from apertura.study.paper.corrected import clock_claims, corrected_claims
 from apertura.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
 from apertura.study.paper.parameters import parameter_claims
 from apertura.study.paper.resolution import simulated_table, uav_table
+from apertura.study.stability.atlas import edge_of, join_parts, part_path, read_outcomes, write_outcomes
+from apertura.study.stability.charts import draw_impairment
+from apertura.study.stability.outcomes import Outcome, correct, crossing, run_sweep
+from apertura.study.stability.sweeps import CHOICES, SWEEPS
 from apertura.study.window import demodulated, window_samples
 
 
