@@ -9,12 +9,15 @@ from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.focus.inputs import Profiles, Spectra
 from apertura.load.pair import Outlook
+from apertura.load.scene import OpenScene
 from apertura.planning.plan import Job
-from apertura.scene.auto_grid import swath
 from apertura.scene.grid import SceneGrid
+from apertura.scene.swath import swath
+from apertura.scene.terrain import FlatGround
 from apertura.steps.plan import job_of
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
-from apertura.steps.terrain import Heights
+
+FLAT = FlatGround(0.0)
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
     bandwidth = min(between(50e6, 600e6), 0.4 * carrier)
     wavelength = C / carrier
     spacing = min(between(wavelength / 8, 1.0), range_m / pixels)
-    grid = SceneGrid("local", 0.0, pixels * spacing, spacing, (pixels, pixels - 7), 0.0)
+    grid = SceneGrid("local", 0.0, pixels * spacing, spacing, (pixels, pixels - 7))
     tx, rx = _fly(
         generator, grid, range_m, wavelength, pulses=pulses, step_m=between(wavelength / 60, range_m / pulses)
     )
@@ -49,9 +52,8 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
     profiles = compressed(spectra, grid, window)
     outlook = Outlook(tx, rx, spectra.frequency_hz, spectra.weight, np.inf, spectra)
     name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
-    return Drawn(
-        name, spectra, profiles, grid, job_of(outlook, grid, Heights((), None), tile_px=256, threads=1), accuracy
-    )
+    scene = OpenScene(grid, FLAT, FLAT, (), {}, {})
+    return Drawn(name, spectra, profiles, grid, job_of(outlook, scene, tile_px=256, threads=1), accuracy)
 
 
 def _fly(
@@ -92,13 +94,13 @@ def _record(
     bandwidth_hz: float,
     window: str,
 ) -> Spectra:
-    near, far = swath(grid, tx, rx)
+    near, far = swath(grid, FLAT, tx, rx)
     cells = (far - near).max() * bandwidth_hz / C + 2 * GUARD_SAMPLES / OVERSAMPLING
     count = int(np.ceil(1.2 * cells)) + 16
     frequency = carrier_hz + bandwidth_hz * (np.arange(count) / count - 0.5)
     targets = generator.integers(1, 25)
     rows, columns = (generator.uniform(0, size - 1, targets) for size in grid.shape)
-    places = grid.positions_at(rows, columns)
+    places = grid.positions_at(rows, columns, 0.0)
     gains = generator.standard_normal(targets) + 1j * generator.standard_normal(targets)
     path = sum(np.linalg.norm(places - antenna[:, None], axis=-1) for antenna in (tx, rx))
     reference = near / C
@@ -113,7 +115,7 @@ def _record(
 
 def compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
     """Return the range profiles of an echo, as the profile step makes them."""
-    near, far = swath(grid, spectra.tx_position_m, spectra.rx_position_m)
+    near, far = swath(grid, FLAT, spectra.tx_position_m, spectra.rx_position_m)
     frequency = spectra.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
     start = near - GUARD_SAMPLES * step

@@ -48,14 +48,14 @@ class Runner:
 
     @property
     def pixels(self) -> np.ndarray:
-        return self.drawn.grid.positions()
+        return self.drawn.grid.positions(0.0)
 
 
 def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
     """Return (plan's setting, errors as it was made and redone, ratio to the best, the best setting)."""
     plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db, costs=read_costs())
     picked = np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T
-    exact = reference.form(drawn.spectra, drawn.grid.positions()[*picked])
+    exact = reference.form(drawn.spectra, drawn.grid.positions(0.0)[*picked])
 
     def error_db(runner: Runner) -> float:
         return numerical_error(runner.go()[*picked].astype(np.complex64), exact).rms_db
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--pulses", type=int, default=400)
     asked = parser.parse_args()
     warm = draw(np.random.default_rng(999), pixels=16, pulses=8)
-    numba.form(numba.prepare(warm.profiles), warm.grid.positions())
+    numba.form(numba.prepare(warm.profiles), warm.grid.positions(0.0))
     ratios, redone, missed = [], 0, 0
     for seed in range(asked.first, asked.first + asked.campaigns):
         drawn = draw(np.random.default_rng(seed), pixels=asked.size, pulses=asked.pulses)

@@ -28,6 +28,7 @@ from apertura.focus.inputs import Profiles
 from apertura.focus.tiles import Former, form_blocks
 from apertura.geometry.geodesy import ecef_from_projected
 from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 
@@ -54,7 +55,7 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
 def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
     """Return seconds of the whole image by the kernel alone, from tiles on its diagonal."""
     corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // native.PATCH * native.PATCH
-    tiles = [grid[c : c + TILE, c : c + TILE].positions() for c in corners]
+    tiles = [grid[c : c + TILE, c : c + TILE].positions(0.0) for c in corners]
     begin = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda pixels: native.form(tables, pixels), tiles))
@@ -77,7 +78,7 @@ def image_seconds(history: Profiles, grid: SceneGrid, *, blocks: int, threads: i
         array = zarr.create_array(folder, shape=grid.shape, chunks=(TILE, TILE), dtype="complex64")
         begin, scratch, pulses = time.perf_counter(), Path(folder), len(history.samples)
         how = {"blocks": blocks, "write": array.__setitem__, "scratch": scratch, "threads": threads}
-        form_blocks(former, pulses, grid, grid.tiles(TILE), **how)
+        form_blocks(former, pulses, grid, FlatGround(0.0), grid.tiles(TILE), **how)
         return time.perf_counter() - begin - paused, alone
 
 
@@ -89,7 +90,7 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=2, help="of pulses, whose tables are held one after the other")
     parser.add_argument("--threads", type=int, default=2)
     asked = parser.parse_args()
-    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size), 0.0)
+    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size))
     history = profiles(grid, asked.pulses)
     spent, alone = image_seconds(history, grid, blocks=asked.blocks, threads=asked.threads)
     found = {

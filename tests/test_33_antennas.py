@@ -158,7 +158,7 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db, costs=COSTS)
     engine = ENGINES[found.engine]
     history = {"echo": drawn.spectra, "profile": found.history(drawn.profiles)}[engine.reads]
-    places = drawn.grid.positions()
+    places = drawn.grid.positions(0.0)
     image = engine.form(engine.prepare(history, **found.options), places, beams=beams, **found.form_options)
     some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
     exact = reference.form(drawn.spectra, places[some], beams=beams)

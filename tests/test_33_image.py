@@ -14,12 +14,14 @@ from apertura.geometry.geodesy import ecef_from_projected, projected_from_ecef
 from apertura.quality.error_check import Certificate, certified_pixels
 from apertura.quality.measures import coherence_factor, numerical_error, survey
 from apertura.quality.point_targets import Patch, cut_through, find_peak
-from apertura.scene.auto_grid import auto_bounds, auto_spacing, swath, utm_crs
+from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.grid import SceneGrid
 from apertura.scene.pixel_positions import block
+from apertura.scene.swath import swath
+from apertura.scene.terrain import FlatGround
 
 FREQUENCY = 1.2e9 + 1.6e6 * np.arange(256)
-GRID = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80), 0.0)
+GRID = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80))
 TABLE_ENGINES = [name for name, engine in ENGINES.items() if engine.reads == "profile" and engine.available()]
 
 
@@ -34,7 +36,7 @@ def history(targets, *, tx=None, rx=None, window="hann"):
     weight, zeros = window_weights(window, len(FREQUENCY)), np.zeros(len(tx))
     spectra = Spectra(transfer.astype(np.complex64), FREQUENCY, weight, zeros, tx, rx)
     step, _ = range_step(FREQUENCY, oversampling=2)
-    near, far = swath(GRID, tx, rx)
+    near, far = swath(GRID, FlatGround(0.0), tx, rx)
     start = near - 32 * step
     count = int((far - near).max() / step) + 66
     samples = compress(spectra.transfer, FREQUENCY, weight=weight, reference_delay_s=zeros, start_m=start, count=count)
@@ -43,7 +45,7 @@ def history(targets, *, tx=None, rx=None, window="hann"):
 
 def formed(name, profiles, grid=GRID):
     engine = ENGINES[name]
-    return engine.form(engine.prepare(profiles), grid.positions())
+    return engine.form(engine.prepare(profiles), grid.positions(0.0))
 
 
 @pytest.mark.parametrize("name", TABLE_ENGINES)
@@ -53,7 +55,7 @@ def test_every_engine_agrees_with_the_double_sum(name, window, bistatic):
     tx = np.stack([np.linspace(-4, 4, 64), np.zeros(64), np.full(64, 5.0)], -1)
     rx = tx + [3.0, -1.0, 2.0] if bistatic else None
     spectra, profiles = history([(0.3, 10.0, 0.0), (-2.0, 12.0, 0.0)], tx=tx, rx=rx, window=window)
-    exact = reference.form(spectra, GRID.positions())
+    exact = reference.form(spectra, GRID.positions(0.0))
     assert numerical_error(formed(name, profiles).ravel(), exact.ravel()).rms_db < -65
 
 
@@ -89,7 +91,8 @@ def test_tiles_change_nothing_to_the_bit(name):
     _, profiles = history((0.33, 10.07, 0.0))
     engine = ENGINES[name]
     tables, tiled = engine.prepare(profiles), np.zeros(GRID.shape, np.complex64)
-    form_tiles(lambda pixels: engine.form(tables, pixels), GRID, GRID.tiles(32), write=tiled.__setitem__, threads=2)
+    flat, tiles = FlatGround(0.0), GRID.tiles(32)
+    form_tiles(lambda pixels: engine.form(tables, pixels), GRID, flat, tiles, write=tiled.__setitem__, threads=2)
     np.testing.assert_array_equal(tiled, formed(name, profiles))
 
 
@@ -117,7 +120,7 @@ def test_an_error_says_how_far_it_hangs_on_the_choice_of_pixels():
 
 
 def test_the_grid_is_anchored_at_its_north_west_corner():
-    grid = SceneGrid.from_bounds("EPSG:32632", (570656.9, 5363687.65, 570670.9, 5363701.65), spacing_m=0.05, height_m=1)
+    grid = SceneGrid.from_bounds("EPSG:32632", (570656.9, 5363687.65, 570670.9, 5363701.65), spacing_m=0.05)
     assert grid.shape == (280, 280)
     np.testing.assert_allclose(grid.bounds_m, (570656.9, 5363687.65, 570670.9, 5363701.65), atol=1e-6)
     assert grid.x_m[0] == pytest.approx(570656.925)
@@ -125,39 +128,37 @@ def test_the_grid_is_anchored_at_its_north_west_corner():
 
 
 def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
-    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (100, 70), 620.0)
+    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (100, 70))
     count = np.zeros(grid.shape, int)
-    whole = grid.positions()
+    whole = grid.positions(620.0)
     for window in grid.tiles(32):
         count[window] += 1
-        np.testing.assert_array_equal(grid[window].positions(), whole[window])
+        np.testing.assert_array_equal(grid[window].positions(620.0), whole[window])
     assert (count == 1).all()
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
 @pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
 def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):
-    """To 10 nm, far below the wavelength; in between nodes, across blocks, and high above the grid's ground."""
+    """To 10 nm, far below the wavelength; in between nodes, across blocks, on and high above the ellipsoid."""
     west_m, north_m = {"EPSG:32632": (330e3, 9.2e6), "EPSG:2056": (2.6e6, 1.2e6)}.get(crs, (1e6, -2e6))
-    grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270), 620.0)[3:, 5:]
+    grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270))[3:, 5:]
     height = np.random.default_rng(1).uniform(-400, 4000, grid.shape)
-    for above in (None, height):
-        exact = ecef_from_projected(
-            crs, *np.meshgrid(grid.x_m, grid.y_m), np.full(grid.shape, 620.0) if above is None else above
-        )
+    for above in (620.0, height):
+        exact = ecef_from_projected(crs, *np.meshgrid(grid.x_m, grid.y_m), np.broadcast_to(above, grid.shape))
         np.testing.assert_allclose(grid.positions(above), exact, rtol=0, atol=1e-8)
 
 
 def test_blocks_too_wide_for_polynomials_are_placed_by_proj():
     options = ("EPSG:32632", (9.2e6, 330e3))
-    assert block(*options, 1.0, 0.0, (0, 0)).exact
-    assert not block(*options, 300.0, 0.0, (0, 0)).exact
+    assert block(*options, 1.0, (0, 0)).exact
+    assert not block(*options, 300.0, (0, 0)).exact
 
 
 def test_pixels_are_where_their_coordinates_say():
-    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (4, 4), 620.0)
+    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (4, 4))
     np.testing.assert_allclose(
-        projected_from_ecef("EPSG:32632", grid.positions())[1, 2], [570657.025, 5363701.575, 620.0], atol=1e-4
+        projected_from_ecef("EPSG:32632", grid.positions(620.0))[1, 2], [570657.025, 5363701.575, 620.0], atol=1e-4
     )
     longitude, latitude = Transformer.from_crs(32632, 4326, always_xy=True).transform(grid.x_m[:2], grid.y_m[[0, 0]])
     ground = Geod(ellps="WGS84").inv(longitude[0], latitude[0], longitude[1], latitude[1])[2]
@@ -170,14 +171,14 @@ def test_pixels_are_where_their_coordinates_say():
 @pytest.mark.parametrize(("crs", "expected"), [("EPSG:4326", "not projected"), ("EPSG:99999", "unknown to PROJ")])
 def test_a_crs_that_is_no_map_in_metres_is_refused(crs, expected):
     with pytest.raises(CampaignError, match=expected):
-        SceneGrid.from_bounds(crs, (0, 0, 1, 1), spacing_m=1, height_m=0)
+        SceneGrid.from_bounds(crs, (0, 0, 1, 1), spacing_m=1)
 
 
 def test_the_swath_holds_every_pixel_and_little_more():
     tx = np.array([[0.0, 0.0, 5.0], [1.0, 11.0, 3.0]])
     rx = tx + [1.0, 2.0, 0.0]
-    near, far = swath(GRID, tx, rx)
-    pixels = GRID.positions().reshape(-1, 3)
+    near, far = swath(GRID, FlatGround(0.0), tx, rx)
+    pixels = GRID.positions(0.0).reshape(-1, 3)
     path = np.linalg.norm(pixels - tx[:, None], axis=-1) + np.linalg.norm(pixels - rx[:, None], axis=-1)
     assert (near <= path.min(axis=1)).all()
     assert (far >= path.max(axis=1)).all()
@@ -235,7 +236,7 @@ def test_a_survey_by_windows_is_the_survey_of_the_whole():
     generator = np.random.default_rng(5)
     image = (generator.standard_normal((60, 50)) + 1j * generator.standard_normal((60, 50))).astype(np.complex64)
     image[7, 8] = np.nan
-    grid = SceneGrid("local", 0, 0, 1, (60, 50), 0)
+    grid = SceneGrid("local", 0, 0, 1, (60, 50))
     whole, parts = (survey(image, list(grid.tiles(side))) for side in (64, 16))
     assert (whole.row, whole.column, whole.noise_floor_db) == (parts.row, parts.column, parts.noise_floor_db)
     assert whole.entropy == pytest.approx(parts.entropy, abs=1e-9)
@@ -248,7 +249,7 @@ def test_a_survey_by_windows_is_the_survey_of_the_whole():
 def test_a_tile_that_misses_the_accuracy_is_found_and_the_others_are_not():
     generator = np.random.default_rng(6)
     image = (generator.standard_normal((64, 64)) + 1j * generator.standard_normal((64, 64))).astype(np.complex64)
-    grid = SceneGrid("local", 0, 0, 1, (64, 64), 0)
+    grid = SceneGrid("local", 0, 0, 1, (64, 64))
     windows = list(grid.tiles(32))
     pixels = certified_pixels(image, windows, 40, generator)
     certificate = Certificate(pixels, image[tuple(pixels.T)].astype(np.complex128), 40)

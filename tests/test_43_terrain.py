@@ -17,9 +17,10 @@ from apertura.errors import CampaignError
 from apertura.focus.engines import ENGINES
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.load import pair as outlook
-from apertura.load.ground import Ground, on_the_ground
+from apertura.load.ground import Ground
 from apertura.load.inputs import profiles_of, spectra_of
 from apertura.load.pair import outlook_of
+from apertura.load.scene import expected_scene, open_scene, settled_scene
 from apertura.scene.grid import SceneGrid
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.plan import grid_around
@@ -27,8 +28,6 @@ from apertura.simulation.presets import DEMO_ORIGIN, tandem
 from apertura.simulation.scene import PointTarget, Scene
 from apertura.steps import profile, scene, terrain
 from apertura.steps.plan import job_of, plan_known, plan_pair
-from apertura.steps.scene import scene_grid
-from apertura.steps.terrain import Heights, expected_heights
 from apertura.steps.verify import verify
 from apertura.store import open_stage
 
@@ -101,8 +100,7 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
     assert report["terrain"]["dem"] == "dem.tif"
     assert report["terrain"]["datum"] == "ellipsoid"
     assert report["numerical_error_db"] < -50
-    grid = scene_grid(hillside)
-    assert report["terrain"]["lowest_m"] < grid.height_m < report["terrain"]["highest_m"]
+    assert report["terrain"]["lowest_m"] < settled_scene(hillside).level.height_m < report["terrain"]["highest_m"]
     digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
     for name in ("f01/uav1-uav2/slc.tif", "f01/fused/coherent_db.tif", "layers/mask.tif"):
         with rasterio.open(hillside.results / name) as raster:
@@ -112,7 +110,7 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
 
 
 def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
-    grid = scene_grid(hillside)
+    grid = settled_scene(hillside).grid
     heights = open_stage(hillside.stage("terrain"), "terrain").height.values
     values = {}
     for name in ("incidence", "bistatic_angle", "mask"):
@@ -151,7 +149,7 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
     campaign = edit_scene(tiny, height_m=572.0, height_datum="egm96", geoid="egm96_15.gtx")
     path = scene.scene(campaign)
     settled = json.loads(path.read_text())
-    assert settled["grid"]["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
+    assert settled["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
     assert settled["inputs"] == {"geoid": hashlib.sha256((tiny / "egm96_15.gtx").read_bytes()).hexdigest()}
 
 
@@ -163,10 +161,10 @@ def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
         (root / "results" / "terrain.manifest.json").unlink()
     campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
     seen, profiles = outlook_of(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
-    grid = scene_grid(campaign)
-    heights = expected_heights(campaign, grid)
-    assert job_of(seen, grid, heights, tile_px=256, threads=1).signal.samples == profiles.sizes["range"]
-    assert job_of(seen, grid, Heights((), None), tile_px=256, threads=1).signal.samples != profiles.sizes["range"]
+    hill = expected_scene(campaign, seen.flown)
+    level = replace(hill, terrain=hill.level)
+    assert job_of(seen, hill, tile_px=256, threads=1).signal.samples == profiles.sizes["range"]
+    assert job_of(seen, level, tile_px=256, threads=1).signal.samples != profiles.sizes["range"]
     plan = plan_pair(campaign, *pair)
     tables = ENGINES[plan.engine].prepare(plan.history(profiles_of(profiles)), **plan.options)
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
@@ -178,7 +176,7 @@ def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
     monkeypatch.setattr(outlook, "open_stage", None)
     found = outlook.outlook_of(hillside, "f01", "uav1-uav2", echo=echo)
     assert np.shares_memory(found.spectra.transfer, held)
-    plan_known(hillside, "f01", "uav1-uav2", found, scene_grid(hillside), terrain.open_heights(hillside))
+    plan_known(hillside, "f01", "uav1-uav2", found, open_scene(hillside))
 
 
 # Bad input
@@ -235,11 +233,9 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
     for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
         campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
         seen = outlook_of(campaign, *PAIR)
-        grid = outlook.campaign_grid(campaign, seen)
-        assert grid.height_m == pytest.approx(620.0, abs=0.1)
-        assert not np.isfinite(
-            Ground.of(campaign.settings.scene, tiny, crs=grid.crs).terrain.heights(under(grid, seen))
-        )
+        expected = expected_scene(campaign, seen.flown)
+        assert expected.level.height_m == pytest.approx(620.0, abs=0.1)
+        assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
     campaign = edit_scene(tiny, bounds_m="auto")
     message = complaint(lambda: plan_pair(campaign, *PAIR))
     assert "under the track, where scene.bounds_m: auto starts from" in message
@@ -249,7 +245,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
 def under(grid, seen):
     """A pixel below the middle of the track."""
     x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate([seen.tx, seen.rx]), axis=0))
-    return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1), 0.0)
+    return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1))
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, "auto"])
@@ -269,8 +265,8 @@ def test_a_scene_much_longer_than_wide_lies_at_the_mean_of_its_dem(tiny):
     write_plane(tiny, slope=0.0, height_m=623.0)
     middle = Campaign.load(tiny).settings.scene.bounds_m
     asked = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
-    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100), 0.0)
-    assert on_the_ground(strip, Ground.of(asked, tiny, crs=strip.crs))[0].height_m == 623.0
+    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100))
+    assert Ground.of(asked, tiny, crs=strip.crs).level(strip).height_m == 623.0
 
 
 def test_a_void_undeclared_is_no_height_on_earth(tiny):

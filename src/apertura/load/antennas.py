@@ -12,11 +12,11 @@ from apertura.antenna.illumination import Illumination, illuminate
 from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, read_pattern
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import OpenScene
 from apertura.settings import Antenna
 
 _STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
-_NET = 33
+_POINTS = 33
 
 
 def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
@@ -65,7 +65,7 @@ def lit(
     campaign: Campaign,
     pair: str,
     beams: Beams | None,
-    grid: SceneGrid,
+    scene: OpenScene,
     places: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> dict[str, Any]:
     """Return beams and illumination as the planner's job takes them, nothing without beams.
@@ -76,7 +76,7 @@ def lit(
         Which.
     beams
         Of the pair.
-    grid
+    scene
         The campaign's.
     places
         Phase centres of transmitter and receiver, (pulse, 3) float64 metres.
@@ -88,11 +88,10 @@ def lit(
     """
     if beams is None:
         return {}
-    rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
-    net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij"))
-    illumination = illuminate(beams, *places, net.reshape(-1, 3))
+    points = scene.grid.sample_points(_POINTS, scene.level.height_m)
+    illumination = illuminate(beams, *places, points.reshape(-1, 3))
     if illumination.unseen == 1:
-        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], places)
+        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], places)
     return {"beams": beams, "illumination": illumination}
 
 

@@ -20,9 +20,8 @@ from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.ingest import PHASE_HISTORIES, TRACKS
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.inputs import spectra_of
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import Flown
 from apertura.settings import OfdmWaveform
-from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
 
 
@@ -52,13 +51,10 @@ class Outlook:
     spectra: Spectra | None = None
     beams: Beams | None = None
 
-
-def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
-    """Return the campaign's grid, settled or as it will be."""
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
-        return scene_grid(campaign)
-    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
+    @property
+    def flown(self) -> Flown:
+        """What `auto` settles the grid from."""
+        return Flown(self.tx, self.rx, self.frequency_hz, self.path_limit_m)
 
 
 def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> Outlook:

@@ -12,9 +12,10 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines import ENGINES, native, numba, reference
 from apertura.focus.inputs import Profiles, Spectra
 from apertura.focus.presum import design, thin
+from apertura.geometry.geodesy import LOCAL
 from apertura.planning.cost import Costs
 from apertura.planning.machine import default_costs, machine
-from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.scene.grid import SceneGrid
 
 BANDWIDTH_HZ, CENTRE_HZ = 400e6, 1.2e9
 _SPACINGS_M = {"shared": 0.03, "wide": 0.18, "exact": 1.5}
@@ -37,7 +38,7 @@ def measure_costs(*, repeats: int = 3, size: int = 160, pulses: int = 256) -> Co
         return min(_timed(work) for _ in range(repeats))
 
     profiles, grid = _job(size, pulses, _SPACINGS_M["shared"])
-    pixels, work = grid.positions(), size * size * pulses
+    pixels, work = grid.positions(0.0), size * size * pulses
     if ENGINES["native"].available():
         found |= _native_costs(least, size=size, pulses=pulses)
         found |= _beam_costs(least, profiles, pixels)
@@ -49,9 +50,9 @@ def measure_costs(*, repeats: int = 3, size: int = 160, pulses: int = 256) -> Co
     centres = (profiles.tx_position_m, profiles.rx_position_m)
     found["weight"] = least(lambda: beams.weight(*centres, some)) / (2 * len(some) * pulses)
     found["reference.subcarrier"] = _reference_cost(least, profiles, pixels)
-    found["place.local"] = least(grid.positions) / grid.shape[0] / grid.shape[1]
-    placed = SceneGrid("EPSG:32632", 5e5, 5.3e6, 0.1, grid.shape, 0.0)
-    found["place.ecef"] = least(placed.positions) / grid.shape[0] / grid.shape[1]
+    found["place.local"] = least(lambda: grid.positions(0.0)) / grid.shape[0] / grid.shape[1]
+    placed = SceneGrid("EPSG:32632", 5e5, 5.3e6, 0.1, grid.shape)
+    found["place.ecef"] = least(lambda: placed.positions(0.0)) / grid.shape[0] / grid.shape[1]
     presum = design(pulses, 4, widest_cycles=0.01)
     if presum is not None:
         found["thin"] = least(lambda: thin(profiles, presum, pixels[size // 2, size // 2])) / profiles.samples.size
@@ -68,7 +69,7 @@ def _native_costs(least: Callable[[Callable[[], object]], float], *, size: int, 
     found = {}
     for name, spacing_m in _SPACINGS_M.items():
         profiles, grid = _job(size, pulses, spacing_m)
-        pixels = grid.positions()
+        pixels = grid.positions(0.0)
         for degree in (1, 2):
             tables = native.prepare(profiles, oversampling=6, degree=degree)
             # The curvature of a patch does not decide here, only its windows.
@@ -133,12 +134,12 @@ def _reference_cost(
 
 def _job(size: int, pulses: int, spacing_m: float) -> tuple[Profiles, SceneGrid]:
     """Return noise seen from a straight track, far enough that a patch shares one curvature."""
-    grid = SceneGrid(LOCAL, -size * spacing_m / 2, size * spacing_m / 2, spacing_m, (size, size), 0.0)
+    grid = SceneGrid(LOCAL, -size * spacing_m / 2, size * spacing_m / 2, spacing_m, (size, size))
     range_m = 60.0 * max(1.0, spacing_m / 0.1)
     along = np.linspace(-0.1, 0.1, pulses) * range_m
     tx = np.stack([np.full(pulses, -0.8 * range_m), along, np.full(pulses, 0.6 * range_m)], -1)
     rx = tx + [0.0, 0.02 * range_m, 0.0]
-    corners = grid.positions()[[0, 0, -1, -1], [0, -1, 0, -1]]
+    corners = grid.positions(0.0)[[0, 0, -1, -1], [0, -1, 0, -1]]
     path = sum(np.linalg.norm(corners - antenna[:, None], axis=-1) for antenna in (tx, rx))
     step = SPEED_OF_LIGHT_M_S / BANDWIDTH_HZ / 2
     start = np.asarray(path).min(axis=1) - 20 * step - 2 * spacing_m

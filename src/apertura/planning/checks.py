@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.planning.view import phase_rates, upward
+from apertura.planning.view import phase_rates, vertical
 
 
 def crossed_edges(
@@ -16,7 +16,6 @@ def crossed_edges(
     spacing_m: float,
     band_hz: tuple[float, float],
     path_limit_m: float = np.inf,
-    lowest_m: float | None = None,
 ) -> dict[str, str]:
     """Return flags: name → what was found, in one line.
 
@@ -32,29 +31,16 @@ def crossed_edges(
         Lowest and highest frequency.
     path_limit_m
         Longest total path inside the cyclic prefix.
-    lowest_m
-        Lowest height of a DEM over the net, metres: a platform beside it may be lower. None: the ground is flat.
 
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, a platform is at or below flat ground, or no echo of the scene
-        arrives inside the prefix.
+        If there is no pulse, a position is not finite, or no echo of the scene arrives inside the prefix.
     """
     _check_finite(tx_m, rx_m)
-    place_m, up = net_m.reshape(-1, 3), upward(net_m)
+    place_m, up = net_m.reshape(-1, 3), vertical(net_m)
     flags = {}
-    platforms = ((tx_m, "transmitter"), (rx_m, "receiver"))
-    for position, which in platforms:
-        height = (position - net_m[0, 0]) @ up
-        if lowest_m is None:
-            _check_above(height, which)
-        elif height.min() <= lowest_m:
-            flags["platform_below_scene"] = (
-                f"the {which} is {lowest_m - height.min():.1f} m below the lowest ground of the scene: check the unit "
-                f"and the datum of the DEM, unless the radar looks up a hillside"
-            )
-    inside = [_over(position, net_m, up, spacing_m) for position, _ in platforms]
+    inside = [_over(position, net_m, up, spacing_m) for position in (tx_m, rx_m)]
     over = int((inside[0] | inside[1]).sum())
     if over:
         flags["platform_inside_scene"] = (
@@ -86,17 +72,6 @@ def _check_finite(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
             where="track",
             expected="a position for every pulse",
             remedy="Mend the flight log.",
-        )
-
-
-def _check_above(height_m: NDArray[np.float64], which: str) -> None:
-    low = int(height_m.argmin())
-    if height_m[low] <= 0:
-        raise CampaignError(
-            f"the {which} is {height_m[low]:.2f} m above the ground at pulse {low}",
-            where="config/config.yaml: scene.height_m",
-            expected="a platform above the ground",
-            remedy="Check height_m and its datum (logs may count from the geoid), and the heights in the flight log.",
         )
 
 

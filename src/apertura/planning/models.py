@@ -5,9 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround, Plane, Terrain
+
 MIDPOINT_WAVELENGTHS = 1 / 16
 TERRAIN_RAD = 0.4
 TERRAIN_PIXELS = 0.5
+
+_BLOCKS = 33
 
 
 @dataclass(frozen=True)
@@ -113,8 +118,55 @@ def wobble_m(position_m: NDArray[np.float64]) -> float:
     return float(np.sqrt((strengths[1:] ** 2).sum() / len(apart)))
 
 
+@dataclass(frozen=True)
+class GroundModels:
+    """The ground of a scene and its two cheaper models, with how far they are off.
+
+    Attributes
+    ----------
+    full, flat, plane
+        The ground, the same at one height, and the plane through it.
+    relief_m, off_plane_m
+        Largest difference of the ground from `flat` and from `plane`, metres.
+    """
+
+    full: Terrain
+    flat: FlatGround
+    plane: Plane
+    relief_m: float
+    off_plane_m: float
+
+    @classmethod
+    def of(cls, terrain: Terrain, flat: FlatGround, grid: SceneGrid) -> "GroundModels":
+        """Return the models of a ground from its heights in the middle of blocks of pixels.
+
+        Examples
+        --------
+        >>> grid = SceneGrid("local", 0.0, 8.0, 1.0, (8, 8))
+        >>> models = GroundModels.of(Plane(0.0, 4.0, 7.0, east=0.0, north=0.5), FlatGround(7.0), grid)
+        >>> models.relief_m, round(models.off_plane_m, 9)
+        (1.75, 0.0)
+        """
+        blocks = grid.coarse(_BLOCKS)
+        heights = terrain.heights(blocks)
+        heights = np.where(np.isfinite(heights), heights, flat.height_m)  # a void between pixels is not imaged
+        plane = Plane.through(blocks, heights)
+        off_m = (np.abs(heights - model.heights(blocks)).max() for model in (flat, plane))
+        return cls(terrain, flat, plane, *map(float, off_m))
+
+    @classmethod
+    def level(cls, height_m: float = 0.0) -> "GroundModels":
+        """Return the models of flat ground, which is its own."""
+        flat = FlatGround(height_m)
+        return cls(flat, flat, Plane(0.0, 0.0, height_m, 0.0, 0.0), 0.0, 0.0)
+
+    def called(self, name: str) -> Terrain:
+        """Return the model that a decision names: 'plane' (level), 'tilted_plane' or 'dem'."""
+        return {"plane": self.flat, "tilted_plane": self.plane, "dem": self.full}[name]
+
+
 def decide_terrain(
-    heights_m: NDArray[np.float64] | None,
+    ground: GroundModels,
     *,
     track_m: NDArray[np.float64],
     place_m: NDArray[np.float64],
@@ -126,12 +178,12 @@ def decide_terrain(
 
     Parameters
     ----------
-    heights_m
-        (row, column) float64 of a DEM over the scene, metres above the flat model, evenly spread; None without one.
+    ground
+        The ground and its cheaper models.
     track_m
         (pulse, 3) float64, mean of both phase centres.
     place_m
-        (place, 3) float64, a net over the scene.
+        (place, 3) float64, points evenly spread over the scene.
     up
         (3,) float64, unit vector.
     wavelength_m, spacing_m
@@ -139,13 +191,13 @@ def decide_terrain(
 
     Notes
     -----
-    Source: DESIGN section 5 and docs/theory/planner.md, "Terrain": a height that is wrong by δh turns the look angle by
-    δh over the ground range and shifts the pixel by δh·H over it.
+    Source: docs/theory/planner.md, "Terrain": a height that is wrong by δh turns the look angle by δh over the ground
+    range and shifts the pixel by δh·H over it.
     """
     apart = track_m[:: max(1, len(track_m) // 64)][:, None] - place_m
     above = apart @ up
-    ground = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
-    nearest, steepest = float(ground.min()), float((np.abs(above) / ground).max())
+    range_m = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
+    nearest, steepest = float(range_m.min()), float((np.abs(above) / range_m).max())
     rms = wobble_m(track_m)
     focus_m = TERRAIN_RAD * wavelength_m * nearest / (4 * np.pi * max(rms, 1e-9))
     shift_m = TERRAIN_PIXELS * spacing_m / max(steepest, 1e-9)
@@ -154,27 +206,9 @@ def decide_terrain(
         f"wobble {rms:.3f} m rms and ground range from {nearest:.1f} m bear {focus_m:.3g} m (0.4 rad), "
         f"half a pixel of shift {shift_m:.3g} m"
     )
-    if heights_m is None:
+    if isinstance(ground.full, FlatGround):
         return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit:.3g} m: {rule}")
-    flat = float(np.abs(heights_m).max())
-    if flat < limit:
-        return Decision("terrain", "plane", f"relief {flat:.3g} m; {rule}")
-    rest = float(np.abs(heights_m - plane_through(heights_m)).max())
-    if rest < limit:
-        return Decision("terrain", "tilted_plane", f"relief {flat:.3g} m, {rest:.3g} m off a tilted plane; {rule}")
-    return Decision("terrain", "dem", f"relief {flat:.3g} m, {rest:.3g} m off a tilted plane; {rule}")
-
-
-def plane_through(heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least-squares plane through heights (row, column), metres, at the same places.
-
-    Examples
-    --------
-    >>> tilted = np.arange(4.0)[:, None] + 2 * np.arange(3.0)
-    >>> bool(np.allclose(plane_through(tilted), tilted))
-    True
-    """
-    row, column = np.indices(heights_m.shape)
-    basis = np.stack([np.ones(heights_m.size), row.ravel(), column.ravel()], -1)
-    fitted = basis @ np.linalg.lstsq(basis, heights_m.ravel(), rcond=None)[0]
-    return np.asarray(fitted.reshape(heights_m.shape))
+    if ground.relief_m < limit:
+        return Decision("terrain", "plane", f"relief {ground.relief_m:.3g} m; {rule}")
+    off_plane = f"relief {ground.relief_m:.3g} m, {ground.off_plane_m:.3g} m off a tilted plane; {rule}"
+    return Decision("terrain", "tilted_plane" if ground.off_plane_m < limit else "dem", off_plane)

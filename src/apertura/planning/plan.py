@@ -13,8 +13,9 @@ from apertura.focus.inputs import Profiles
 from apertura.focus.presum import Presum, thin
 from apertura.planning.candidates import Setting, Signal
 from apertura.planning.cost import Load
-from apertura.planning.models import Decision, plane_through
+from apertura.planning.models import Decision, GroundModels
 from apertura.planning.view import View, look
+from apertura.scene.terrain import Terrain
 
 _VIEW_PULSES = 48
 
@@ -41,8 +42,8 @@ class Job:
         'ecef' or 'local'.
     tile_px, threads
         Side of a tile; tiles formed at once.
-    heights_m, heights_step_px
-        (row, column) float64 of a DEM above the flat model, in the middle of blocks of so many pixels; None without.
+    ground
+        The scene's ground and its cheaper models.
     path_limit_m
         Longest total path inside the cyclic prefix.
     memory_bytes
@@ -66,8 +67,7 @@ class Job:
     frame: str = "ecef"
     tile_px: int = 256
     threads: int = 1
-    heights_m: NDArray[np.float64] | None = None
-    heights_step_px: int = 1
+    ground: GroundModels = field(default_factory=GroundModels.level)
     path_limit_m: float = np.inf
     memory_bytes: float = np.inf
     content_db: float | None = None
@@ -98,17 +98,6 @@ class Job:
         """The net as (place, 3), its middle in the middle."""
         return self.net_m.reshape(-1, 3)
 
-    @property
-    def tilt_m(self) -> tuple[float, float, float]:
-        """The plane through the DEM: height above the flat model at pixel (0, 0), per row and per column, metres."""
-        if self.heights_m is None:
-            return (0.0, 0.0, 0.0)
-        plane, step = plane_through(self.heights_m), self.heights_step_px
-        down, right = (
-            float(np.diff(plane[:2, :2], axis=axis)[0, 0]) / step if plane.shape[axis] > 1 else 0.0 for axis in (0, 1)
-        )
-        return (float(plane[0, 0]) - (down + right) * (step - 1) / 2, down, right)
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -132,8 +121,8 @@ class Plan:
         Edges that the job crosses: name → what was found, in one line.
     presum, midpoint, middle_m
         What `history` applies.
-    tilt_m
-        Of a tilted plane: height above the flat model at pixel (0, 0), per row and per column, metres.
+    terrain
+        The ground that is imaged on: as it is, a plane through it, or flat.
     cost_source
         Where the costs came from.
     illumination
@@ -148,10 +137,10 @@ class Plan:
     memory_bytes: int
     disk_bytes: int
     flags: Mapping[str, str]
+    terrain: Terrain
     presum: Presum | None = field(default=None, repr=False)
     midpoint: bool = False
     middle_m: NDArray[np.float64] | None = field(default=None, repr=False)
-    tilt_m: tuple[float, float, float] | None = None
     cost_source: str = ""
     illumination: Illumination | None = field(default=None, repr=False)
 
@@ -178,7 +167,7 @@ class Plan:
     @property
     def choices(self) -> dict[str, Any]:
         """Choice → value: all that the image's pixels depend on, and no prediction."""
-        return {decision.name: decision.value for decision in self.decisions} | {"tilt_m": self.tilt_m}
+        return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
 
     def history(self, profiles: Profiles) -> Profiles:
         """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same.

@@ -15,7 +15,8 @@ from apertura.planning.desk import Desk
 from apertura.planning.memory import block_decision, bytes_needed, setting_decisions, wall_seconds
 from apertura.planning.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db
 from apertura.planning.plan import Job, Plan
-from apertura.planning.view import phase_rates, upward
+from apertura.planning.view import phase_rates, vertical
+from apertura.scene.terrain import FlatGround
 
 MARGIN_DB = 3.0
 """Predicted errors lie this far below what is asked."""
@@ -42,7 +43,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
     Raises
     ------
     CampaignError
-        If the job holds no pulse, a platform is below the ground, or what is asked cannot run here.
+        If the job holds no pulse, or what is asked cannot run here.
 
     Notes
     -----
@@ -56,7 +57,6 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         spacing_m=job.spacing_m,
         band_hz=job.band_hz,
         path_limit_m=job.path_limit_m,
-        lowest_m=None if job.heights_m is None else float(job.heights_m.min()),
     )
     desk = Desk(job, job.view, costs, asked)
     whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
@@ -91,7 +91,7 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         presum=presum,
         midpoint=bool(midpoint.value),
         middle_m=job.place_m[len(job.place_m) // 2],
-        tilt_m=job.tilt_m if terrain.value == "tilted_plane" else None,
+        terrain=job.ground.called(str(terrain.value)),
         cost_source=costs.source,
         illumination=job.illumination,
     )
@@ -169,17 +169,17 @@ def _decide_midpoint(desk: Desk, accuracy_db: float) -> Decision:
 def _decide_terrain(desk: Desk) -> Decision:
     job = desk.job
     found = decide_terrain(
-        job.heights_m,
+        job.ground,
         track_m=(job.tx_position_m + job.rx_position_m) / 2,
         place_m=job.place_m,
-        up=upward(job.net_m),
+        up=vertical(job.net_m),
         wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz,
         spacing_m=job.spacing_m,
     )
     asked = desk.asked.get("terrain")
     if asked is None or asked == found.value:
         return found
-    if job.heights_m is None:
+    if isinstance(job.ground.full, FlatGround):
         raise CampaignError(
             f"terrain is {asked}",
             where="config/config.yaml: processing.terrain",

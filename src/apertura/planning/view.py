@@ -122,13 +122,13 @@ def phase_rates(
     return spread / wavelength_m, widest / wavelength_m
 
 
-def upward(net_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def vertical(net_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the unit normal of a net of places (row, column, 3) whose rows go south and columns east.
 
     Examples
     --------
     >>> east, south = np.meshgrid(np.arange(3.0), np.arange(2.0))
-    >>> upward(np.stack([east, -south, 0 * east], -1))
+    >>> vertical(np.stack([east, -south, 0 * east], -1))
     array([0., 0., 1.])
     """
     if min(net_m.shape[:2]) < 2:

@@ -15,14 +15,12 @@ from apertura.focus.engines import ENGINES
 from apertura.focus.tiles import Former, form_blocks
 from apertura.load.inputs import profiles_of
 from apertura.load.pair import outlook_of
+from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.candidates import Setting
 from apertura.planning.plan import Plan
 from apertura.provenance import sha256_file
-from apertura.scene.grid import LOCAL, SceneGrid
-from apertura.steps.plan import plan_known, planned_heights
-from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
+from apertura.steps.plan import plan_known
 from apertura.steps.stamping import stamped
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 
 
@@ -40,10 +38,10 @@ class Work:
         'echo' → `Spectra`, 'profile' → `Profiles`.
     beams
         Of the antennas; None where they look everywhere alike.
-    grid, heights
-        The campaign's grid, and the ground as the plan models it.
+    scene
+        The campaign's grid and ground.
     plan
-        How the image is formed.
+        How the image is formed, and on which model of the ground.
     empty
         The stamped stage `image`, without its pixels.
     windows
@@ -56,8 +54,7 @@ class Work:
     echo: xr.Dataset
     history: dict[str, Any]
     beams: Beams | None
-    grid: SceneGrid
-    heights: Heights
+    scene: OpenScene
     plan: Plan
     empty: xr.Dataset
     windows: list[Window]
@@ -67,26 +64,24 @@ class Work:
     def of(cls, campaign: Campaign, flight: str, pair: str, *, module: str, threads: int) -> "Work":
         """Open what a pair's image is made from, and plan it; `module` as `apertura.steps.stamping.stamped`."""
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-        grid, heights, outlook = (
-            scene_grid(campaign),
-            open_heights(campaign),
-            outlook_of(campaign, flight, pair, echo=echo),
-        )
+        scene, outlook = open_scene(campaign), outlook_of(campaign, flight, pair, echo=echo)
         history = {"echo": outlook.spectra, "profile": profiles_of(profile)}
-        plan = plan_known(campaign, flight, pair, outlook, grid, heights, threads=threads)
-        heights = planned_heights(plan, heights, grid)
+        plan = plan_known(campaign, flight, pair, outlook, scene, threads=threads)
         # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
         choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
         empty = stamped(
-            _empty(grid, pair, echo.attrs["flags"], campaign.settings.campaign),
+            _empty(scene, pair, echo.attrs["flags"]),
             "image",
             module=module,
-            parents=[echo, profile, *heights.parents],
+            parents=[echo, profile, *scene.parents],
             inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
-            settings={**campaign.relevant("image", pair), "grid": grid_spec(grid), "plan": choices},
+            settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
         )
-        folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(campaign.settings.processing.tile_px))
-        return cls(folder, echo, history, outlook.beams, grid, heights, plan, empty, windows, threads)
+        folder, windows = (
+            campaign.stage("image", flight, pair),
+            list(scene.grid.tiles(campaign.settings.processing.tile_px)),
+        )
+        return cls(folder, echo, history, outlook.beams, scene, plan, empty, windows, threads)
 
     def form(self, target: Any, setting: Setting, windows: list[Window], *, planned: bool = False) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.
@@ -118,13 +113,13 @@ class Work:
         form_blocks(
             former,
             len(history.tx_position_m),
-            self.grid,
+            self.scene.grid,
+            self.plan.terrain,
             windows,
             blocks=setting.pulse_blocks,
             write=target.__setitem__,
             scratch=self.folder.parent,
             threads=self.threads,
-            heights=self.heights.of,
         )
 
     def form_planned(self, target: Any, windows: list[Window]) -> None:
@@ -134,12 +129,12 @@ class Work:
 
     def places(self, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np.float64]:
         """Return (..., 3) float64 positions (m) of fractional pixel indices, on the ground."""
-        return self.grid.positions_at(row, column, self.heights.at(row, column))
+        return self.plan.terrain.positions_at(self.scene.grid, row, column)
 
 
-def _empty(grid: SceneGrid, pair: str, flags: dict[str, str], name: str) -> xr.Dataset:
+def _empty(scene: OpenScene, pair: str, flags: dict[str, str]) -> xr.Dataset:
     return xr.Dataset(
-        {"image": (("y", "x"), np.broadcast_to(np.complex64(0), grid.shape))},
-        coords=grid_coordinates(grid, name),
-        attrs={"frame": "local" if grid.crs == LOCAL else "ecef", "pair": pair, "flags": flags, "quality": {}},
+        {"image": (("y", "x"), np.broadcast_to(np.complex64(0), scene.grid.shape))},
+        coords=scene.coordinates,
+        attrs={"frame": scene.grid.frame, "pair": pair, "flags": flags, "quality": {}},
     )

@@ -31,7 +31,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **certified(work, target, plan.better, campaign.settings.processing.accuracy_db),
             **measures(work, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
-            **work.heights.report,
+            **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
         }
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}

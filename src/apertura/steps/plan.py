@@ -2,32 +2,29 @@
 
 import shutil
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from apertura.campaign import Campaign
-from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
 from apertura.focus.engines import reference
 from apertura.focus.inputs import Spectra
 from apertura.load.antennas import lit
-from apertura.load.ground import Ground
-from apertura.load.pair import Outlook, campaign_grid, outlook_of
+from apertura.load.pair import Outlook, outlook_of
+from apertura.load.scene import OpenScene, expected_scene
 from apertura.planning.candidates import Signal
 from apertura.planning.memory import memory_limit, size_text
+from apertura.planning.models import GroundModels
 from apertura.planning.plan import Job, Plan
 from apertura.planning.planner import make_plan
 from apertura.quality.measures import content_loss_db
-from apertura.scene.auto_grid import swath
-from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.scene.clearance import check_antennas
+from apertura.scene.swath import swath
 from apertura.steps.costs import campaign_costs
-from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING, check_clearance
-from apertura.steps.terrain import Heights, expected_heights
+from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
 from apertura.store import manifest_of
 
 OVERRIDES = (
@@ -41,8 +38,7 @@ OVERRIDES = (
     "midpoint",
     "terrain",
 )
-_NET = 9
-_BLOCKS = 33
+_POINTS = 9
 _CONTENT_PIXELS = 128
 
 
@@ -52,8 +48,7 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
     Parameters and errors as `plan_known`.
     """
     outlook = outlook_of(campaign, flight, pair)
-    grid = campaign_grid(campaign, outlook)
-    return plan_known(campaign, flight, pair, outlook, grid, expected_heights(campaign, grid), threads=threads)
+    return plan_known(campaign, flight, pair, outlook, expected_scene(campaign, outlook.flown), threads=threads)
 
 
 def plan_known(
@@ -61,8 +56,7 @@ def plan_known(
     flight: str,
     pair: str,
     outlook: Outlook,
-    grid: SceneGrid,
-    heights: Heights,
+    scene: OpenScene,
     *,
     threads: int = 1,
 ) -> Plan:
@@ -72,8 +66,8 @@ def plan_known(
     ----------
     campaign, flight, pair
         Which.
-    outlook, grid, heights
-        Its echo or what the logs promise, the campaign's grid and the ground.
+    outlook, scene
+        Its echo or what the logs promise; the campaign's grid and ground.
     threads
         Tiles formed at once: for seconds and bytes; nothing is chosen by it.
 
@@ -82,8 +76,10 @@ def plan_known(
     CampaignError
         If the job cannot fit in memory or on the disk, or its geometry is impossible.
     """
-    check_clearance(grid, outlook.tx, outlook.rx, heights=heights, where=f"flight {flight}, pair {pair}")
-    plan = plan_job(campaign, campaign_job(campaign, pair, outlook, grid, heights, threads=threads))
+    where = f"flight {flight}, pair {pair}"
+    flags = check_antennas(scene.grid, scene.terrain, outlook.tx, outlook.rx, where=where)
+    plan = plan_job(campaign, campaign_job(campaign, pair, outlook, scene, threads=threads))
+    plan = replace(plan, flags={**flags, **plan.flags})
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()
     check_fits(plan, free_disk=None if written else shutil.disk_usage(campaign.root).free, where=f"{flight}/{pair}")
     return plan
@@ -96,91 +92,49 @@ def plan_job(campaign: Campaign, job: Job) -> Plan:
     return make_plan(job, accuracy_db=processing.accuracy_db, costs=campaign_costs(campaign), overrides=overrides)
 
 
-def campaign_job(
-    campaign: Campaign, pair: str, outlook: Outlook, grid: SceneGrid, heights: Heights, *, threads: int = 1
-) -> Job:
-    """Return the planner's job of a pair, or of a part of its pulses, with the campaign's DEM, antennas and memory."""
+def campaign_job(campaign: Campaign, pair: str, outlook: Outlook, scene: OpenScene, *, threads: int = 1) -> Job:
+    """Return the planner's job of a pair, or of a part of its pulses, with the campaign's antennas and memory."""
     return replace(
-        job_of(outlook, grid, heights, tile_px=campaign.settings.processing.tile_px, threads=threads),
+        job_of(outlook, scene, tile_px=campaign.settings.processing.tile_px, threads=threads),
         memory_bytes=memory_limit(),
-        **_relief(campaign, grid),
-        **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
+        **lit(campaign, pair, outlook.beams, scene, (outlook.tx, outlook.rx)),
     )
 
 
-def job_of(outlook: Outlook, grid: SceneGrid, heights: Heights, *, tile_px: int, threads: int) -> Job:
+def job_of(outlook: Outlook, scene: OpenScene, *, tile_px: int, threads: int) -> Job:
     """Return the planner's job of what is known of a pair, on a grid and its ground."""
-    rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
-    frequency = outlook.frequency_hz
+    grid, frequency = scene.grid, outlook.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
-    nearest, farthest = swath(grid, outlook.tx, outlook.rx, heights=heights.of)
+    nearest, farthest = swath(grid, scene.terrain, outlook.tx, outlook.rx)
     centre, count = centre_frequency(frequency), len(frequency)
     samples = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
     return Job(
         tx_position_m=outlook.tx,
         rx_position_m=outlook.rx,
-        net_m=grid.positions_at(*np.meshgrid(rows, columns, indexing="ij")),
+        net_m=grid.sample_points(_POINTS, scene.level.height_m),
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
         bandwidth_hz=float(frequency[-1] - frequency[0]) * count / (count - 1),
         subcarriers=count,
         signal=Signal(centre, length / count, step, samples, outlook.weight),
-        frame="local" if grid.crs == LOCAL else "ecef",
+        frame=grid.frame,
         tile_px=tile_px,
         threads=threads,
+        ground=GroundModels.of(scene.terrain, scene.level, grid),
         path_limit_m=outlook.path_limit_m,
-        content_db=None if outlook.spectra is None else _content_db(outlook, outlook.spectra, grid, heights),
+        content_db=None if outlook.spectra is None else _content_db(outlook, outlook.spectra, scene),
     )
 
 
-def _content_db(outlook: Outlook, spectra: Spectra, grid: SceneGrid, heights: Heights) -> float:
+def _content_db(outlook: Outlook, spectra: Spectra, scene: OpenScene) -> float:
     """Return how much errors weigh at some random pixels of the scene."""
-    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
-    places = grid.positions_at(rows, columns, heights.at(rows, columns))
+    rows, columns = np.random.default_rng(0).integers(0, scene.grid.shape, (_CONTENT_PIXELS, 2)).T
+    places = scene.terrain.positions_at(scene.grid, rows, columns)
     parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
     return content_loss_db(
         np.concatenate([reference.terms(spectra, places, outlook.beams, pulses=part) for part in parts])
     )
-
-
-def _relief(campaign: Campaign, grid: SceneGrid) -> dict[str, Any]:
-    """Return the DEM as the planner's job takes it: above the flat model, in the middle of blocks of pixels."""
-    if campaign.settings.scene.dem is None:
-        return {}
-    terrain = Ground.of(campaign.settings.scene, campaign.root, crs=grid.crs).terrain
-    if terrain is None:
-        return {}
-    side = max(1, max(grid.shape) // _BLOCKS)
-    rows, columns = (max(1, size // side) for size in grid.shape)
-    found = terrain.heights(replace(grid, spacing_m=grid.spacing_m * side, shape=(rows, columns))) - grid.height_m
-    # Voids at pixels are refused by now; one between them is not imaged.
-    return {"heights_m": np.where(np.isfinite(found), found, 0.0), "heights_step_px": side}
-
-
-def planned_heights(plan: Plan, heights: Heights, grid: SceneGrid) -> Heights:
-    """Return the ground as the plan models it: the DEM itself, a plane through it, or flat.
-
-    Parameters
-    ----------
-    plan
-        Of the pair.
-    heights
-        From `apertura.steps.terrain.open_heights`.
-    grid
-        The campaign's.
-    """
-    if heights.of is None or plan.choices["terrain"] == "dem":
-        return heights
-    if plan.tilt_m is None:
-        return replace(heights, of=None)
-    first, down, right = plan.tilt_m
-
-    def plane(window: Window) -> NDArray[np.float64]:
-        row, column = (np.arange(*part.indices(size)) for part, size in zip(window, grid.shape, strict=True))
-        return np.asarray(grid.height_m + first + down * row[:, None] + right * column)
-
-    return replace(heights, of=plane)
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:

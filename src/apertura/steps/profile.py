@@ -1,6 +1,7 @@
 """Rule `profile`: transfer functions of a pair become range profiles, cropped to what the scene needs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +9,10 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.scene.auto_grid import clearance, swath
-from apertura.scene.grid import SceneGrid
-from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
+from apertura.load.scene import open_scene
+from apertura.scene.clearance import check_antennas
+from apertura.scene.swath import swath
 from apertura.steps.stamping import stamped
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage, save_stage
 
 GUARD_SAMPLES = 32
@@ -23,12 +23,12 @@ OVERSAMPLING = 2.0
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr."""
-    source, grid = open_stage(campaign.stage("echo", flight, pair), "echo"), scene_grid(campaign)
+    source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
     window, frequency = campaign.settings.processing.window, source.frequency.values
-    ground, places = open_heights(campaign), (source.tx_position.values, source.rx_position.values)
-    check_clearance(grid, *places, heights=ground, where=f"flight {flight}, pair {pair}")
-    nearest, farthest = swath(grid, *places, heights=ground.of)
-    _check_prefix(farthest, source.path_limit.values, where=f"flight {flight}, pair {pair}")
+    antennas, where = (source.tx_position.values, source.rx_position.values), f"flight {flight}, pair {pair}"
+    check_antennas(scene.grid, scene.terrain, *antennas, where=where)
+    nearest, farthest = swath(scene.grid, scene.terrain, *antennas)
+    _check_prefix(farthest, source.path_limit.values, where=where)
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
     start = nearest - GUARD_SAMPLES * step
     count = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
@@ -52,42 +52,10 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "window": window,
     }
     folder = campaign.stage("profile", flight, pair)
-    settings = {**campaign.relevant("profile"), "grid": grid_spec(grid)}
-    parents, inputs = [source, *ground.parents], scene_inputs(campaign)
-    save_stage(stamped(dataset, "profile", module=__name__, parents=parents, settings=settings, inputs=inputs), folder)
+    settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
+    how: dict[str, Any] = {"module": __name__, "parents": parents, "settings": settings, "inputs": scene.inputs}
+    save_stage(stamped(dataset, "profile", **how), folder)
     return folder
-
-
-def check_clearance(
-    grid: SceneGrid, tx: NDArray[np.float64], rx: NDArray[np.float64], *, heights: Heights, where: str
-) -> None:
-    """Raise CampaignError where an antenna is not above the ground; it names what said how high the ground is.
-
-    Parameters
-    ----------
-    grid, heights
-        The scene and its ground.
-    tx, rx
-        (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
-    where
-        Flight and pair.
-    """
-    source, keys = ("the ground", "scene.height_m and scene.height_datum")
-    if heights.of is not None:
-        source, keys = ("the DEM", "scene.dem (metres, not feet) and scene.dem_datum")
-    for antenna, which in ((tx, "transmitter"), (rx, "receiver")):
-        above, ground = clearance(grid, antenna, heights=heights.of)
-        low = above <= 0
-        if low.any():
-            pulse = int(np.nanargmin(above))
-            raise CampaignError(
-                f"{where}: at {int(low.sum())} pulses the {which} is in or below the ground of the scene, worst at "
-                f"pulse {pulse}: {above[pulse]:.2f} m above it, its height {above[pulse] + ground[pulse]:.2f} m where "
-                f"{source} has {ground[pulse]:.2f} m",
-                where=f"config/config.yaml: scene.{'height_m' if heights.of is None else 'dem'}",
-                expected="an antenna above the ground",
-                remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
-            )
 
 
 def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:

@@ -10,7 +10,7 @@ from apertura.focus.inputs import Spectra
 from apertura.planning.candidates import Setting
 from apertura.quality.error_check import Certificate, certified_pixels
 from apertura.quality.measures import coherence_factor, survey
-from apertura.quality.point_targets import cut_through, find_peak, ground_position
+from apertura.quality.point_targets import cut_through, find_peak
 from apertura.steps.forming import Work
 
 CERTIFIED_PIXELS = 256
@@ -59,9 +59,9 @@ def certified(work: Work, target: Any, better: tuple[Setting, ...], accuracy_db:
 
 def measures(work: Work, target: Any) -> dict[str, Any]:
     """Return what one pass over the pixels and a close look at the brightest target tell."""
-    found, grid = survey(target, work.windows), work.grid
+    found, grid = survey(target, work.windows), work.scene.grid
     peak = find_peak(target, found.row, found.column)
-    x, y = ground_position(grid, peak)
+    x, y = map(float, grid.map_at(peak.row, peak.column))
     spectra: Spectra = work.history["echo"]
     terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])), work.beams)
     along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)

@@ -14,15 +14,14 @@ from apertura.campaign import Campaign
 from apertura.focus.engines import ENGINES, reference
 from apertura.focus.inputs import Profiles, Spectra
 from apertura.load.inputs import profiles_of
-from apertura.load.pair import campaign_grid, outlook_of
+from apertura.load.pair import outlook_of
+from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.candidates import Setting, candidates
 from apertura.planning.cost import Costs, Load, tile_seconds
 from apertura.planning.plan import Job, Plan
 from apertura.quality.measures import numerical_error
-from apertura.scene.grid import SceneGrid
 from apertura.steps.costs import campaign_costs
 from apertura.steps.plan import campaign_job, plan_job
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.chart.interactive import write_page
 from apertura.study.chart.pareto import Point, draw_points, with_front, write_points
@@ -82,7 +81,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     adds to the planned error is added to that of every setting.
     """
     outlook = outlook_of(campaign, flight, pair)
-    grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
+    scene, processing = open_scene(campaign), campaign.settings.processing
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     middle = len(outlook.tx) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
@@ -90,10 +89,9 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         raise ValueError("the echo stage is not there")
     spectra, beams = outlook.spectra.of_pulses(block), outlook.beams and outlook.beams.at(block)
     outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra, beams=beams)
-    heights = open_heights(campaign)
-    job = campaign_job(campaign, pair, outlook, grid, heights)
+    job = campaign_job(campaign, pair, outlook, scene)
     plan, costs = plan_job(campaign, job), campaign_costs(campaign)
-    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
+    part = _part(spectra, profiles.of_pulses(block), scene, whole=job.load, beams=beams)
     points = [
         replace(
             point,
@@ -102,7 +100,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         )
         for point in measure(part, plan, _settings(job, costs), seconds=seconds)
     ]
-    size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(outlook.tx)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     paths[0].parent.mkdir(parents=True, exist_ok=True)
@@ -112,14 +110,12 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     return paths
 
 
-def _part(
-    spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load, beams: Beams | None
-) -> Part:
+def _part(spectra: Spectra, profiles: Profiles, scene: OpenScene, *, whole: Load, beams: Beams | None) -> Part:
     window = []
-    for size in grid.shape:
+    for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
         window.append(slice(first, min(size, first + SIDE_PX)))
-    pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
+    pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
     picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
     begin = perf_counter()
     exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]], beams=beams)
