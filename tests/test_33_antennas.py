@@ -158,7 +158,7 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db)
     engine = load_engine(found.engine)
     inputs = {"phase_history": drawn.history, "profiles": found.inputs(drawn.profiles)}[engine.READS]
-    places = drawn.grid.positions()
+    places = drawn.grid.positions(0.0)
     image = engine.form(
         engine.prepare(inputs, **found.setting.options), places, beams=beams, **found.setting.form_options
     )
