@@ -23,7 +23,7 @@ import zarr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import native
-from apertura.focus.engines.tables import Tables
+from apertura.focus.engines.native_tables import Tables
 from apertura.focus.inputs import Profiles
 from apertura.focus.tiles import Former, form_blocks
 from apertura.geometry.geodesy import ecef_from_projected

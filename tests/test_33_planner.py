@@ -12,6 +12,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.echo.compression import window_weights
 from apertura.errors import CampaignError
 from apertura.focus.engines import ENGINES, native, reference
+from apertura.focus.engines.native_prediction import path_variants
 from apertura.focus.inputs import Profiles
 from apertura.focus.presum import design, presum_error_db, thin
 from apertura.focus.tiles import form_blocks
@@ -23,7 +24,7 @@ from apertura.planning.memory import memory_limit
 from apertura.planning.models import decide_midpoint, decide_terrain, midpoint_error
 from apertura.planning.plan import Job
 from apertura.planning.planner import make_plan
-from apertura.planning.view import forms, look, phase_rates
+from apertura.planning.view import look, phase_rates
 from apertura.quality.measures import numerical_error
 from apertura.scene.grid import SceneGrid
 from apertura.steps.plan import check_fits, planned_heights
@@ -384,7 +385,7 @@ def test_a_thinned_image_equals_that_of_all_pulses_where_leaving_pulses_out_does
     [(0.05, 12, 0), (0.05, 60, 0), (0.05, 4, 1), (0.02, 0.6, 2), (0.6, 60, 2), (2.0, 60, 2)],
 )
 def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeypatch):
-    """Shared and wide forms count together in the kernel's tally; the exact way apart."""
+    """Shared curvature counts in the kernel's tally whatever its window; own curvature and exact paths apart."""
     pixels = spacing_m * np.stack(np.meshgrid(np.arange(48.0), -np.arange(48.0)), -1)
     places = np.concatenate([pixels - pixels.mean((0, 1)) + [0, range_m], np.zeros((48, 48, 1))], -1)
     tx = track(64, length_m=range_m, height_m=range_m)
@@ -396,7 +397,14 @@ def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeyp
     tally = np.zeros(4, np.int64)
     native.form(native.prepare(profiles), places, counts=tally)
     view = look(tx, tx, places[::6, ::6], spacing_m)
-    shares, _ = forms(view, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
+    shares, _ = path_variants(
+        view.range_m,
+        view.slope,
+        spacing_m=spacing_m,
+        cell_m=step / 3,
+        wavenumber_rad_m=2 * np.pi / WAVELENGTH,
+        tolerance_rad=1.5e-3,
+    )
     assert shares[2] == pytest.approx(tally[2] / tally.sum(), abs=0.15)
     assert (shares[2] > 0.5) == (way == 2)
     if spacing_m < 0.1:  # windows are narrow: only curvature decides between the first two

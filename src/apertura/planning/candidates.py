@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines import ENGINES
-from apertura.focus.engines.tables import BAND, MARGIN, TAPS, band_error_db, plan, ratio
+from apertura.focus.engines.native_prediction import path_variants
+from apertura.focus.engines.native_tables import BAND, MARGIN, TAPS, band_error_db, design_table, ratio
 from apertura.planning import cost
-from apertura.planning.view import View, forms
+from apertura.planning.view import View
 
 DEGREES = (1, 2)
 OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
@@ -80,7 +81,7 @@ class Setting:
     reason
         One line.
     shares
-        Of pixels × pulses that native computes by its shared, wide and exact forms.
+        Of pixels × pulses that native computes by shared curvature, wide windows and exact paths.
     pulse_blocks
         Into how many blocks pulses are split, so that the tables of one fit into memory; their images add up.
     """
@@ -176,16 +177,23 @@ def _native(
     k = signal.wavenumber_rad_m
     up, down = ratio(signal.oversampling, oversampling)
     cell_m = signal.step_m * down / up
-    table_db = plan(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree).error_db(
+    table_db = design_table(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree).error_db(
         signal.window
     )
-    shares, path_rad = forms(view, cell_m=cell_m, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
+    shares, path_rad = path_variants(
+        view.range_m,
+        view.slope,
+        spacing_m=view.spacing_m,
+        cell_m=cell_m,
+        wavenumber_rad_m=k,
+        tolerance_rad=tolerance_rad,
+    )
     cells = -(-((signal.samples - 1) * up // down + 1 + 2 * MARGIN) // TAPS) * TAPS
     paths_db = 20 * np.log10(_WORST_TO_RMS * path_rad + _FLOAT32_RAD)
-    beams_db = 20 * np.log10(view.footprint.error + _SILENT)
+    beams_db = 20 * np.log10(view.weights.error + _SILENT)
     error_db = power_sum_db(table_db, paths_db, beams_db)
     tables, tiles = cost.seconds(
-        costs, "native", replace(load, cells=cells), degree=degree, shares=shares, footprint=view.footprint
+        costs, "native", replace(load, cells=cells), degree=degree, shares=shares, weights=view.weights
     )
     sum_type = accumulate or ("complex64" if error_db > WIDE_SUM_DB else "complex128")
     return Setting(
@@ -196,7 +204,7 @@ def _native(
         tables + tiles,
         load.pulses * cells * 8 * (degree + 1),
         f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB"
-        + (f", weights of antennas by {beams_db:.1f} dB" if view.footprint.antennas else ""),
+        + (f", weights of antennas by {beams_db:.1f} dB" if view.weights.antennas else ""),
         tables,
         shares,
     )
@@ -206,7 +214,7 @@ def _numba(view: View, signal: Signal, load: cost.Load, costs: cost.Costs, overs
     factor = max(1, round(oversampling / signal.oversampling))
     cells = signal.samples * factor
     cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
-    tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells), footprint=view.footprint)
+    tables, tiles = cost.seconds(costs, "numba", replace(load, cells=cells), weights=view.weights)
     error_db = power_sum_db(cubic_db, _REFINED_DB)
     reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
     table_bytes = 8 * load.pulses * cells
@@ -214,7 +222,7 @@ def _numba(view: View, signal: Signal, load: cost.Load, costs: cost.Costs, overs
 
 
 def _reference(view: View, load: cost.Load, costs: cost.Costs) -> Setting:
-    spent = cost.seconds(costs, "reference", load, footprint=view.footprint)[1]
+    spent = cost.seconds(costs, "reference", load, weights=view.weights)[1]
     return Setting("reference", {}, {}, _REFERENCE_DB, spent, 0, "the double sum itself, float64")
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from apertura.antenna.illumination import NO_BEAMS, Footprint
+from apertura.focus.engines.native_prediction import NO_BEAMS, PatchWeights
 
 _WIDE_FORMS = ("shared", "wide", "exact")
 
@@ -58,7 +58,7 @@ def seconds(
     *,
     degree: int = 2,
     shares: tuple[float, float, float] = (1.0, 0.0, 0.0),
-    footprint: Footprint = NO_BEAMS,
+    weights: PatchWeights = NO_BEAMS,
 ) -> tuple[float, float]:
     """Return predicted seconds (tables, pixels) of an engine.
 
@@ -73,8 +73,8 @@ def seconds(
     degree
         Of native's polynomials.
     shares
-        Parts of pixels × pulses that native computes by its shared, wide and exact forms.
-    footprint
+        Parts of pixels × pulses that native computes by shared curvature, wide windows and exact paths.
+    weights
         Of the antennas' beams.
 
     Returns
@@ -98,20 +98,18 @@ def seconds(
     if engine == "native":
         tables = unit["native.table"] * load.pulses * load.cells * (degree + 1)
         form = sum(share * unit[f"native.{name}.{degree}"] for name, share in zip(_WIDE_FORMS, shares, strict=True))
-        if footprint.antennas:
+        if weights.antennas:
             exact = unit[f"native.exact.{degree}"]
             weighed = form + (1 - shares[2]) * unit["native.beam"] + shares[2] * (unit["native.edge"] - exact)
             form = (
-                footprint.smooth * weighed
-                + footprint.rough * unit["native.edge"]
-                + footprint.dark * unit["native.dark"]
+                weights.smooth * weighed + weights.pixelwise * unit["native.edge"] + weights.dark * unit["native.dark"]
             )
         pixels = work * form
     elif engine == "numba":
         tables = unit["numba.table"] * load.pulses * load.cells
-        pixels = work * (unit["numba.pixel"] + footprint.antennas * unit["weight"])
+        pixels = work * (unit["numba.pixel"] + weights.antennas * unit["weight"])
     else:
-        spent = load.subcarriers * unit["reference.subcarrier"] + footprint.antennas * unit["weight"]
+        spent = load.subcarriers * unit["reference.subcarrier"] + weights.antennas * unit["weight"]
         tables, pixels = 0.0, work * spent
     return tables, pixels + tile_seconds(costs, load)
 

@@ -44,10 +44,12 @@ def setting_decisions(chosen: Setting, asked: Mapping[str, Any], accuracy_db: fl
     if chosen.engine == "native":
         options = {**chosen.options, **chosen.form_options}
         shared, wide, exact = (100 * share for share in chosen.shares)
-        forms = f"of pixel·pulses {shared:.0f} % share curvature, {wide:.0f} % need their own or wide windows"
+        paths = (
+            f"of pixel·pulses {shared:.0f} % share curvature, {wide:.0f} % take wide windows, {exact:.0f} % exact paths"
+        )
         reasons = {
             "table_degree": "cheapest with this oversampling",
-            "phase_tolerance_rad": f"{forms}, {exact:.0f} % the exact way",
+            "phase_tolerance_rad": paths,
             "accumulate": f"sums in float32 err by -115 dB, wider below {WIDE_SUM_DB:.0f} dB; paths start in float64",
         }
         names = {"table_degree": "degree", "phase_tolerance_rad": "tolerance_rad", "accumulate": "accumulate"}

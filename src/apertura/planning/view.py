@@ -1,4 +1,4 @@
-"""How the scene is seen, and which of its forms the compiled engine may take there."""
+"""How the scene is seen: ranges, slopes and phase rates over it."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
-from apertura.antenna.illumination import NO_BEAMS, Footprint, footprint
-from apertura.planning.machine import machine
+from apertura.focus.engines.native_prediction import NO_BEAMS, PatchWeights, patch_weights
 
 
 @dataclass(frozen=True)
@@ -22,14 +21,14 @@ class View:
         (2, pulse, place) float64, change of total path per pixel along columns and rows, metres.
     spacing_m
         Pixel spacing.
-    footprint
+    weights
         Of the antennas' beams.
     """
 
     range_m: NDArray[np.float64]
     slope: NDArray[np.float64]
     spacing_m: float
-    footprint: Footprint = NO_BEAMS
+    weights: PatchWeights = NO_BEAMS
 
 
 def look(
@@ -46,7 +45,7 @@ def look(
     distance = np.linalg.norm(apart, axis=-1)
     direction = (apart / distance[..., None]).sum(axis=0)
     slope = np.stack([(direction * step).sum(-1) for step in (right, down)])
-    seen = NO_BEAMS if beams is None else footprint(beams, tx_m, rx_m, np.stack([right, down]), place)
+    seen = NO_BEAMS if beams is None else patch_weights(beams, tx_m, rx_m, np.stack([right, down]), place)
     return View(distance, slope, spacing_m, seen)
 
 
@@ -55,35 +54,6 @@ def _steps(net_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[n
         return np.zeros_like(net_m)
     along = np.gradient(net_m, axis=axis)
     return np.asarray(spacing_m * along / np.linalg.norm(along, axis=-1, keepdims=True))
-
-
-def forms(
-    view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
-) -> tuple[tuple[float, float, float], float]:
-    """Return the parts that native computes by its shared, wide and exact forms, and its phase error.
-
-    The error is the RMS over patches and pulses of the largest in a patch, rad.
-
-    Notes
-    -----
-    Source: docs/theory/engine.md, "Paths" and "Look-ups", for flat patches of 16 × 16 pixels.
-    """
-    reach, inner = 8.49 * view.spacing_m, 2.12 * view.spacing_m
-    inverse = (1 / view.range_m) ** 2
-    base = inverse * (0.19 * inner**3 + inverse * reach**4 * (0.14 * reach + inner))
-    shared = (base + 0.58 * reach * inner**2 * inverse).sum(axis=0) * wavenumber_rad_m
-    own = (base + 0.075 * reach**2 * inner**2 * inverse**1.5).sum(axis=0) * wavenumber_rad_m
-    step = np.abs(view.slope).sum(axis=0)
-    bend = 4.5 * view.spacing_m**2 * (1 / view.range_m).sum(axis=0)
-    span = (3 * step + 2 * bend) / cell_m + 1
-    narrow_cells = 8 if machine() == "avx2" else 16
-    group = span if narrow_cells == 8 else span + 4 * step / cell_m
-    fits = span <= 15.49
-    alike, alone = fits & (shared <= tolerance_rad), fits & (shared > tolerance_rad) & (own <= tolerance_rad)
-    fast = alike & (group <= narrow_cells - 0.51)
-    parts = (float(fast.mean()), float((alike & ~fast).mean() + alone.mean()))
-    error = np.where(alike, shared, np.where(alone, own, 0.0))
-    return (*parts, float(1 - sum(parts))), float(np.sqrt((error**2).mean()))
 
 
 def phase_rates(

@@ -27,7 +27,7 @@ class Processing(Section):
         "auto", description="native and numba: table cells per resolution cell c/B of total path"
     )
     phase_tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | Literal["auto"] = Field(
-        "auto", description="native: largest phase error its fast forms may make, rad"
+        "auto", description="native: largest phase error its path series may make, rad"
     )
     accumulate: Literal["auto", "complex64", "complex128"] = Field(
         "auto", description="native: type of sums over pulses"
