@@ -1,7 +1,6 @@
 // The entry points that Python binds, and the choice of the instruction set.
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 #include <new>
 #include <vector>

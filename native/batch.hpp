@@ -26,8 +26,8 @@ constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four 
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the block's centre, in cells from the window's first cell
   alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks], h[kBatch][kBlocks];  // its derivatives
-  alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks],
-      yy[kBatch][kBlocks];  // own curvature: coefficients of (5a)
+  // Own curvature: its second-order coefficients, (5a).
+  alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks], yy[kBatch][kBlocks];
   alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
   alignas(64) int32_t window[kBatch][kBlocks];     // first cell, from `row`
   alignas(64) float shared_curvature[kBatch][16];  // x'^2 xx + x'y' xy + y'^2 yy at the pixels of any block

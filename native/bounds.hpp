@@ -19,7 +19,7 @@ constexpr float kWindowMargin = 0.51f;
 constexpr float kFifthOrder = 0.14f;            // D^5/R^4, with room for higher orders; the gradient adds delta D^4/R^4
 constexpr float kThirdOrder = 0.19f;            // delta^3/R^2
 constexpr float kSharedCurvatureError = 0.58f;  // D delta^2/R^2: three such terms, 1/sqrt 3
-constexpr float kOwnCurvatureError = 0.75f * .1f;  // D^2 delta^2/R^3: of six terms of 1/8 all but a tenth is in (5a)
+constexpr float kOwnCurvatureError = 0.075f;    // D^2 delta^2/R^3: of six terms of 1/8 all but a tenth is in (5a)
 
 // Second-order terms move a pixel of a block by at most 1.5^2 times their coefficients; those of the origin stand for
 // all of the patch, with a factor of two.

@@ -9,7 +9,7 @@ namespace {
 
 struct Field {
   const char* name;
-  size_t offset, size;
+  int64_t offset, size;
 };
 #define APERTURA_FIELD(type, name) {#type "." #name, offsetof(type, name), sizeof(type::name)}
 constexpr Field kFields[] = {
