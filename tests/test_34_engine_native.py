@@ -17,6 +17,7 @@ from apertura.errors import CampaignError
 from apertura.focus.engines import native, native_binding
 from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -60,7 +61,7 @@ class Scene:
         at = start[:, None] + step_m * np.arange(length)
         turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
         samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
-        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, self.tx, self.rx)
+        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
 
     def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
         delay = self.path_m(places) / C
@@ -301,7 +302,7 @@ def test_near_ranges_take_more_exact_paths(isa, range_m, way):
 
 def test_swapping_transmitter_and_receiver_gives_the_same_image(isa, plain):
     _, pixels, profiles = plain
-    swapped = replace(profiles, tx_position_m=profiles.rx_position_m, rx_position_m=profiles.tx_position_m)
+    swapped = replace(profiles, aperture=Aperture(*reversed(profiles.aperture.legs)))
     image, other = (native.form(native.prepare(p), ecef(pixels)) for p in (profiles, swapped))
     assert decibels(image - other, image) <= -100
 
@@ -313,9 +314,7 @@ def test_a_constant_height_equals_a_lowered_track(isa):
     lowered = [antenna - 1.5 * AXES[:, 2] for antenna in (scene.tx, scene.rx)]
     profiles = scene.profiles(ecef(raised))
     image = native.form(native.prepare(profiles), ecef(raised))
-    other = native.form(
-        native.prepare(replace(profiles, tx_position_m=lowered[0], rx_position_m=lowered[1])), ecef(pixels)
-    )
+    other = native.form(native.prepare(replace(profiles, aperture=Aperture(*lowered))), ecef(pixels))
     assert decibels(image - other, image) <= -70
 
 
@@ -336,7 +335,7 @@ def test_a_raised_target_focuses_where_geometry_predicts(isa):
 def test_blocks_of_pulses_add_up(isa, plain):
     _, pixels, profiles = plain
     whole = native.form(native.prepare(profiles), ecef(pixels))
-    blocks = (profiles.of_pulses(slice(0, 33)), profiles.of_pulses(slice(33, None)))
+    blocks = (profiles[slice(0, 33)], profiles[slice(33, None)])
     parts = [native.form(native.prepare(block), ecef(pixels)) for block in blocks]
     assert decibels(sum(parts) - whole, whole) <= -110
 
@@ -393,7 +392,7 @@ def test_bad_input_is_refused(plain):
     with pytest.raises(ValueError, match="degree=3"):
         native.prepare(profiles, degree=3)
     with pytest.raises(ValueError, match="holds no pulse"):
-        native.prepare(profiles.of_pulses(slice(0, 0)))
+        native.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
     with pytest.raises(ValueError, match="oversampling"):

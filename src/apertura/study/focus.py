@@ -10,7 +10,8 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.echo.demodulate import remove_path
 from apertura.focus.engines import numba, reference
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.geometry.aperture import Aperture
 from apertura.quality.measures import coherence_factor
 from apertura.quality.point_targets import half_power_width
 from apertura.study.bench import Bench, Complexes
@@ -92,8 +93,7 @@ def range_tables(observed: History, targets_m: Floats) -> numba.Tables:
         step,
         centre_frequency(observed.frequency_hz),
         length / len(observed.frequency_hz),
-        observed.tx_position_m,
-        observed.rx_position_m,
+        Aperture(observed.tx_position_m, observed.rx_position_m),
     )
     return numba.prepare(profiles)
 
@@ -161,13 +161,12 @@ def widths_of(image: Callable[[Floats], Complexes], peak_m: Floats) -> tuple[flo
 def coherence_factors(observed: History, points_m: Floats) -> Floats:
     """Return Γ at each of (point, 3), from what each pulse adds there by the double sum."""
     weight = window_weights(observed.window, len(observed.frequency_hz))
-    spectra = Spectra(
+    spectra = PhaseHistory(
         observed.transfer,
         observed.frequency_hz,
         weight,
         np.zeros(len(observed.transfer)),
-        observed.tx_position_m,
-        observed.rx_position_m,
+        Aperture(observed.tx_position_m, observed.rx_position_m),
     )
     added = reference.terms(spectra, points_m)
     return np.array([coherence_factor(column) for column in added.T])
