@@ -48,6 +48,7 @@ lint: $(SETUP)
 	$(BIN)/ruff format --check src tests benchmarks
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/clang-format --dry-run -Werror native/*.?pp
 	$(BIN)/lint-imports
 	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
 	$(BIN)/snakemake --lint --directory build/lint
@@ -56,6 +57,7 @@ format: $(SETUP)
 	$(BIN)/ruff check --fix src tests benchmarks
 	$(BIN)/ruff format src tests benchmarks
 	$(BIN)/snakefmt Snakefile workflow
+	$(BIN)/clang-format -i native/*.?pp
 
 # Needs a registry; the files name none.
 lock: $(SETUP)

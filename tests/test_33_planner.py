@@ -12,7 +12,7 @@ from apertura.echo.compression import window_weights
 from apertura.errors import CampaignError
 from apertura.focus.engines import load_engine, native, reference
 from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.native_prediction import forms, view_of
+from apertura.focus.engines.native_prediction import path_variants, view_of
 from apertura.focus.inputs import Profiles
 from apertura.focus.job import Job, Signal
 from apertura.focus.presum import design, presum_error_db, presummed
@@ -345,7 +345,7 @@ def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeyp
     tally = np.zeros(4, np.int64)
     native.form(native.prepare(profiles), places, counts=tally)
     seen = view_of(job(aperture=mono(tx), ground_m=places[::6, ::6], spacing_m=spacing_m))
-    shares, _ = forms(seen, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
+    shares, _ = path_variants(seen, cell_m=step / 3, wavenumber_rad_m=2 * np.pi / WAVELENGTH, tolerance_rad=1.5e-3)
     assert shares[2] == pytest.approx(tally[2] / tally.sum(), abs=0.15)
     assert (shares[2] > 0.5) == (way == 2)
     if spacing_m < 0.1:  # windows are narrow: only curvature decides between the first two
