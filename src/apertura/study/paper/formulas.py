@@ -1,7 +1,6 @@
 """Closed forms of the source paper: waveform, clocks, timing, resolution and coherence.
 
-Every claim that follows from parameters alone is computed here; what needs an image is measured elsewhere.
-Source of all: the paper's equations as DESIGN section 4 settles them, unless a function says otherwise.
+Source of all: docs/theory/study.md, "Closed forms", unless a function says otherwise.
 """
 
 import numpy as np
@@ -93,17 +92,6 @@ def timing_requirement_s(range_error_m: float) -> float:
     133.4
     """
     return 2 * range_error_m / SPEED_OF_LIGHT_M_S
-
-
-def association_requirement_s(prf_hz: float) -> float:
-    """Return 1/f_prf: the error of a time tag that takes a pulse for its neighbour.
-
-    Examples
-    --------
-    >>> association_requirement_s(100.0)
-    0.01
-    """
-    return 1 / prf_hz
 
 
 def time_tag_requirement_s(range_error_m: float, speed_m_s: float) -> float:

@@ -1,4 +1,4 @@
-"""How much of each impairment each correction of the sidelink survives."""
+"""What each size of an impairment does to the image under each correction of the sidelink."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,22 +9,25 @@ from numpy.typing import NDArray
 from apertura.echo.line_of_sight import fit_line_of_sight
 from apertura.echo.sidelink import METHODS, choose, measure
 from apertura.errors import CampaignError
-from apertura.study.bench import Bench, Case, Complexes, receive_pair
-from apertura.study.focus import (
+from apertura.focus.inputs import Spectra
+from apertura.study.paper_scene import Complexes, PaperScene, receive_pair, receive_undisturbed
+from apertura.study.point_response import (
     Floats,
-    History,
+    amplitude_db,
     coherence_factors,
-    decibels,
     divided_history,
+    error_floor_db,
     find_peaks,
     half_power_widths,
     mean_image,
+    phase_history,
+    random_pixels,
     range_tables,
 )
 from apertura.study.stability.sweeps import SWEEPS, Sweep
 
 REFUSED_DB = 40.0
-"""Loss entered where nothing is imaged, and the largest that is told apart."""
+"""Loss entered where nothing is imaged; larger ones are clipped to it."""
 
 _REACH_M = (0.16, 1.0)
 
@@ -89,15 +92,15 @@ def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcom
     method
         One of `CHOICES`.
     seed
-        Draws depend on it and on their number alone: every method and size meets the same dice.
+        Draws depend on it and on their number alone: every method and size meets the same random numbers.
     """
     sweep = SWEEPS[impairment]
     for size in sweep.sizes:
         ideal = _undisturbed(sweep.flown(0.0))
-        found = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
-        losses = np.array([one.loss_db for one in found])
-        chosen = [one.chosen for one in found]
-        ground, cross = np.median([one.widths_m for one in found], axis=0)
+        draws = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
+        losses = np.array([one.loss_db for one in draws])
+        chosen = [one.chosen for one in draws]
+        ground, cross = np.median([one.widths_m for one in draws], axis=0)
         yield Outcome(
             impairment=impairment,
             unit=sweep.unit,
@@ -105,11 +108,11 @@ def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcom
             method=method,
             loss_db=_rounded(losses.mean()),
             loss_spread_db=_rounded(losses.std()),
-            coherence_factor=_rounded(np.mean([one.coherence for one in found])),
+            coherence_factor=_rounded(np.mean([one.coherence for one in draws])),
             ground_width_m=_rounded(ground),
             cross_width_m=_rounded(cross),
-            floor_db=_rounded(np.mean([one.floor_db for one in found])),
-            pulses_used=_rounded(np.mean([one.used for one in found])),
+            floor_db=_rounded(np.mean([one.floor_db for one in draws])),
+            pulses_used=_rounded(np.mean([one.used for one in draws])),
             chosen=max(sorted(set(chosen)), key=chosen.count),
             draws=sweep.draws,
             seed=seed,
@@ -127,34 +130,23 @@ class _Ideal:
     values: Complexes
 
 
-def _undisturbed(bench: Bench) -> _Ideal:
+def _undisturbed(scene: PaperScene) -> _Ideal:
     """Return the peaks, and the image at random pixels, of the scene with nothing wrong."""
-    targets = bench.scatterers.position_m
-    radar, _, _ = receive_pair(bench, Case(), np.random.default_rng(0))
-    tables = range_tables(_alone(bench, radar, np.ones(len(radar), bool)), targets)
-    dice = np.random.default_rng(0)
-    pixels = np.column_stack([dice.uniform(-6, 6, 256), dice.uniform(5, 25, 256), np.zeros(256)])[None]
+    targets = scene.scatterers.position_m
+    tables = range_tables(phase_history(scene, receive_undisturbed(scene)), targets)
+    pixels = random_pixels(np.random.default_rng(0))
     return _Ideal(find_peaks(tables, targets, reach_m=_REACH_M)[1], pixels, mean_image(tables, pixels))
 
 
 def _draw(sweep: Sweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator) -> _Draw:
     flown = sweep.flown(size)
-    radar, sidelink, seen = receive_pair(flown, sweep.case(size), generator)
+    radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
-    kept, transfer, chosen = correct(method, radar, sidelink, seen.hidden.kept)
+    kept, transfer, chosen = correct(method, radar, sidelink, observation.hidden.kept)
     if not kept.any():
         return _Draw(REFUSED_DB, 0.0, (np.nan, np.nan), 0.0, 0.0, chosen)
-    image = _alone if chosen == "none" else _divided
-    return _measured(image(logged, transfer, kept), ideal, float(kept.mean()), chosen, flown.scatterers.position_m)
-
-
-def _alone(bench: Bench, transfer: Complexes, kept: NDArray[np.bool_]) -> History:
-    geometry = bench.geometry
-    return History(transfer, bench.frequency_hz, geometry.radar_tx[kept], geometry.radar_rx[kept])
-
-
-def _divided(bench: Bench, transfer: Complexes, kept: NDArray[np.bool_]) -> History:
-    return divided_history(bench, transfer, pulses=kept)
+    history = (phase_history if chosen == "none" else divided_history)(logged, transfer, pulses=kept)
+    return _measured(history, ideal, float(kept.mean()), chosen, flown.scatterers.position_m)
 
 
 def correct(
@@ -191,15 +183,13 @@ def correct(
     return kept, METHODS[chosen](radar[kept], sidelink[kept]), chosen
 
 
-def _measured(found: History, ideal: _Ideal, used: float, chosen: str, targets_m: Floats) -> _Draw:
-    tables = range_tables(found, targets_m)
-    places, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
-    loss = float(np.clip(-decibels(peaks / ideal.peaks), -REFUSED_DB, REFUSED_DB).mean())
-    values = mean_image(tables, ideal.pixels_m)
-    gain = np.vdot(ideal.values, values) / np.vdot(ideal.values, ideal.values).real
-    floor = float(decibels(np.sqrt(np.mean(np.abs(values - gain * ideal.values) ** 2)) / peaks.mean()))
-    widths = half_power_widths(tables, places[2])
-    return _Draw(loss, float(coherence_factors(found, places).mean()), widths, floor, used, chosen)
+def _measured(history: Spectra, ideal: _Ideal, used: float, chosen: str, targets_m: Floats) -> _Draw:
+    tables = range_tables(history, targets_m)
+    positions, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
+    loss_db = float(np.clip(-amplitude_db(peaks / ideal.peaks), -REFUSED_DB, REFUSED_DB).mean())
+    floor_db = error_floor_db(mean_image(tables, ideal.pixels_m), ideal.values, peaks)
+    widths_m = half_power_widths(lambda pixels: mean_image(tables, pixels), positions[2])
+    return _Draw(loss_db, float(coherence_factors(history, positions).mean()), widths_m, floor_db, used, chosen)
 
 
 def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: bool) -> float:
@@ -208,7 +198,7 @@ def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: 
     Parameters
     ----------
     sizes
-        (size,) float64 from harmless to ruinous, rising or falling.
+        (size,) float64 from negligible to destructive, rising or falling.
     losses_db
         (size,) float64.
     level_db
@@ -230,5 +220,5 @@ def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: 
     if i == 0:
         return float(sizes[0])
     scale: Callable[[Floats], Floats] = np.log if logarithmic else np.asarray
-    place = np.interp(level_db, losses_db[i - 1 : i + 1], scale(sizes[i - 1 : i + 1]))
-    return float(np.exp(place) if logarithmic else place)
+    at = np.interp(level_db, losses_db[i - 1 : i + 1], scale(sizes[i - 1 : i + 1]))
+    return float(np.exp(at) if logarithmic else at)
