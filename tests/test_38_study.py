@@ -30,8 +30,8 @@ from apertura.study.point_response import (
     range_tables,
 )
 from apertura.study.stability.charts import draw_impairment
-from apertura.study.stability.outcomes import Outcome, correct, crossing, run_sweep
-from apertura.study.stability.summary import join_parts, part_path, tolerance_of
+from apertura.study.stability.outcomes import Outcome, correct, run_sweep
+from apertura.study.stability.summary import crossing, join_parts, part_path, tolerance_of
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 from apertura.study.tables import read_table, write_table
 

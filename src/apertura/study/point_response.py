@@ -13,7 +13,7 @@ from apertura.focus.engines import numba, reference
 from apertura.focus.inputs import Profiles, Spectra
 from apertura.quality.measures import coherence_factor
 from apertura.quality.point_targets import half_power_width, locate_maximum
-from apertura.study.paper_scene import Complexes, PaperScene
+from apertura.study.paper_scene import Complexes, PaperScene, receive_undisturbed
 
 Floats = NDArray[np.float64]
 
@@ -90,6 +90,12 @@ def range_tables(history: Spectra, targets_m: Floats) -> numba.Tables:
     return numba.prepare(Profiles(samples, start_m, step_m, centre_hz, oversampling, *sides))
 
 
+def undisturbed_tables(scene: PaperScene, *, window: str = "none") -> numba.Tables:
+    """Return the range tables of a scene with nothing wrong and without noise."""
+    history = phase_history(scene, receive_undisturbed(scene), window=window)
+    return range_tables(history, scene.scatterers.position_m)
+
+
 def pixels_around(centre_m: Floats, along_m: Floats, across_m: Floats) -> Floats:
     """Return (along, across, 3) float64 pixels on the ground around a point."""
     along, across = np.meshgrid(along_m, across_m, indexing="ij")
@@ -142,17 +148,14 @@ def _find_peak(tables: numba.Tables, target_m: Floats, reach_m: tuple[float, flo
 def half_power_widths(image: Callable[[Floats], Complexes], peak_m: Floats) -> tuple[float, float]:
     """Return the −3 dB widths across (ground range) and along the track (cross-range) through a peak, metres.
 
+    NaN where the main lobe is wider than 1 m (across) or 0.4 m (along) to either side.
+
     Parameters
     ----------
     image
         Values (y, x) complex64 at (y, x, 3) pixels.
     peak_m
         (3,) float64.
-
-    Returns
-    -------
-    tuple of float
-        NaN where the main lobe is wider than 1 m (across) or 0.4 m (along) to either side.
     """
     centre, across_m, along_m = np.zeros(1), np.linspace(-1, 1, 401), np.linspace(-0.4, 0.4, 401)
     across = np.abs(image(pixels_around(peak_m, centre, across_m))).ravel() ** 2

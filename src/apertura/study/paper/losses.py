@@ -10,25 +10,10 @@ from apertura.echo.sidelink import divide
 from apertura.focus.inputs import Spectra
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.presets import paper_waveform
+from apertura.study import point_response
 from apertura.study.paper.claims import Claim, compare
-from apertura.study.paper_scene import (
-    RX_AHEAD_M,
-    Complexes,
-    Disturbance,
-    PaperScene,
-    receive_pair,
-    receive_undisturbed,
-    reduced_scene,
-)
-from apertura.study.point_response import (
-    REACH_M,
-    Floats,
-    amplitude_db,
-    divided_history,
-    find_peaks,
-    phase_history,
-    range_tables,
-)
+from apertura.study.paper_scene import RX_AHEAD_M, Complexes, Disturbance, PaperScene, receive_pair, reduced_scene
+from apertura.study.point_response import REACH_M, Floats, find_peaks, range_tables, undisturbed_tables
 
 DESTROYED_DB = -12.0
 """Beyond it there is no peak to measure: the largest speckle near the target is reported."""
@@ -46,10 +31,10 @@ class UncorrectedError:
         Size, in `unit` → mean peak loss of an independent model, dB.
     disturbance
         Size → what goes wrong.
-    scene
-        Number of pulses → the scene.
     pulses
         That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
+    subcarriers, rx_ahead_m, qpsk
+        As in `reduced_scene`.
     draws
         Over which the loss is averaged; 1 where nothing is random.
     within_db
@@ -66,21 +51,19 @@ class UncorrectedError:
     unit: str
     independent_model_db: Mapping[float, float]
     disturbance: Callable[[float], Disturbance]
-    scene: Callable[[int], PaperScene]
     pulses: int
+    subcarriers: int = 128
+    rx_ahead_m: float = 0.0
+    qpsk: bool = False
     draws: int = 1
     within_db: float = 0.5
     divided: bool = False
     reach_m: tuple[float, float] = REACH_M
     note: str = ""
 
-
-def _few_subcarriers(pulses: int) -> PaperScene:
-    return reduced_scene(pulses=pulses, subcarriers=128)
-
-
-def _all_subcarriers(pulses: int) -> PaperScene:
-    return reduced_scene(pulses=pulses, subcarriers=4096, qpsk=True)
+    def scene(self, pulses: int) -> PaperScene:
+        """Return the scene with so many pulses."""
+        return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=self.qpsk)
 
 
 def _sfo(khz: float) -> Disturbance:
@@ -97,54 +80,29 @@ def _localization(centimetres: float) -> Disturbance:
 
 ERRORS: Mapping[str, UncorrectedError] = {
     "carrier_phase": UncorrectedError(
-        "Carrier phase per pulse, uniform ±",
-        "π rad",
-        {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0},
-        lambda size: Disturbance(Impairments(carrier_phase=UniformPhase(size * np.pi))),
-        _few_subcarriers,
-        3000,
-        draws=4,
+        "Carrier phase per pulse, uniform ±", "π rad", {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0},
+        lambda size: Disturbance(Impairments(carrier_phase=UniformPhase(size * np.pi))), pulses=3000, draws=4,
     ),
     "timing": UncorrectedError(
-        "Timing offset per pulse, uniform ±",
-        "ns",
-        {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0},
-        lambda size: Disturbance(Impairments(timing=Timing(half_width_s=1e-9 * size))),
-        _few_subcarriers,
-        3000,
-        draws=4,
+        "Timing offset per pulse, uniform ±", "ns", {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0},
+        lambda size: Disturbance(Impairments(timing=Timing(half_width_s=1e-9 * size))), pulses=3000, draws=4,
     ),
     "cfo": UncorrectedError(
-        "Carrier frequency offset",
-        "kHz",
-        {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5},
+        "Carrier frequency offset", "kHz", {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5},
         lambda size: Disturbance(Impairments(clock=Clock(cfo_hz=1e3 * size)), sampled=True),
-        _all_subcarriers,
-        150,
+        pulses=150, subcarriers=4096, qpsk=True,
         note="random QPSK code; a quadratic-phase code loses half as much, in dB, and shifts the targets",
     ),
     "sfo": UncorrectedError(
-        "Sampling frequency offset",
-        "kHz",
-        {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
-        _sfo,
-        _all_subcarriers,
-        150,
-        reach_m=(0.16, 1.5),
+        "Sampling frequency offset", "kHz", {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
+        _sfo, pulses=150, subcarriers=4096, qpsk=True, reach_m=(0.16, 1.5),
         note="time error counted from the DFT window; counted from the prefix a third more is lost, by defocusing",
     ),
     "localization": UncorrectedError(
-        "Localization error, σ per axis after 1 s, bistatic",
-        "cm",
-        {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
-        _localization,
-        lambda pulses: reduced_scene(pulses=pulses, subcarriers=128, rx_ahead_m=RX_AHEAD_M),
-        600,
-        draws=40,
-        within_db=1.0,
-        divided=True,
+        "Localization error, σ per axis after 1 s, bistatic", "cm", {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
+        _localization, pulses=600, rx_ahead_m=RX_AHEAD_M, draws=40, within_db=1.0, divided=True,
     ),
-}
+}  # fmt: skip
 
 
 def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[Claim]:
@@ -175,12 +133,14 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
     radar, sidelink, _ = receive_pair(scene, error.disturbance(size), generator)
     history = history_of(scene, radar, sidelink, divided=error.divided)
     _, peaks = find_peaks(range_tables(history, targets), targets, reach_m=error.reach_m)
-    return amplitude_db(peaks / _undisturbed_peaks(error))
+    return point_response.amplitude_db(peaks / _undisturbed_peaks(error))
 
 
 def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> Spectra:
     """Return what is focused: the radar alone, or divided by the sidelink."""
-    return divided_history(scene, divide(radar, sidelink)) if divided else phase_history(scene, radar)
+    if divided:
+        return point_response.divided_history(scene, divide(radar, sidelink))
+    return point_response.phase_history(scene, radar)
 
 
 @lru_cache(maxsize=2)
@@ -190,9 +150,7 @@ def _scene(error: UncorrectedError) -> PaperScene:
 
 @lru_cache(maxsize=2)
 def _undisturbed_peaks(error: UncorrectedError) -> Floats:
-    scene = _scene(error)
-    targets = scene.scatterers.position_m
-    return find_peaks(range_tables(phase_history(scene, receive_undisturbed(scene)), targets), targets)[1]
+    return find_peaks(undisturbed_tables(_scene(error)), _scene(error).scatterers.position_m)[1]
 
 
 def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Floats) -> Claim:

@@ -9,15 +9,8 @@ from apertura.simulation.recording import Geometry
 from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare
 from apertura.study.paper.formulas import HALF_POWER_OF_HANN, cross_range_resolution_m, ground_range_resolution_m
-from apertura.study.paper_scene import Complexes, PaperScene, receive_undisturbed, reduced_scene
-from apertura.study.point_response import (
-    Floats,
-    find_peaks,
-    half_power_widths,
-    mean_image,
-    phase_history,
-    range_tables,
-)
+from apertura.study.paper_scene import Complexes, PaperScene, reduced_scene
+from apertura.study.point_response import Floats, find_peaks, half_power_widths, mean_image, undisturbed_tables
 
 WITHIN = 0.05
 """Share by which widths may differ and still agree."""
@@ -47,7 +40,7 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
     """
     scene = reduced_scene(pulses=pulses, subcarriers=256)
     targets = scene.scatterers.position_m
-    tables = range_tables(phase_history(scene, receive_undisturbed(scene)), targets)
+    tables = undisturbed_tables(scene)
     peaks, _ = find_peaks(tables, targets)
     height_m, aperture_m = scene.geometry.radar_tx[0, 2], float(np.ptp(scene.geometry.radar_tx[:, 0]))
     middle_hz = float(scene.frequency_hz.mean())
@@ -92,17 +85,9 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     )
     middle_m = BISTATIC_MIDPOINT_M - SEPARATION_M / 2
     mono = _uav_widths_cm([_segment(scene, 0.0, UAV_APERTURE_M)])
-    fused = _uav_widths_cm(
-        [
-            _segment(scene, MONO_SEGMENT_M, SEGMENT_LENGTH_M),
-            _segment(scene, middle_m, SEGMENT_LENGTH_M, rx_ahead_m=SEPARATION_M),
-        ]
-    )
-    across, along, closed = (
-        "UAV flight: ground-range width",
-        "UAV flight: cross-range width",
-        f"{100 * closed_m:.1f} cm",
-    )
+    bistatic = _segment(scene, middle_m, SEGMENT_LENGTH_M, rx_ahead_m=SEPARATION_M)
+    fused = _uav_widths_cm([_segment(scene, MONO_SEGMENT_M, SEGMENT_LENGTH_M), bistatic])
+    across, along = "UAV flight: ground-range width", "UAV flight: cross-range width"
     check = "consistency check: recovered"
     return [
         compare(f"{across}, Hann, mono", mono[0], "cm", paper=57.6, within=WITHIN, note=closed),
@@ -128,13 +113,11 @@ def _segment(scene: PaperScene, middle_m: float, length_m: float, *, rx_ahead_m:
 def _uav_widths_cm(segments: list[PaperScene]) -> tuple[float, float]:
     """Return the widths across and along the track of the coherent sum of images of equal peaks."""
     images = [_normalised(segment) for segment in segments]
-    across_m, along_m = half_power_widths(
-        lambda pixels: np.asarray(sum(image(pixels) for image in images)), UAV_TARGET_M[0]
-    )
-    return 100 * across_m, 100 * along_m
+    width_m = half_power_widths(lambda pixels: np.asarray(sum(image(pixels) for image in images)), UAV_TARGET_M[0])
+    return 100 * width_m[0], 100 * width_m[1]
 
 
 def _normalised(scene: PaperScene) -> Callable[[Floats], Complexes]:
-    tables = range_tables(phase_history(scene, receive_undisturbed(scene), window="hann"), UAV_TARGET_M)
+    tables = undisturbed_tables(scene, window="hann")
     peak = np.abs(mean_image(tables, UAV_TARGET_M[None]))[0, 0]
     return lambda pixels: np.asarray(mean_image(tables, pixels) / peak)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apertura.study.stability.outcomes import Outcome, crossing
+from apertura.study.point_response import Floats
+from apertura.study.stability.outcomes import Outcome
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 from apertura.study.tables import read_table, write_table
 
@@ -125,3 +126,35 @@ def _method_row(outcomes: Sequence[Outcome]) -> dict[str, object]:
         **{f"floor_db_at_{snr:g}_db": floors[snr] for snr in (10.0, 0.0, -10.0, -20.0)},
         "independent_model": EXPECTED[tolerance.method],
     }
+
+
+def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: bool) -> float:
+    """Return the size at which the loss first passes a level, interpolated; NaN if it never does.
+
+    Parameters
+    ----------
+    sizes
+        (size,) float64 from negligible to destructive, rising or falling.
+    losses_db
+        (size,) float64.
+    level_db
+        What is passed.
+    logarithmic
+        Interpolate in the logarithm of the size.
+
+    Examples
+    --------
+    >>> crossing(np.array([1.0, 10.0, 100.0]), np.array([0.0, 0.5, 1.5]), 1.0, logarithmic=True)
+    31.6...
+    >>> crossing(np.array([30.0, 0.0]), np.array([0.1, 0.2]), 1.0, logarithmic=False)
+    nan
+    """
+    above = np.flatnonzero(losses_db >= level_db)
+    if not above.size:
+        return float("nan")
+    i = int(above[0])
+    if i == 0:
+        return float(sizes[0])
+    between = np.log(sizes[i - 1 : i + 1]) if logarithmic else sizes[i - 1 : i + 1]
+    at = np.interp(level_db, losses_db[i - 1 : i + 1], between)
+    return float(np.exp(at) if logarithmic else at)
