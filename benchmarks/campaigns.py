@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.focus.inputs import Profiles, Spectra
-from apertura.load.pair import Outlook
-from apertura.planning.plan import Job
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.job import Job
+from apertura.geometry.aperture import Aperture
+from apertura.load.pair import OpenPair
 from apertura.scene.auto_grid import swath
 from apertura.scene.grid import SceneGrid
 from apertura.steps.plan import job_of
@@ -22,7 +23,7 @@ class Drawn:
     """A campaign: what was recorded, where it is imaged, how exact that has to be."""
 
     name: str
-    spectra: Spectra
+    history: PhaseHistory
     profiles: Profiles
     grid: SceneGrid
     job: Job
@@ -44,14 +45,12 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
         generator, grid, range_m, wavelength, pulses=pulses, step_m=between(wavelength / 60, range_m / pulses)
     )
     window = str(generator.choice(["hann", "none"]))
-    spectra = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
+    history = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
     accuracy = float(generator.choice([-50.0, -60.0, -70.0, -80.0]))
-    profiles = compressed(spectra, grid, window)
-    outlook = Outlook(tx, rx, spectra.frequency_hz, spectra.weight, np.inf, spectra)
+    profiles = compressed(history, grid, window)
+    pair = OpenPair(history.aperture, history.frequency_hz, history.weight, np.inf, history)
     name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
-    return Drawn(
-        name, spectra, profiles, grid, job_of(outlook, grid, Heights((), None), tile_px=256, threads=1), accuracy
-    )
+    return Drawn(name, history, profiles, grid, job_of(pair, grid, Heights((), None), tile_px=256, threads=1), accuracy)
 
 
 def _fly(
@@ -91,7 +90,7 @@ def _record(
     carrier_hz: float,
     bandwidth_hz: float,
     window: str,
-) -> Spectra:
+) -> PhaseHistory:
     near, far = swath(grid, tx, rx)
     cells = (far - near).max() * bandwidth_hz / C + 2 * GUARD_SAMPLES / OVERSAMPLING
     count = int(np.ceil(1.2 * cells)) + 16
@@ -108,24 +107,24 @@ def _record(
     noise = 10 ** (generator.uniform(-60, 10) / 20)
     transfer += noise * (generator.standard_normal(transfer.shape) + 1j * generator.standard_normal(transfer.shape))
     weights = window_weights(window, count)
-    return Spectra(transfer.astype(np.complex64), frequency, weights, reference, tx, rx)
+    return PhaseHistory(transfer.astype(np.complex64), frequency, weights, reference, Aperture(tx, rx))
 
 
-def compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
+def compressed(history: PhaseHistory, grid: SceneGrid, window: str) -> Profiles:
     """Return the range profiles of an echo, as the profile step makes them."""
-    near, far = swath(grid, spectra.tx_position_m, spectra.rx_position_m)
-    frequency = spectra.frequency_hz
+    near, far = swath(grid, *history.aperture.legs)
+    frequency = history.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
     start = near - GUARD_SAMPLES * step
     count = int(np.ceil((far - near).max() / step)) + 2 * GUARD_SAMPLES + 1
     samples = compress(
-        spectra.transfer,
+        history.transfer,
         frequency,
         weight=window_weights(window, len(frequency)),
-        reference_delay_s=spectra.reference_delay_s,
+        reference_delay_s=history.reference_delay_s,
         start_m=start,
         count=count,
         oversampling=OVERSAMPLING,
     )
     centre, oversampling = centre_frequency(frequency), length / len(frequency)
-    return Profiles(samples, start, step, centre, oversampling, spectra.tx_position_m, spectra.rx_position_m)
+    return Profiles(samples, start, step, centre, oversampling, history.aperture)

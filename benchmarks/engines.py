@@ -164,7 +164,7 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
 def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return antennas from the scene's middle, their mean distance to it, and the middle."""
     middle = job.pixels.mean((0, 1))
-    tx, rx = job.profiles.tx_position_m - middle, job.profiles.rx_position_m - middle
+    tx, rx = (leg - middle for leg in job.profiles.aperture.legs)
     return tx, rx, (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2, middle
 
 

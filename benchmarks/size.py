@@ -23,9 +23,10 @@ import zarr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import native
-from apertura.focus.engines.tables import Tables
+from apertura.focus.engines.native_tables import Tables
 from apertura.focus.inputs import Profiles
 from apertura.focus.tiles import Former, form_blocks
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import ecef_from_projected
 from apertura.scene.grid import SceneGrid
 
@@ -48,7 +49,7 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
     samples = np.empty(shape, np.complex64)
     for part in np.array_split(samples, 32):
         part.real, part.imag = generator.standard_normal((2, *part.shape), np.float32)
-    return Profiles(samples, np.full(pulses, nearest), step_m, CENTRE_HZ, 2.0, tx, rx)
+    return Profiles(samples, np.full(pulses, nearest), step_m, CENTRE_HZ, 2.0, Aperture(tx, rx))
 
 
 def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
@@ -67,7 +68,7 @@ def image_seconds(history: Profiles, grid: SceneGrid, *, blocks: int, threads: i
 
     def former(part: slice) -> Former:
         nonlocal alone, paused
-        tables = native.prepare(history.of_pulses(part))
+        tables = native.prepare(history[part])
         begin = time.perf_counter()
         alone += kernel_seconds(tables, grid, threads)
         paused += time.perf_counter() - begin

@@ -7,9 +7,10 @@ from pyproj import Geod, Transformer
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.focus.engines import ENGINES, reference
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.engines import ENGINES, load_engine, reference
+from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.tiles import form_tiles
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import ecef_from_projected, projected_from_ecef
 from apertura.quality.error_check import Certificate, certified_pixels
 from apertura.quality.measures import coherence_factor, numerical_error, survey
@@ -20,7 +21,7 @@ from apertura.scene.pixel_positions import block
 
 FREQUENCY = 1.2e9 + 1.6e6 * np.arange(256)
 GRID = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80), 0.0)
-TABLE_ENGINES = [name for name, engine in ENGINES.items() if engine.reads == "profile" and engine.available()]
+TABLE_ENGINES = [name for name in ENGINES if load_engine(name).READS == "profiles" and load_engine(name).available()]
 
 
 def history(targets, *, tx=None, rx=None, window="hann"):
@@ -32,17 +33,17 @@ def history(targets, *, tx=None, rx=None, window="hann"):
         path = np.linalg.norm(tx - target, axis=1) + np.linalg.norm(rx - target, axis=1)
         transfer += np.exp(-2j * np.pi * FREQUENCY * path[:, None] / SPEED_OF_LIGHT_M_S)
     weight, zeros = window_weights(window, len(FREQUENCY)), np.zeros(len(tx))
-    spectra = Spectra(transfer.astype(np.complex64), FREQUENCY, weight, zeros, tx, rx)
+    spectra = PhaseHistory(transfer.astype(np.complex64), FREQUENCY, weight, zeros, Aperture(tx, rx))
     step, _ = range_step(FREQUENCY, oversampling=2)
     near, far = swath(GRID, tx, rx)
     start = near - 32 * step
     count = int((far - near).max() / step) + 66
     samples = compress(spectra.transfer, FREQUENCY, weight=weight, reference_delay_s=zeros, start_m=start, count=count)
-    return spectra, Profiles(samples, start, step, FREQUENCY[128], 2.0, tx, rx)
+    return spectra, Profiles(samples, start, step, FREQUENCY[128], 2.0, Aperture(tx, rx))
 
 
 def formed(name, profiles, grid=GRID):
-    engine = ENGINES[name]
+    engine = load_engine(name)
     return engine.form(engine.prepare(profiles), grid.positions())
 
 
@@ -87,7 +88,7 @@ def test_a_pair_of_coincident_platforms_is_monostatic(name):
 @pytest.mark.parametrize("name", TABLE_ENGINES)
 def test_tiles_change_nothing_to_the_bit(name):
     _, profiles = history((0.33, 10.07, 0.0))
-    engine = ENGINES[name]
+    engine = load_engine(name)
     tables, tiled = engine.prepare(profiles), np.zeros(GRID.shape, np.complex64)
     form_tiles(lambda pixels: engine.form(tables, pixels), GRID, GRID.tiles(32), write=tiled.__setitem__, threads=2)
     np.testing.assert_array_equal(tiled, formed(name, profiles))

@@ -12,7 +12,8 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.export import layers as exported
 from apertura.focus.engines import reference
-from apertura.focus.inputs import Spectra
+from apertura.focus.inputs import PhaseHistory
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.quality.point_targets import find_peak, ground_position
 from apertura.scene import geoid, sightlines
@@ -214,7 +215,7 @@ def history(track, targets):
     path = 2 * np.linalg.norm(track[:, None] - np.atleast_2d(targets), axis=-1)
     echo = np.exp(-2j * np.pi * FREQUENCY[None, None] * path[..., None] / SPEED_OF_LIGHT_M_S).sum(axis=1)
     zeros = np.zeros(len(track))
-    return Spectra(echo.astype(np.complex64), FREQUENCY, np.hanning(100) / 50, zeros, track, track)
+    return PhaseHistory(echo.astype(np.complex64), FREQUENCY, np.hanning(100) / 50, zeros, Aperture(track, track))
 
 
 def track_at(height, count=48):

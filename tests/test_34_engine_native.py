@@ -13,8 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import binding, native
+from apertura.focus.engines import native, native_binding
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -58,7 +59,7 @@ class Scene:
         at = start[:, None] + step_m * np.arange(length)
         turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
         samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
-        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, self.tx, self.rx)
+        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
 
     def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
         delay = self.path_m(places) / C
@@ -114,7 +115,7 @@ def decibels(difference: NDArray[np.complexfloating], truth: NDArray[np.complexf
 
 
 def _runs(name: str) -> bool:
-    return native.available() and binding._library().apertura_form(name.encode()) is not None
+    return native.available() and native_binding._library().apertura_form(name.encode()) is not None
 
 
 @pytest.fixture(params=native.INSTRUCTION_SETS)
@@ -303,7 +304,7 @@ def test_near_ranges_take_more_exact_paths(isa, range_m, way):
 
 def test_swapping_transmitter_and_receiver_gives_the_same_image(isa, plain):
     _, pixels, profiles = plain
-    swapped = replace(profiles, tx_position_m=profiles.rx_position_m, rx_position_m=profiles.tx_position_m)
+    swapped = replace(profiles, aperture=Aperture(*reversed(profiles.aperture.legs)))
     image, other = (native.form(native.prepare(p), ecef(pixels)) for p in (profiles, swapped))
     assert decibels(image - other, image) <= -100
 
@@ -315,9 +316,7 @@ def test_a_constant_height_equals_a_lowered_track(isa):
     lowered = [antenna - 1.5 * AXES[:, 2] for antenna in (scene.tx, scene.rx)]
     profiles = scene.profiles(ecef(raised))
     image = native.form(native.prepare(profiles), ecef(raised))
-    other = native.form(
-        native.prepare(replace(profiles, tx_position_m=lowered[0], rx_position_m=lowered[1])), ecef(pixels)
-    )
+    other = native.form(native.prepare(replace(profiles, aperture=Aperture(*lowered))), ecef(pixels))
     assert decibels(image - other, image) <= -70
 
 
@@ -338,7 +337,7 @@ def test_a_raised_target_focuses_where_geometry_predicts(isa):
 def test_blocks_of_pulses_add_up(isa, plain):
     _, pixels, profiles = plain
     whole = native.form(native.prepare(profiles), ecef(pixels))
-    blocks = (profiles.of_pulses(slice(0, 33)), profiles.of_pulses(slice(33, None)))
+    blocks = (profiles[slice(0, 33)], profiles[slice(33, None)])
     parts = [native.form(native.prepare(block), ecef(pixels)) for block in blocks]
     assert decibels(sum(parts) - whole, whole) <= -110
 
@@ -395,7 +394,7 @@ def test_bad_input_is_refused(plain):
     with pytest.raises(ValueError, match="degree=3"):
         native.prepare(profiles, degree=3)
     with pytest.raises(ValueError, match="holds no pulse"):
-        native.prepare(profiles.of_pulses(slice(0, 0)))
+        native.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
     with pytest.raises(ValueError, match="oversampling"):
@@ -407,14 +406,14 @@ def test_bad_input_is_refused(plain):
 
 
 def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setattr(binding, "_library_path", lambda: None)
-    binding._library.cache_clear()
+    monkeypatch.setattr(native_binding, "_library_path", lambda: None)
+    native_binding._library.cache_clear()
     try:
         assert not native.available()
         with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
             native.instruction_set()
     finally:
-        binding._library.cache_clear()
+        native_binding._library.cache_clear()
 
 
 def test_no_environment_variable_means_the_best(monkeypatch):

@@ -11,8 +11,9 @@ from conftest import run_steps
 from apertura.campaign import Campaign
 from apertura.echo.compression import compress, range_step, window_weights
 from apertura.echo.sidelink import METHODS
-from apertura.focus.engines import ENGINES, reference
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.engines import load_engine, reference
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.geometry.aperture import Aperture
 from apertura.quality.measures import numerical_error
 from apertura.quality.point_targets import Patch, find_peak, ground_position
 from apertura.steps import echo
@@ -86,9 +87,9 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
             range_step(frequency, oversampling=2)[0],
             frequency[512],
             2.0,
-            *places,
+            Aperture(*places),
         )
-        engine = ENGINES["numba"]
+        engine = load_engine("numba")
         peaks.append(np.abs(engine.form(engine.prepare(profiles), grid.positions())).max())
     assert 20 * np.log10(peaks[0] / peaks[1]) > 15
 
@@ -125,12 +126,14 @@ def test_the_table_engine_meets_its_error(finished_sample, window, pair):
     frequency, weight = dataset.frequency.values, window_weights(window, 1024)
     places = dataset.tx_position.values, dataset.rx_position.values
     zeros = np.zeros(len(places[0]))
-    spectra = Spectra(dataset.transfer.values, frequency, weight, zeros, *places)
+    spectra = PhaseHistory(dataset.transfer.values, frequency, weight, zeros, Aperture(*places))
     start = np.full(len(zeros), 5.0)
     samples = compress(spectra.transfer, frequency, weight=weight, reference_delay_s=zeros, start_m=start, count=500)
-    profiles = Profiles(samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, *places)
+    profiles = Profiles(
+        samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, Aperture(*places)
+    )
     pixels = grid.positions_at(*random_pixels(grid.shape, 256, seed=3))
-    engine = ENGINES["numba"]
+    engine = load_engine("numba")
     computed = engine.form(engine.prepare(profiles), pixels[None])[0]
     assert numerical_error(computed, reference.form(spectra, pixels)).rms_db < -50
 
@@ -142,7 +145,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     dataset = open_stage(finished_tiny.stage("echo", *pair), "echo")
     formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
     frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
-    spectra = Spectra(
+    spectra = PhaseHistory(
         dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), *places
     )
     rows, columns = random_pixels(formed.shape, 200, seed=99)

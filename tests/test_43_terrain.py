@@ -14,12 +14,12 @@ from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.focus.engines import ENGINES
+from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.load import pair as outlook
 from apertura.load.ground import Ground, on_the_ground
-from apertura.load.inputs import profiles_of, spectra_of
-from apertura.load.pair import outlook_of
+from apertura.load.inputs import phase_history_of, profiles_of
+from apertura.load.pair import open_pair
 from apertura.scene.grid import SceneGrid
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.plan import grid_around
@@ -162,22 +162,22 @@ def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
     if not made:
         (root / "results" / "terrain.manifest.json").unlink()
     campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
-    seen, profiles = outlook_of(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
+    seen, profiles = open_pair(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
     grid = scene_grid(campaign)
     heights = expected_heights(campaign, grid)
     assert job_of(seen, grid, heights, tile_px=256, threads=1).signal.samples == profiles.sizes["range"]
     assert job_of(seen, grid, Heights((), None), tile_px=256, threads=1).signal.samples != profiles.sizes["range"]
     plan = plan_pair(campaign, *pair)
-    tables = ENGINES[plan.engine].prepare(plan.history(profiles_of(profiles)), **plan.options)
+    tables = load_engine(plan.engine).prepare(plan.inputs(profiles_of(profiles)), **plan.setting.options)
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
 
 
 def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
     echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
-    held = spectra_of(echo, "hann").transfer
+    held = phase_history_of(echo, "hann").transfer
     monkeypatch.setattr(outlook, "open_stage", None)
-    found = outlook.outlook_of(hillside, "f01", "uav1-uav2", echo=echo)
-    assert np.shares_memory(found.spectra.transfer, held)
+    found = outlook.open_pair(hillside, "f01", "uav1-uav2", echo=echo)
+    assert np.shares_memory(found.history.transfer, held)
     plan_known(hillside, "f01", "uav1-uav2", found, scene_grid(hillside), terrain.open_heights(hillside))
 
 
@@ -234,7 +234,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
     write_plane(tiny, keep=slice(16, 25))
     for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
         campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
-        seen = outlook_of(campaign, *PAIR)
+        seen = open_pair(campaign, *PAIR)
         grid = outlook.campaign_grid(campaign, seen)
         assert grid.height_m == pytest.approx(620.0, abs=0.1)
         assert not np.isfinite(
@@ -248,7 +248,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
 
 def under(grid, seen):
     """A pixel below the middle of the track."""
-    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate([seen.tx, seen.rx]), axis=0))
+    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate([seen.aperture.tx_m, seen.aperture.rx_m]), axis=0))
     return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1), 0.0)
 
 

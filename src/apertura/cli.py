@@ -86,18 +86,6 @@ def chart(
     raise SystemExit(status)
 
 
-@app.command("calibrate-cost")
-def calibrate_cost() -> None:
-    """Measure what imaging costs on this machine, for the planner; takes less than a minute."""
-    from apertura.planning.calibration import measure_costs
-    from apertura.planning.machine import write_costs
-
-    costs = measure_costs()
-    for name, seconds in sorted(costs.seconds.items()):
-        print(f"{name:<24}{1e9 * seconds:>12.3g} ns")
-    print(write_costs(costs), "(a campaign that ran keeps its own: delete its results/costs.json to plan anew)")
-
-
 @app.command()
 def verify(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
@@ -173,14 +161,6 @@ def scene(campaign: Directory = HERE) -> None:
     from apertura.steps import scene as steps
 
     print(steps.scene(Campaign.load(campaign)))
-
-
-@step.command()
-def costs(campaign: Directory = HERE) -> None:
-    """Keep what imaging costs on this machine as the campaign's, costs.json."""
-    from apertura.steps import costs as steps
-
-    print(steps.costs(Campaign.load(campaign)))
 
 
 @step.command()

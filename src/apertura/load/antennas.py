@@ -12,6 +12,7 @@ from apertura.antenna.illumination import Illumination, illuminate
 from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, read_pattern
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
 from apertura.scene.grid import SceneGrid
 from apertura.settings import Antenna
 
@@ -66,7 +67,7 @@ def lit(
     pair: str,
     beams: Beams | None,
     grid: SceneGrid,
-    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    aperture: Aperture,
 ) -> dict[str, Any]:
     """Return beams and illumination as the planner's job takes them, nothing without beams.
 
@@ -78,8 +79,8 @@ def lit(
         Of the pair.
     grid
         The campaign's.
-    places
-        Phase centres of transmitter and receiver, (pulse, 3) float64 metres.
+    aperture
+        Of the pair.
 
     Raises
     ------
@@ -90,9 +91,9 @@ def lit(
         return {}
     rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
     net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij"))
-    illumination = illuminate(beams, *places, net.reshape(-1, 3))
+    illumination = illuminate(beams, aperture, net.reshape(-1, 3))
     if illumination.unseen == 1:
-        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], places)
+        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], aperture)
     return {"beams": beams, "illumination": illumination}
 
 
@@ -101,12 +102,12 @@ def _refuse(
     pair: str,
     beams: Beams,
     middle_m: NDArray[np.float64],
-    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    aperture: Aperture,
 ) -> None:
     """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
     stated = campaign.antennas(pair)
     keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
-    legs = {"radar_tx": (beams.transmit, places[0]), "radar_rx": (beams.receive, places[1])}
+    legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
     for point, (node, _) in stated.items():
         beam, place = legs[point]
         if beam is None:

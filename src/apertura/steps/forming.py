@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.contracts import Window
-from apertura.focus.engines import ENGINES
+from apertura.focus.engines import load_engine
+from apertura.focus.engines.engine import Setting
 from apertura.focus.tiles import Former, form_blocks
 from apertura.load.inputs import profiles_of
-from apertura.load.pair import outlook_of
-from apertura.planning.candidates import Setting
+from apertura.load.pair import open_pair
 from apertura.planning.plan import Plan
 from apertura.provenance import sha256_file
 from apertura.scene.grid import LOCAL, SceneGrid
@@ -37,7 +37,7 @@ class Work:
     echo
         The stage that image.json quotes.
     history
-        'echo' → `Spectra`, 'profile' → `Profiles`.
+        'phase_history' → `PhaseHistory`, 'profiles' → `Profiles`.
     beams
         Of the antennas; None where they look everywhere alike.
     grid, heights
@@ -67,13 +67,13 @@ class Work:
     def of(cls, campaign: Campaign, flight: str, pair: str, *, module: str, threads: int) -> "Work":
         """Open what a pair's image is made from, and plan it; `module` as `apertura.steps.stamping.stamped`."""
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-        grid, heights, outlook = (
+        grid, heights, opened = (
             scene_grid(campaign),
             open_heights(campaign),
-            outlook_of(campaign, flight, pair, echo=echo),
+            open_pair(campaign, flight, pair, echo=echo),
         )
-        history = {"echo": outlook.spectra, "profile": profiles_of(profile)}
-        plan = plan_known(campaign, flight, pair, outlook, grid, heights, threads=threads)
+        history = {"phase_history": opened.history, "profiles": profiles_of(profile)}
+        plan = plan_known(campaign, flight, pair, opened, grid, heights, threads=threads)
         heights = planned_heights(plan, heights, grid)
         # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
         choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
@@ -86,7 +86,7 @@ class Work:
             settings={**campaign.relevant("image", pair), "grid": grid_spec(grid), "plan": choices},
         )
         folder, windows = campaign.stage("image", flight, pair), list(grid.tiles(campaign.settings.processing.tile_px))
-        return cls(folder, echo, history, outlook.beams, grid, heights, plan, empty, windows, threads)
+        return cls(folder, echo, history, opened.beams, grid, heights, plan, empty, windows, threads)
 
     def form(self, target: Any, setting: Setting, windows: list[Window], *, planned: bool = False) -> None:
         """Form and write tiles with an engine; the image is the mean over the pulses.
@@ -104,20 +104,20 @@ class Work:
         """
         if not windows:
             return
-        engine = ENGINES[setting.engine]
-        history = self.history[engine.reads]
-        if planned and engine.reads == "profile":
-            history = self.plan.history(history)
-        count = np.float32(len(self.history["echo"].transfer))
+        engine = load_engine(setting.engine)
+        history = self.history[engine.READS]
+        if planned and engine.READS == "profiles":
+            history = self.plan.inputs(history)
+        count = np.float32(len(self.history["phase_history"]))
 
         def former(pulses: slice) -> Former:
-            prepared = engine.prepare(history.of_pulses(pulses), **setting.options)
-            options = {"beams": self.beams and self.beams.at(pulses), **setting.form_options}
+            prepared = engine.prepare(history[pulses], **setting.options)
+            options = {"beams": self.beams and self.beams[pulses], **setting.form_options}
             return lambda pixels: np.asarray(engine.form(prepared, pixels, **options) / count, np.complex64)
 
         form_blocks(
             former,
-            len(history.tx_position_m),
+            len(history),
             self.grid,
             windows,
             blocks=setting.pulse_blocks,

@@ -28,7 +28,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "engine": plan.engine,
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
-            **certified(work, target, plan.better, campaign.settings.processing.accuracy_db),
+            **certified(work, target, plan.fallbacks, campaign.settings.processing.accuracy_db),
             **measures(work, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.heights.report,

@@ -7,40 +7,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.filesize import decimal
 from rich.table import Table
 
-from apertura.campaign import Campaign
+from apertura.campaign import CONFIG, Campaign
 from apertura.contracts import Window
 from apertura.echo.compression import centre_frequency, range_step
 from apertura.errors import CampaignError
 from apertura.focus.engines import reference
-from apertura.focus.inputs import Spectra
+from apertura.focus.inputs import PhaseHistory
+from apertura.focus.job import Job, Signal
 from apertura.load.antennas import lit
 from apertura.load.ground import Ground
-from apertura.load.pair import Outlook, campaign_grid, outlook_of
-from apertura.planning.candidates import Signal
-from apertura.planning.memory import memory_limit, size_text
-from apertura.planning.plan import Job, Plan
+from apertura.load.pair import OpenPair, campaign_grid, open_pair
+from apertura.planning.memory import memory_limit
+from apertura.planning.plan import Plan
 from apertura.planning.planner import make_plan
 from apertura.quality.measures import content_loss_db
 from apertura.scene.auto_grid import swath
 from apertura.scene.grid import LOCAL, SceneGrid
-from apertura.steps.costs import campaign_costs
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING, check_clearance
 from apertura.steps.terrain import Heights, expected_heights
 from apertura.store import manifest_of
 
-OVERRIDES = (
-    "engine",
-    "table_degree",
-    "table_oversampling",
-    "phase_tolerance_rad",
-    "accumulate",
-    "pulse_thinning",
-    "pulse_blocks",
-    "midpoint",
-    "terrain",
-)
+OVERRIDES = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
 _NET = 9
 _BLOCKS = 33
 _CONTENT_PIXELS = 128
@@ -51,16 +41,16 @@ def plan_pair(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -
 
     Parameters and errors as `plan_known`.
     """
-    outlook = outlook_of(campaign, flight, pair)
-    grid = campaign_grid(campaign, outlook)
-    return plan_known(campaign, flight, pair, outlook, grid, expected_heights(campaign, grid), threads=threads)
+    opened = open_pair(campaign, flight, pair)
+    grid = campaign_grid(campaign, opened)
+    return plan_known(campaign, flight, pair, opened, grid, expected_heights(campaign, grid), threads=threads)
 
 
 def plan_known(
     campaign: Campaign,
     flight: str,
     pair: str,
-    outlook: Outlook,
+    opened: OpenPair,
     grid: SceneGrid,
     heights: Heights,
     *,
@@ -72,7 +62,7 @@ def plan_known(
     ----------
     campaign, flight, pair
         Which.
-    outlook, grid, heights
+    opened, grid, heights
         Its echo or what the logs promise, the campaign's grid and the ground.
     threads
         Tiles formed at once: for seconds and bytes; nothing is chosen by it.
@@ -82,8 +72,8 @@ def plan_known(
     CampaignError
         If the job cannot fit in memory or on the disk, or its geometry is impossible.
     """
-    check_clearance(grid, outlook.tx, outlook.rx, heights=heights, where=f"flight {flight}, pair {pair}")
-    plan = plan_job(campaign, campaign_job(campaign, pair, outlook, grid, heights, threads=threads))
+    check_clearance(grid, *opened.aperture.legs, heights=heights, where=f"flight {flight}, pair {pair}")
+    plan = plan_job(campaign, campaign_job(campaign, pair, opened, grid, heights, threads=threads))
     written = manifest_of(campaign.stage("image", flight, pair)).is_file()
     check_fits(plan, free_disk=None if written else shutil.disk_usage(campaign.root).free, where=f"{flight}/{pair}")
     return plan
@@ -93,54 +83,54 @@ def plan_job(campaign: Campaign, job: Job) -> Plan:
     """Return how a job will be done at the accuracy, with the overrides and the costs of a campaign."""
     processing = campaign.settings.processing
     overrides = {name: getattr(processing, name) for name in OVERRIDES}
-    return make_plan(job, accuracy_db=processing.accuracy_db, costs=campaign_costs(campaign), overrides=overrides)
+    return make_plan(job, accuracy_db=processing.accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
 
 
 def campaign_job(
-    campaign: Campaign, pair: str, outlook: Outlook, grid: SceneGrid, heights: Heights, *, threads: int = 1
+    campaign: Campaign, pair: str, opened: OpenPair, grid: SceneGrid, heights: Heights, *, threads: int = 1
 ) -> Job:
     """Return the planner's job of a pair, or of a part of its pulses, with the campaign's DEM, antennas and memory."""
     return replace(
-        job_of(outlook, grid, heights, tile_px=campaign.settings.processing.tile_px, threads=threads),
+        job_of(opened, grid, heights, tile_px=campaign.settings.processing.tile_px, threads=threads),
         memory_bytes=memory_limit(),
         **_relief(campaign, grid),
-        **lit(campaign, pair, outlook.beams, grid, (outlook.tx, outlook.rx)),
+        **lit(campaign, pair, opened.beams, grid, opened.aperture),
     )
 
 
-def job_of(outlook: Outlook, grid: SceneGrid, heights: Heights, *, tile_px: int, threads: int) -> Job:
+def job_of(opened: OpenPair, grid: SceneGrid, heights: Heights, *, tile_px: int, threads: int) -> Job:
     """Return the planner's job of what is known of a pair, on a grid and its ground."""
     rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
-    frequency = outlook.frequency_hz
+    frequency = opened.frequency_hz
     step, length = range_step(frequency, oversampling=OVERSAMPLING)
-    nearest, farthest = swath(grid, outlook.tx, outlook.rx, heights=heights.of)
+    nearest, farthest = swath(grid, *opened.aperture.legs, heights=heights.of)
     centre, count = centre_frequency(frequency), len(frequency)
     samples = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
     return Job(
-        tx_position_m=outlook.tx,
-        rx_position_m=outlook.rx,
-        net_m=grid.positions_at(*np.meshgrid(rows, columns, indexing="ij")),
+        aperture=opened.aperture,
+        ground_m=grid.positions_at(*np.meshgrid(rows, columns, indexing="ij")),
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
         bandwidth_hz=float(frequency[-1] - frequency[0]) * count / (count - 1),
         subcarriers=count,
-        signal=Signal(centre, length / count, step, samples, outlook.weight),
+        signal=Signal(centre, length / count, step, samples, opened.weight),
         frame="local" if grid.crs == LOCAL else "ecef",
         tile_px=tile_px,
         threads=threads,
-        path_limit_m=outlook.path_limit_m,
-        content_db=None if outlook.spectra is None else _content_db(outlook, outlook.spectra, grid, heights),
+        path_limit_m=opened.path_limit_m,
+        content_db=None if opened.history is None else _content_db(opened, opened.history, grid, heights),
     )
 
 
-def _content_db(outlook: Outlook, spectra: Spectra, grid: SceneGrid, heights: Heights) -> float:
+def _content_db(opened: OpenPair, history: PhaseHistory, grid: SceneGrid, heights: Heights) -> float:
     """Return how much errors weigh at some random pixels of the scene."""
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
     places = grid.positions_at(rows, columns, heights.at(rows, columns))
-    parts = [slice(first, first + 64) for first in range(0, len(spectra.transfer), 64)]
+    parts = [slice(first, first + 64) for first in range(0, len(history), 64)]
+    beams = opened.beams
     return content_loss_db(
-        np.concatenate([reference.terms(spectra, places, outlook.beams, pulses=part) for part in parts])
+        np.concatenate([reference.terms(history[part], places, beams and beams[part]) for part in parts])
     )
 
 
@@ -200,16 +190,16 @@ def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | N
     memory = memory or memory_limit()
     if plan.memory_bytes > memory:
         raise CampaignError(
-            f"imaging needs {size_text(plan.memory_bytes)} of memory",
+            f"imaging needs {decimal(plan.memory_bytes)} of memory",
             where=where,
-            expected=f"at most the {size_text(memory)} that this machine, or the job's share of it, has",
+            expected=f"at most the {decimal(memory)} that this machine, or the job's share of it, has",
             remedy="Make scene.bounds_m smaller, use fewer threads, or ask for more memory.",
         )
     if free_disk is not None and plan.disk_bytes > free_disk:
         raise CampaignError(
-            f"the results need {size_text(plan.disk_bytes)} on disk",
+            f"the results need {decimal(plan.disk_bytes)} on disk",
             where=where,
-            expected=f"at most the {size_text(free_disk)} that are free",
+            expected=f"at most the {decimal(free_disk)} that are free",
             remedy="Free some space, make scene.bounds_m smaller or scene.spacing_m larger.",
         )
 
@@ -225,15 +215,13 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
-    console.print(
-        f"in all {seconds:.3g} s of imaging on {threads} threads, {size_text(disk)} on disk before compression"
-    )
+    console.print(f"in all {seconds:.3g} s of imaging on {threads} threads, {decimal(disk)} on disk before compression")
     free = shutil.disk_usage(campaign.root).free
     if disk > free and not campaign.results.is_dir():
         raise CampaignError(
-            f"the results of all pairs need {size_text(disk)} on disk",
+            f"the results of all pairs need {decimal(disk)} on disk",
             where=campaign.root,
-            expected=f"at most the {size_text(free)} that are free",
+            expected=f"at most the {decimal(free)} that are free",
             remedy="Free some space, or make the scene smaller.",
         )
 
@@ -246,7 +234,7 @@ def _table(plan: Plan, title: str, accuracy_db: float) -> Table:
         error = "" if decision.error_db is None else f"{decision.error_db:.1f} dB"
         table.add_row(decision.name, str(decision.value), decision.reason, error)
     table.add_section()
-    memory, disk = size_text(plan.memory_bytes), size_text(plan.disk_bytes)
-    line = f"{plan.predicted_seconds:.3g} s, {memory} of memory, {disk} on disk; costs {plan.cost_source}"
+    memory, disk = decimal(plan.memory_bytes), decimal(plan.disk_bytes)
+    line = f"{plan.predicted_seconds:.3g} s, {memory} of memory, {disk} on disk"
     table.add_row("predicted", f"{accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
     return table

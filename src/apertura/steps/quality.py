@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from apertura.focus.engines import reference
-from apertura.focus.inputs import Spectra
-from apertura.planning.candidates import Setting
+from apertura.focus.engines.engine import Setting
+from apertura.focus.inputs import PhaseHistory
 from apertura.quality.error_check import Certificate, certified_pixels
 from apertura.quality.measures import coherence_factor, survey
 from apertura.quality.point_targets import cut_through, find_peak, ground_position
@@ -31,9 +31,9 @@ def certified(work: Work, target: Any, better: tuple[Setting, ...], accuracy_db:
     accuracy_db
         Error asked.
     """
-    spectra, windows = work.history["echo"], work.windows
+    history, windows = work.history["phase_history"], work.windows
     pixels = certified_pixels(target, windows, CERTIFIED_PIXELS, np.random.default_rng(0))
-    exact = reference.form(spectra, work.places(*pixels.T), beams=work.beams) / len(spectra.transfer)
+    exact = reference.form(history, work.places(*pixels.T), beams=work.beams) / len(history)
     certificate = Certificate(pixels, exact, CERTIFIED_PIXELS)
     redone: list[dict[str, Any]] = []
     for choice in better:
@@ -43,7 +43,7 @@ def certified(work: Work, target: Any, better: tuple[Setting, ...], accuracy_db:
         print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {choice.line}", flush=True)
         work.form(target, choice, uncertified)
         work.form(target, choice, worse)  # last: while one fails, a run that was killed here does all of it again
-        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{choice.line}, every pulse, both legs"})
+        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{choice.line}, every pulse"})
     error = certificate.error(target)
     missed = error.rms_db > accuracy_db
     line = f"numerical error {error.rms_db:.1f} dB, {accuracy_db:.1f} dB asked"
@@ -62,9 +62,9 @@ def measures(work: Work, target: Any) -> dict[str, Any]:
     found, grid = survey(target, work.windows), work.grid
     peak = find_peak(target, found.row, found.column)
     x, y = ground_position(grid, peak)
-    spectra: Spectra = work.history["echo"]
-    terms = reference.terms(spectra, work.places(np.array([peak.row]), np.array([peak.column])), work.beams)
-    along = grid.direction(spectra.tx_position_m[-1] - spectra.tx_position_m[0], peak.row, peak.column)
+    history: PhaseHistory = work.history["phase_history"]
+    terms = reference.terms(history, work.places(np.array([peak.row]), np.array([peak.column])), work.beams)
+    along = grid.direction(history.aperture.tx_m[-1] - history.aperture.tx_m[0], peak.row, peak.column)
     cuts = {
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
         for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))

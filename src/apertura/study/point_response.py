@@ -10,7 +10,8 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.echo.demodulate import remove_path
 from apertura.focus.engines import numba, reference
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.geometry.aperture import Aperture
 from apertura.quality.measures import coherence_factor
 from apertura.quality.point_targets import half_power_width, locate_maximum
 from apertura.study.paper_scene import Complexes, PaperScene, receive_undisturbed
@@ -29,7 +30,7 @@ _REFINEMENTS = 4
 
 def phase_history(
     scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None, window: str = "none"
-) -> Spectra:
+) -> PhaseHistory:
     """Return transfer functions of total paths with the phase centres of the scene's logs.
 
     Parameters
@@ -46,11 +47,11 @@ def phase_history(
     kept = slice(None) if pulses is None else pulses
     frequency_hz, geometry = scene.frequency_hz, scene.geometry
     weight = window_weights(window, len(frequency_hz))
-    delay_s = np.zeros(len(transfer))
-    return Spectra(transfer, frequency_hz, weight, delay_s, geometry.radar_tx[kept], geometry.radar_rx[kept])
+    aperture = Aperture(geometry.radar_tx[kept], geometry.radar_rx[kept])
+    return PhaseHistory(transfer, frequency_hz, weight, np.zeros(len(transfer)), aperture)
 
 
-def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None) -> Spectra:
+def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None) -> PhaseHistory:
     """Return what a sidelink correction left, brought back to total paths by the logged length of the sidelink.
 
     Parameters
@@ -63,7 +64,7 @@ def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[n
     return phase_history(scene, remove_path(transfer, scene.frequency_hz, delay_s=delay_s), pulses=pulses)
 
 
-def range_tables(history: Spectra, targets_m: Floats) -> numba.Tables:
+def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:
     """Return range tables that cover some metres around every target, for `numba.form`.
 
     Parameters
@@ -73,8 +74,7 @@ def range_tables(history: Spectra, targets_m: Floats) -> numba.Tables:
     targets_m
         (target, 3) float64, in the frame of the phase centres.
     """
-    sides = (history.tx_position_m, history.rx_position_m)
-    path_m = np.asarray(sum(np.linalg.norm(side[:, None] - targets_m, axis=2) for side in sides))
+    path_m = history.aperture.path(targets_m)
     step_m, length = range_step(history.frequency_hz, oversampling=2.0)
     start_m = path_m.min(axis=1) - SWATH_MARGIN_M
     swath_m = (path_m.max(axis=1) - start_m + SWATH_MARGIN_M).max()
@@ -87,7 +87,7 @@ def range_tables(history: Spectra, targets_m: Floats) -> numba.Tables:
         count=min(length, int(np.ceil(swath_m / step_m))),
     )
     centre_hz, oversampling = centre_frequency(history.frequency_hz), length / len(history.frequency_hz)
-    return numba.prepare(Profiles(samples, start_m, step_m, centre_hz, oversampling, *sides))
+    return numba.prepare(Profiles(samples, start_m, step_m, centre_hz, oversampling, history.aperture))
 
 
 def undisturbed_tables(scene: PaperScene, *, window: str = "none") -> numba.Tables:
@@ -164,7 +164,7 @@ def half_power_widths(image: Callable[[Floats], Complexes], peak_m: Floats) -> t
     return half_power_width(across, 200) * across_step_m, half_power_width(along, 200) * along_step_m
 
 
-def coherence_factors(history: Spectra, points_m: Floats) -> Floats:
+def coherence_factors(history: PhaseHistory, points_m: Floats) -> Floats:
     """Return Γ at each of (point, 3), from what each pulse adds there by the double sum."""
     return np.array([coherence_factor(column) for column in reference.terms(history, points_m).T])
 

@@ -5,14 +5,16 @@ the GIL and start no threads of their own. Without a compiler at installation `a
 """
 
 import ctypes
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.binding import (
+from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.native_binding import (
     INSTRUCTION_SETS,
     ApertureJob,
     BeamJob,
@@ -21,12 +23,27 @@ from apertura.focus.engines.binding import (
     call,
     instruction_set,
 )
-from apertura.focus.engines.tables import MARGIN, TAPS, Plan, Tables, plan
+from apertura.focus.engines.native_prediction import candidates
+from apertura.focus.engines.native_tables import MARGIN, TAPS, Plan, Tables, plan
 from apertura.focus.inputs import Profiles
 
-__all__ = ["INSTRUCTION_SETS", "PATCH", "available", "form", "instruction_set", "prepare"]
+__all__ = ["INSTRUCTION_SETS", "PATCH", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
 
+READS: Literal["profiles"] = "profiles"
 PATCH = 16  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
+
+
+class Options(EngineOptions):
+    """What may be asked of the engine."""
+
+    degree: Annotated[int, Field(ge=1, le=2)] | None = Field(None, description="of the polynomials in a table cell")
+    oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
+        None, description="table cells per resolution cell c/B of total path"
+    )
+    tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
+        None, description="largest phase error that the fast ways may make, rad"
+    )
+    accumulate: Literal["complex64", "complex128"] | None = Field(None, description="type of sums over pulses")
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Tables:
@@ -63,7 +80,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
         raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
     samples = np.ascontiguousarray(profiles.samples, np.complex64)
     start_m = np.ascontiguousarray(profiles.start_m, np.float64)
-    places = [np.asarray(p, np.float64) for p in (profiles.tx_position_m, profiles.rx_position_m)]
+    places = [np.asarray(p, np.float64) for p in profiles.aperture.legs]
     if not len(samples):
         raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
     if not all(np.isfinite(values).all() for values in (start_m, *places)):

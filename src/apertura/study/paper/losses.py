@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from apertura.echo.sidelink import divide
-from apertura.focus.inputs import Spectra
+from apertura.focus.inputs import PhaseHistory
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.presets import paper_waveform
 from apertura.study import point_response
@@ -136,7 +136,7 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
     return point_response.amplitude_db(peaks / _undisturbed_peaks(error))
 
 
-def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> Spectra:
+def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
     """Return what is focused: the radar alone, or divided by the sidelink."""
     if divided:
         return point_response.divided_history(scene, divide(radar, sidelink))

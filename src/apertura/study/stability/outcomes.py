@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.echo.line_of_sight import fit_line_of_sight
 from apertura.echo.sidelink import METHODS, choose, measure
 from apertura.errors import CampaignError
-from apertura.focus.inputs import Spectra
+from apertura.focus.inputs import PhaseHistory
 from apertura.study import point_response
 from apertura.study.paper_scene import Complexes, receive_pair
 from apertura.study.point_response import Floats, find_peaks, mean_image
@@ -177,7 +177,7 @@ def correct(
     return kept, METHODS[chosen](radar[kept], sidelink[kept]), chosen
 
 
-def _measured(history: Spectra, ideal: _Ideal, used: float, targets_m: Floats) -> _Measured:
+def _measured(history: PhaseHistory, ideal: _Ideal, used: float, targets_m: Floats) -> _Measured:
     tables = point_response.range_tables(history, targets_m)
     positions, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
     gain_db = point_response.amplitude_db(peaks / ideal.peaks)
