@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
@@ -136,6 +138,31 @@ def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
         count[window] += 1
         np.testing.assert_array_equal(grid[window].positions(620.0), whole[window])
     assert (count == 1).all()
+
+
+@given(
+    crs=st.sampled_from(["local", "EPSG:32632"]),
+    spacing_m=st.floats(0.01, 50.0),
+    shape=st.tuples(st.integers(1, 600), st.integers(1, 600)),
+    side=st.integers(40, 300),
+    data=st.data(),
+)
+@settings(max_examples=40, deadline=None)
+def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordinates_of_the_whole(
+    crs, spacing_m, shape, side, data
+):
+    grid = SceneGrid(crs, 570656.9, 5363701.65, spacing_m, shape)
+    window = data.draw(st.sampled_from(list(grid.tiles(side))))
+    part = grid[window]
+    np.testing.assert_array_equal(part.x_m, grid.x_m[window[1]])
+    np.testing.assert_array_equal(part.y_m, grid.y_m[window[0]])
+    row, column, height_m = (data.draw(st.floats(-5.0, 700.0)) for _ in range(3))
+    tolerance_px = 1e-8 / spacing_m + 1e-9  # coordinates of millions of metres hold a nanometre or so
+    np.testing.assert_allclose(part.pixel_of(*part.map_at(row, column)), (row, column), atol=tolerance_px)
+    place = part.pixel_below(part.positions_at(row, column, height_m))
+    np.testing.assert_allclose(place, (row, column, height_m), rtol=0, atol=10 * tolerance_px + 1e-8)
+    whole = grid.pixel_of(*part.map_at(row, column))
+    np.testing.assert_allclose(whole, (row + window[0].start, column + window[1].start), atol=tolerance_px)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])

@@ -93,7 +93,7 @@ def test_a_pixel_has_the_same_height_in_whatever_window(shared):
 
 
 def test_a_missing_geoid_grid_is_an_error_that_names_it(shared, monkeypatch, tmp_path):
-    monkeypatch.setattr(geoid, "_proj_folders", lambda: [tmp_path])
+    monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
     path = shared / "dem_isce3" / "SanAnd_dem.tif"
     with pytest.raises(CampaignError, match=r"us_nga_egm96_15\.tif or egm96_15\.gtx.*scene\.geoid"):
         open_dem(path, "EPSG:32611", datum="egm96")
@@ -126,7 +126,7 @@ def test_the_grid_of_another_geoid_is_refused(shared):
 
 
 def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypatch):
-    monkeypatch.setattr(geoid, "_proj_folders", lambda: [tmp_path])
+    monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
     gtx = shared / "dem_isce3" / "egm96_15.gtx"
     carrying = plane_dem(tmp_path / "carrying.tif", crs="EPSG:32632+5773")
     silent = plane_dem(tmp_path / "silent.tif")

@@ -44,17 +44,17 @@ def open_dem(path: Path, crs: str, *, datum: str, geoid: Path | None = None) -> 
         return Dem(path, shape, pixel_from_map, "", "", None, 1.0)
     if system is None or not (system.is_geographic or system.is_projected or system.is_compound):
         raise _wrong(path, "no CRS on Earth", f"a georeferenced DEM, or scene.crs: {LOCAL}")
-    found = _datum(path, system, datum)
+    counted_from = _datum(path, system, datum)
     metres = _metres_per_unit(path, system, unit)
     horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
-    earth = found in {"egm96", "egm2008"}
+    earth = counted_from in {"egm96", "egm2008"}
     geodetic = CRS("EPSG:4979") if earth or horizontal.geodetic_crs is None else horizontal.geodetic_crs.to_3d()
-    grid = (
+    undulations = (
         None
-        if found == "ellipsoid"
-        else geoid_file(found, geoid, names=grid_names(system) if datum == "carried" else ())
+        if counted_from == "ellipsoid"
+        else geoid_file(counted_from, geoid, names=grid_names(system) if datum == "carried" else ())
     )
-    return Dem(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), grid, metres)
+    return Dem(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), undulations, metres)
 
 
 def _opened(path: Path) -> Any:

@@ -28,7 +28,7 @@ from apertura.scene.terrain import FlatGround, Terrain
 from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.store import open_stage
 
-LOOKS = 17
+MASK_PULSES = 17
 """Pulses, evenly spread over the aperture, from which shadow is decided."""
 
 _TILE_PX = 256
@@ -49,16 +49,16 @@ def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
 
 @dataclass(frozen=True)
 class Track:
-    """Phase centres of a pair: at mid-aperture (3,), and at some looks (look, 3), metres."""
+    """Phase centres of a pair: at mid-aperture (3,), and at the pulses of the mask, 2 × (pulse, 3), metres."""
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
-    looks: tuple[NDArray[np.float64], NDArray[np.float64]]
+    spread: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _track(echo: xr.Dataset) -> Track:
     tx, rx = echo.tx_position.values, echo.rx_position.values
-    some = np.unique(np.linspace(0, len(tx) - 1, LOOKS).round().astype(int))
+    some = np.unique(np.linspace(0, len(tx) - 1, MASK_PULSES).round().astype(int))
     return Track(tx[len(tx) // 2], rx[len(rx) // 2], (tx[some], rx[some]))
 
 
@@ -126,7 +126,7 @@ def _flat_mask(grid: SceneGrid) -> Callable[[Window], NDArray[np.uint8]]:
 
 def _mask(scene: OpenScene, tracks: Sequence[Track]) -> Callable[[Window], NDArray[np.uint8]]:
     relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
-    pairs = [tuple(relief.above(leg) for leg in track.looks) for track in tracks]
+    pairs = [tuple(relief.above(leg) for leg in track.spread) for track in tracks]
     return lambda window: np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in pairs]))
 
 
