@@ -1,10 +1,10 @@
-"""Section `processing`: how to compute."""
+"""Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector."""
 
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from apertura.settings.section import Section
+from apertura.settings.section import Metres3, Name, Section
 
 
 class Processing(Section):
@@ -44,3 +44,11 @@ class Processing(Section):
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
         "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
     )
+
+
+class Calibration(Section):
+    """Which flight the path offsets come from."""
+
+    flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
+    reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
+    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")

@@ -15,7 +15,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.scene.grid import LOCAL
-from apertura.settings.flights import Flight
+from apertura.settings import Flight
 from apertura.steps.scene import scene_grid
 from apertura.store import open_stage
 
