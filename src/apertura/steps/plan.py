@@ -2,12 +2,10 @@
 
 import shutil
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from apertura.campaign import Campaign
 from apertura.contracts import Window
@@ -29,6 +27,9 @@ from apertura.steps.costs import campaign_costs
 from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING, check_clearance
 from apertura.steps.terrain import Heights, expected_heights
 from apertura.store import manifest_of
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 OVERRIDES = (
     "engine",
@@ -216,6 +217,8 @@ def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | N
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     """Print every pair's decisions, reasons, predicted error, seconds and bytes; nothing is run or written."""
+    from rich.console import Console
+
     console = Console(width=max(140, Console().width))
     seconds, disk = 0.0, 0
     for flight in campaign.image_flights:
@@ -238,7 +241,9 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         )
 
 
-def _table(plan: Plan, title: str, accuracy_db: float) -> Table:
+def _table(plan: Plan, title: str, accuracy_db: float) -> "Table":
+    from rich.table import Table
+
     table = Table(title=f"{title}: {plan.setting.line}", title_justify="left")
     for heading in ("choice", "value", "reason", "error"):
         table.add_column(heading, overflow="fold")
