@@ -11,12 +11,14 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 setup: $(SETUP)
 
-# uv comes first, by hash; it then installs everything else by hash, and the package from this folder.
+# uv comes first, by hash; it then installs everything else by hash, and the package from this folder. All is compiled
+# to bytecode now: where Python may not write it later, every start would compile a step's 3000 imported files again.
 $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMakeLists.txt native/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt
-	$(BIN)/uv pip sync --quiet --python $(BIN)/python --require-hashes requirements/all.txt
+	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q src
 	touch $@
 
 demo: $(SETUP)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from rich.filesize import decimal
 
-from apertura.campaign import CONFIG, Campaign
+from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.focus.job import Job
 from apertura.imaging.job import imaging_job
@@ -17,6 +17,7 @@ from apertura.planning.plan import Plan
 from apertura.planning.planner import make_plan
 from apertura.scene.clearance import check_antennas
 from apertura.scene.ground_models import GroundModels
+from apertura.settings import CONFIG
 from apertura.store import manifest_of
 
 OVERRIDES = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")

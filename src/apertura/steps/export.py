@@ -38,7 +38,9 @@ class Amplitude:
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
-    """Write slc, power and db GeoTIFFs and the quicklook of one pair; return their paths."""
+    """Write slc, power and db GeoTIFFs and the quicklook of one pair, or of 'fused'; return their paths."""
+    if pair == "fused":
+        return export_fused(campaign, flight)
     dataset = open_stage(campaign.stage("image", flight, pair), "image")
     tags = _tags(dataset, dataset.attrs["quality"])
     title = f"{campaign.settings.campaign} · flight {flight} · {pair}"

@@ -1,10 +1,7 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
 import shutil
-
-from rich.console import Console
-from rich.filesize import decimal
-from rich.table import Table
+from typing import TYPE_CHECKING
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
@@ -12,6 +9,9 @@ from apertura.load.pair import open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import expected_scene
 from apertura.planning.plan import Plan
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
@@ -22,6 +22,9 @@ def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     """Print every pair's decisions, reasons, predicted error, seconds and bytes; nothing is run or written."""
+    from rich.console import Console
+    from rich.filesize import decimal
+
     console = Console(width=max(140, Console().width))
     seconds, disk = 0.0, 0
     for flight in campaign.image_flights:
@@ -44,7 +47,10 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         )
 
 
-def _table(plan: Plan, title: str, accuracy_db: float) -> Table:
+def _table(plan: Plan, title: str, accuracy_db: float) -> "Table":
+    from rich.filesize import decimal
+    from rich.table import Table
+
     table = Table(title=f"{title}: {plan.setting.line}", title_justify="left")
     for heading in ("choice", "value", "reason", "error"):
         table.add_column(heading, overflow="fold")

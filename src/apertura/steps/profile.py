@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign import CONFIG, Campaign
+from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
 from apertura.load.inputs import phase_history_of
 from apertura.load.scene import open_scene
 from apertura.scene.clearance import check_antennas
+from apertura.settings import CONFIG
 from apertura.steps.stamping import stamped
 from apertura.store import open_stage, save_stage
 

@@ -15,7 +15,7 @@ from apertura.errors import CampaignError
 from apertura.load.scene import settled_scene
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.scene.grid import SceneGrid
-from apertura.settings.flights import Flight
+from apertura.settings import Flight
 from apertura.store import open_stage
 
 REACH_M = 1.0
