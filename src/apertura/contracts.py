@@ -5,7 +5,6 @@ at echo. Two functions serve every step: `check` refuses a dataset that breaks i
 `stamp` writes where it came from.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +14,7 @@ import xarray as xr
 
 from apertura import __version__
 from apertura.errors import ContractError
+from apertura.provenance import canonical_json
 
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
@@ -209,14 +209,3 @@ def stamp(
         "code_sha256": code_sha256,
     }
     return stamped
-
-
-def canonical_json(value: object) -> str:
-    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
-
-    Examples
-    --------
-    >>> canonical_json({"b": 1, "a": [1.5, None]})
-    '{"a":[1.5,null],"b":1}'
-    """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

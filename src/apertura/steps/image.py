@@ -4,11 +4,12 @@ from pathlib import Path
 
 import zarr
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.load.antennas import antennas_report
 from apertura.steps.forming import Work
 from apertura.steps.quality import certified, measures
-from apertura.store import finish, sharing, tiles_missing, write_json, writing
+from apertura.store import finish, resume, sharing, writing
 
 _QUOTED = ("pulses", "sidelink", "clock", "calibration")
 
@@ -21,7 +22,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     work = Work.of(campaign, flight, pair, module=__name__, threads=threads)
     folder, echo, plan = work.folder, work.echo, work.plan
     with writing(folder) as wip:
-        missing = tiles_missing(wip, work.empty, "image", work.windows)
+        missing = resume(wip, work.empty, "image", work.windows)
         target = zarr.open_array(wip / "image", mode="r+")
         work.form_planned(target, missing)
         quality = {

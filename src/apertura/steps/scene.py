@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.geometry.geodesy import local_crs, projected_from_ecef
 from apertura.load.ground import Ground, on_the_ground
@@ -16,7 +17,7 @@ from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.scene.terrain import COVER_NODES
 from apertura.settings import Scene
-from apertura.store import open_stage, write_json
+from apertura.store import open_stage
 
 PATH = Path("results/scene.json")
 

@@ -18,7 +18,7 @@ from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.scene.terrain import Terrain
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
-from apertura.store import finish, manifest_of, open_stage, tiles_missing, writing
+from apertura.store import finish, manifest_of, open_stage, resume, writing
 
 _TILE_PX = 512
 
@@ -54,7 +54,7 @@ def terrain(campaign: Campaign) -> Path:
     )
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = tiles_missing(wip, empty, "height", windows)
+        missing = resume(wip, empty, "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.terrain.path.name}", flush=True)
         target = zarr.open_array(wip / "height", mode="r+")
         for window in missing:

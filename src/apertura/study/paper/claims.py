@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+from apertura.atomic import replacement
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -83,11 +85,8 @@ def read_claims(path: Path) -> list[Claim]:
 
 
 def write_rows(path: Path, columns: list[str], rows: Iterable[dict[str, object]]) -> None:
-    """Write a CSV file under another name first, so that a kill leaves none or all of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".wip")
-    with draft.open("w", encoding="utf-8", newline="") as lines:
+    """Write a CSV file that is complete or absent."""
+    with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as lines:
         writer = csv.DictWriter(lines, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    draft.replace(path)

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from apertura.atomic import replacement
 from apertura.study.stability.atlas import LEVELS_DB, Edge
 from apertura.study.stability.outcomes import Outcome
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
@@ -119,8 +120,6 @@ def _words(edge: Edge) -> str:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG that is the same for the same figure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    draft = path.with_name(path.name + ".wip")
-    figure.savefig(draft, format="png", dpi=110, metadata={"Software": None})
-    draft.replace(path)
+    with replacement(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})
