@@ -77,7 +77,7 @@ rule layers:
         "results/scene.json",
         campaign.terrain_sources(),
     output:
-        multiext("results/layers/", "incidence.tif", "bistatic_angle.tif", "mask.tif"),
+        [f"results/layers/{export.file}" for export in exports_in("layers")],
     log:
         "results/logs/layers.log",
     benchmark:
@@ -88,7 +88,7 @@ rule layers:
     resources:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
-        code=code_sha256("apertura.steps.layers"),
+        code=code_sha256("apertura.steps.layers", *export_modules("layers")),
     message:
         "drawing how the scene is seen"
     shell:

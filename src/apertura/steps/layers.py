@@ -5,7 +5,6 @@ is; the bistatic angle is the largest of the pairs'; the mask marks what any pai
 sum does not either.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,12 +16,11 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura import __version__
 from apertura.campaign import Campaign
-from apertura.contracts import Window, canonical_json
-from apertura.export import LAYERS
+from apertura.contracts import Window
+from apertura.export import export_modules, write_exports
 from apertura.geometry.geodesy import local_crs
-from apertura.provenance import chained_sha256, code_sha256, merged
+from apertura.provenance import Provenance
 from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.scene.visibility import (
     Relief,
@@ -43,17 +41,25 @@ _TILE_PX = 256
 
 
 def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
-    """Write results/layers/{incidence,bistatic_angle,mask}.tif; return their paths."""
+    """Write the products of results/layers: incidence, bistatic angle and mask; return their paths."""
     grid, heights, flight = scene_grid(campaign), open_heights(campaign), campaign.image_flights[0]
-    echoes = [open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs]
-    rasters = _rasters(grid, heights, [_track(echo) for echo in echoes], threads=threads)
-    tags = _tags(grid, [*echoes, *heights.parents], scene_inputs(campaign))
-    crs = local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs
-    folder = campaign.results / "layers"
-    for name, raster in rasters.items():
-        title = f"{campaign.settings.campaign} · flight {flight.name} · {name.removesuffix('.tif')}"
-        LAYERS[name](folder / name, raster, transform=Affine(*grid.transform), crs=crs, tags=tags, title=title)
-    return [folder / name for name in rasters]
+    echoes = {pair: open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs}
+    rasters = _rasters(grid, heights, [_track(echo) for echo in echoes.values()], threads=threads)
+    origin = Provenance.of(
+        [__name__, *export_modules("layers")],
+        {**echoes, **dict(zip(["terrain"], heights.parents, strict=False))},
+        settings={"grid": grid_spec(grid)},
+        inputs=scene_inputs(campaign),
+    )
+    return write_exports(
+        "layers",
+        campaign.results / "layers",
+        rasters,
+        titles={name: f"{campaign.settings.campaign} · flight {flight.name} · {name}" for name in rasters},
+        tags=origin.tags(),
+        transform=Affine(*grid.transform),
+        crs=local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,9 +134,9 @@ def _rasters(grid: SceneGrid, heights: Heights, tracks: Sequence[Track], *, thre
         return np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in looks]))
 
     return {
-        "incidence.tif": Layer(grid, np.float32, incidence, threads),
-        "bistatic_angle.tif": Layer(grid, np.float32, bistatic_angle, threads),
-        "mask.tif": Layer(grid, np.uint8, mask, threads),
+        "incidence": Layer(grid, np.float32, incidence, threads),
+        "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
+        "mask": Layer(grid, np.uint8, mask, threads),
     }
 
 
@@ -151,15 +157,3 @@ def _surface(grid: SceneGrid, heights: Heights, window: Window) -> tuple[NDArray
     position = wider.positions(height)
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
     return position[inner], surface_normals(position)[inner]
-
-
-def _tags(grid: SceneGrid, parents: Sequence[xr.Dataset], inputs: dict[str, str]) -> dict[str, str]:
-    runspec: dict[str, Any] = {}
-    for parent in parents:
-        runspec |= json.loads(parent.attrs["runspec"])
-    return {
-        "APERTURA_RUNSPEC": canonical_json(runspec | {"grid": grid_spec(grid)}),
-        "APERTURA_INPUTS": canonical_json(merged(*(parent.attrs["inputs"] for parent in parents), inputs)),
-        "APERTURA_CODE_SHA256": chained_sha256(code_sha256(__name__), [one.attrs["code_sha256"] for one in parents]),
-        "APERTURA_VERSION": __version__,
-    }
