@@ -7,14 +7,16 @@ at echo. Two functions serve every step: `check` refuses a dataset that breaks i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from apertura import __version__
 from apertura.errors import ContractError
 from apertura.provenance import canonical_json
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
@@ -122,7 +124,7 @@ STAGES: Mapping[str, Stage] = {
 }
 
 
-def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     """Return `dataset` unchanged if it keeps the contract of `stage`.
 
     Parameters
@@ -139,6 +141,7 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
     Examples
     --------
+    >>> import xarray as xr
     >>> check(xr.Dataset(), "image")
     Traceback (most recent call last):
     ...
@@ -161,13 +164,13 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
 
 def stamp(
-    dataset: xr.Dataset,
+    dataset: "xr.Dataset",
     stage: str,
     *,
     runspec: Mapping[str, Any],
     inputs: Mapping[str, str],
     code_sha256: str,
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Check `dataset` and write units and provenance into its attributes.
 
     Parameters

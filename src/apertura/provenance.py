@@ -202,7 +202,10 @@ def _is_ours(name: str) -> bool:
 
 
 def _source(name: str, package: Path) -> Path | None:
-    base = package.joinpath(*name.split(".")[1:])
+    parts = name.split(".")[1:]
+    if not parts:  # the package itself only hands out public names
+        return None
+    base = package.joinpath(*parts)
     return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
 
 

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import zarr
-
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.load.antennas import antennas_report
 from apertura.steps.forming import Work
 from apertura.steps.quality import certified, measures
-from apertura.store import finish, resume, sharing, writing
+from apertura.store import finish, open_array, resume, sharing, writing
 
 _QUOTED = ("pulses", "sidelink", "clock", "calibration")
 
@@ -23,7 +21,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     folder, echo, plan = work.folder, work.echo, work.plan
     with writing(folder) as wip:
         missing = resume(wip, work.empty, "image", work.windows)
-        target = zarr.open_array(wip / "image", mode="r+")
+        target = open_array(wip, "image")
         work.form_planned(target, missing)
         quality = {
             "engine": plan.engine,
@@ -36,9 +34,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **antennas_report(campaign, pair, plan.illumination),
         }
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}
-        zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
         write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
-        finish(wip, folder)
+        finish(wip, folder, quality=quality, flags=quality["flags"])
     return folder
 
 
@@ -67,7 +64,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     with sharing(work.folder, work.empty, "image", work.windows) as (wip, missing):
         todo = [window for window in mine if window in missing]
         if todo:
-            work.form_planned(zarr.open_array(wip / "image", mode="r+"), todo)
+            work.form_planned(open_array(wip, "image"), todo)
     receipt = work.folder.with_name("tiles") / f"{share}.json"
     write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.plan.setting.line})
     return receipt

@@ -18,7 +18,7 @@ from apertura.scene.grid import LOCAL, SceneGrid
 from apertura.scene.terrain import Terrain
 from apertura.steps.scene import grid_coordinates, grid_spec, scene_grid
 from apertura.steps.stamping import stamped
-from apertura.store import finish, manifest_of, open_stage, resume, writing
+from apertura.store import finish, manifest_of, open_array, open_stage, resume, writing
 
 _TILE_PX = 512
 
@@ -56,12 +56,11 @@ def terrain(campaign: Campaign) -> Path:
     with writing(folder) as wip:
         missing = resume(wip, empty, "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.terrain.path.name}", flush=True)
-        target = zarr.open_array(wip / "height", mode="r+")
+        target = open_array(wip, "height")
         for window in missing:
             target[window] = ground.terrain.heights(grid[window])
         report = _report(lambda window: np.asarray(target[window]), windows, grid, ground.terrain)
-        zarr.open_group(wip, mode="r+").attrs["terrain"] = report | {"datum": campaign.settings.scene.dem_datum}
-        finish(wip, folder)
+        finish(wip, folder, terrain=report | {"datum": campaign.settings.scene.dem_datum})
     return folder
 
 
