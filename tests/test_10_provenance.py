@@ -33,6 +33,8 @@ def changes(copied, file, *modules):
         ("echo/sidelink.py", "echo", True),
         ("echo/sidelink.py", "image", False),
         ("export/__init__.py", "export", True),
+        ("export/cog.py", "export", True),
+        ("export/cog.py", "cube", False),
         ("export/__init__.py", "cube", False),
         ("ingest/rtklib.py", "ingest", True),
         ("simulation/presets.py", "image", False),

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parent
 
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
 _NAME = re.compile(r"[\w.]+")
+_ROW = re.compile(r"[\"'](apertura(?:\.\w+)+):\w+[\"']")  # a row that names a function, imported when it is used
 
 
 class Stage(Protocol):
@@ -137,7 +138,8 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     """Return the hash of the source of `modules` and of every apertura module they import, however deep.
 
     A stage's hash therefore changes when, and only when, code it can run has changed. Compiled code counts by
-    what it was built from: each ``*.sha256`` that was installed beside one of the modules.
+    what it was built from: each ``*.sha256`` that was installed beside one of the modules. Modules that the row of a
+    table names as a string, ``module:function``, count as imported.
 
     Parameters
     ----------
@@ -221,7 +223,7 @@ def _imports(source: str) -> tuple[str, ...]:
     for module, members, modules in _IMPORT.findall(source):
         names += [module, *(f"{module}.{member}" for member in _NAME.findall(members))] if module else []
         names += _NAME.findall(modules)
-    return tuple(name for name in names if _is_ours(name))
+    return tuple(name for name in [*names, *_ROW.findall(source)] if _is_ours(name))
 
 
 def _compiled(closure: Mapping[str, Path], package: Path) -> list[Path]:
