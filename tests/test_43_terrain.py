@@ -103,10 +103,12 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
     assert report["numerical_error_db"] < -50
     assert report["terrain"]["lowest_m"] < settled_scene(hillside).level.height_m < report["terrain"]["highest_m"]
     digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
-    for name in ("f01/uav1-uav2/slc.tif", "f01/fused/coherent_db.tif", "layers/mask.tif"):
+    apart = {"f01/uav1-uav2/slc.tif": None, "f01/fused/coherent_db.tif": "uav1-uav2", "layers/mask.tif": "terrain"}
+    for name, stage in apart.items():
         with rasterio.open(hillside.results / name) as raster:
             assert json.loads(raster.tags()["APERTURA_INPUTS"])["dem"] == digest
             runspec = json.loads(raster.tags()["APERTURA_RUNSPEC"])
+            runspec = runspec[stage] if stage else runspec
             assert (runspec["dem"], runspec["dem_datum"]) == ("dem.tif", "ellipsoid")
 
 

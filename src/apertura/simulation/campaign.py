@@ -1,6 +1,5 @@
 """A simulated campaign as a folder no different from a real one, with its truth beside it."""
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +10,7 @@ import yaml
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from apertura.atomic import replacement
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.simulation.continuous import continuous_blocks, recording_start_s
@@ -53,7 +53,7 @@ def write_campaign(directory: str | Path, simulation: Simulation, generator: Gen
 
     Notes
     -----
-    Source: the input contract, ../shared/DESIGN.md section 3. Written beside and renamed when whole.
+    Source: the input contract, ../shared/DESIGN.md section 3.
     """
     directory = Path(directory)
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
@@ -63,19 +63,12 @@ def write_campaign(directory: str | Path, simulation: Simulation, generator: Gen
             expected="a new or empty folder for the simulated campaign",
             remedy="Remove it or choose another name.",
         )
-    beside = directory.with_name(f"{directory.name}.wip")
-    shutil.rmtree(beside, ignore_errors=True)
-    (beside / "config").mkdir(parents=True)
-    (beside / "raw").mkdir()
-    try:
-        _write_config(beside, simulation)
-        write_truth(beside / "truth.json", _write_flights(beside, simulation, generator))
-    except BaseException:
-        shutil.rmtree(beside)
-        raise
-    if directory.exists():
-        directory.rmdir()
-    return beside.rename(directory)
+    with replacement(directory) as root:
+        (root / "config").mkdir(parents=True)
+        (root / "raw").mkdir()
+        _write_config(root, simulation)
+        write_truth(root / "truth.json", _write_flights(root, simulation, generator))
+    return directory
 
 
 def _write_config(root: Path, simulation: Simulation) -> None:

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
-from apertura.contracts import canonical_json
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import frame_from_map
-from apertura.provenance import chained_sha256, code_sha256
+from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
 from apertura.settings import Calibration
-from apertura.store import open_stage, write_json
+from apertura.store import open_stage
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:

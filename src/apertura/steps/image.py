@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-import zarr
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.contracts import Window
+from apertura.focus.engines import ENGINES
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.certify import certified, measures
 from apertura.imaging.formation import Formation
@@ -20,7 +21,7 @@ from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import sha256_file
 from apertura.steps.stamping import stamped
-from apertura.store import finish, open_stage, sharing, tiles_missing, write_json, writing
+from apertura.store import finish, open_array, open_stage, resume, sharing, writing
 
 _QUOTED = ("pulses", "sidelink", "clock", "calibration")
 
@@ -33,8 +34,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
     work = _open(campaign, flight, pair, threads=threads)
     folder, echo, plan = work.folder, work.echo, work.formation.plan
     with writing(folder) as wip:
-        missing = tiles_missing(wip, work.empty, "image", work.formation.windows)
-        target = zarr.open_array(wip / "image", mode="r+")
+        missing = resume(wip, work.empty, "image", work.formation.windows)
+        target = open_array(wip, "image")
         work.compute(missing, target)
         accuracy_db = campaign.settings.processing.accuracy_db
         quality = {
@@ -48,9 +49,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **antennas_report(campaign, pair, plan.illumination),
         }
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"]}
-        zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
         write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
-        finish(wip, folder)
+        finish(wip, folder, quality=quality, flags=quality["flags"])
     return folder
 
 
@@ -80,7 +80,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     with sharing(work.folder, work.empty, "image", windows) as (wip, missing):
         todo = [window for window in mine if window in missing]
         if todo:
-            work.compute(todo, zarr.open_array(wip / "image", mode="r+"))
+            work.compute(todo, open_array(wip, "image"))
     receipt = work.folder.with_name("tiles") / f"{share}.json"
     write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.formation.plan.setting.line})
     return receipt
@@ -122,7 +122,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),
         "image",
-        module=__name__,
+        modules=[__name__, *ENGINES.values()],
         parents=[echo, profile, *scene.parents],
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},

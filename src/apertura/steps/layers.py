@@ -5,7 +5,6 @@ is; the bistatic angle is the largest of the pairs'; the mask marks what any pai
 their sum lacks it too.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,12 +16,11 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura import __version__
 from apertura.campaign import Campaign
-from apertura.contracts import Window, canonical_json
-from apertura.export import LAYERS
+from apertura.contracts import Window
+from apertura.export import export_modules, write_exports
 from apertura.load.scene import OpenScene, open_scene
-from apertura.provenance import chained_sha256, code_sha256, merged
+from apertura.provenance import Provenance
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, Terrain
 from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
@@ -35,16 +33,25 @@ _TILE_PX = 256
 
 
 def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
-    """Write results/layers/{incidence,bistatic_angle,mask}.tif; return their paths."""
+    """Write the products of results/layers: incidence, bistatic angle and mask; return their paths."""
     scene, flight = open_scene(campaign), campaign.image_flights[0]
-    echoes = [open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs]
-    rasters = _rasters(scene, [_track(echo) for echo in echoes], threads=threads)
-    place = {"transform": Affine(*scene.grid.transform), "crs": scene.grid.crs_wkt, "tags": _tags(scene, echoes)}
-    folder = campaign.results / "layers"
-    for name, raster in rasters.items():
-        title = f"{campaign.settings.campaign} · flight {flight.name} · {name.removesuffix('.tif')}"
-        LAYERS[name](folder / name, raster, **place, title=title)
-    return [folder / name for name in rasters]
+    echoes = {pair: open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs}
+    rasters = _rasters(scene, [_track(echo) for echo in echoes.values()], threads=threads)
+    origin = Provenance.of(
+        [__name__, *export_modules("layers")],
+        {**echoes, **dict(zip(["terrain"], scene.parents, strict=False))},
+        settings=scene.spec,
+        inputs=scene.inputs,
+    )
+    return write_exports(
+        "layers",
+        campaign.results / "layers",
+        rasters,
+        titles={name: f"{campaign.settings.campaign} · flight {flight.name} · {name}" for name in rasters},
+        tags=origin.tags(),
+        transform=Affine(*scene.grid.transform),
+        crs=scene.grid.crs_wkt,
+    )
 
 
 @dataclass(frozen=True)
@@ -114,9 +121,9 @@ def _rasters(scene: OpenScene, tracks: Sequence[Track], *, threads: int) -> dict
         return np.asarray(np.max([bistatic_angle_deg(position, track.tx, track.rx) for track in tracks], axis=0))
 
     return {
-        "incidence.tif": Layer(grid, np.float32, incidence, threads),
-        "bistatic_angle.tif": Layer(grid, np.float32, bistatic_angle, threads),
-        "mask.tif": Layer(grid, np.uint8, mask, threads),
+        "incidence": Layer(grid, np.float32, incidence, threads),
+        "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
+        "mask": Layer(grid, np.uint8, mask, threads),
     }
 
 
@@ -143,16 +150,3 @@ def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray
     position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
     return position[inner], surface_normals(position)[inner]
-
-
-def _tags(scene: OpenScene, echoes: Sequence[xr.Dataset]) -> dict[str, str]:
-    parents = [*echoes, *scene.parents]
-    runspec: dict[str, Any] = {}
-    for parent in parents:
-        runspec |= json.loads(parent.attrs["runspec"])
-    return {
-        "APERTURA_RUNSPEC": canonical_json(runspec | scene.spec),
-        "APERTURA_INPUTS": canonical_json(merged(*(parent.attrs["inputs"] for parent in parents), scene.inputs)),
-        "APERTURA_CODE_SHA256": chained_sha256(code_sha256(__name__), [one.attrs["code_sha256"] for one in parents]),
-        "APERTURA_VERSION": __version__,
-    }

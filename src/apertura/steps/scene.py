@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.geometry.aperture import Aperture
 from apertura.load.scene import PATH, Flown, settled
-from apertura.store import open_stage, write_json
+from apertura.store import open_stage
 
 
 def scene(campaign: Campaign) -> Path:

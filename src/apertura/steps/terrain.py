@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-import zarr
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
@@ -13,7 +12,7 @@ from apertura.load.scene import OpenScene, settled_scene
 from apertura.scene.dem import height_range
 from apertura.scene.terrain import GridHeights
 from apertura.steps.stamping import stamped
-from apertura.store import finish, tiles_missing, writing
+from apertura.store import finish, open_array, resume, writing
 
 
 def terrain(campaign: Campaign) -> Path:
@@ -36,9 +35,9 @@ def terrain(campaign: Campaign) -> Path:
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = tiles_missing(wip, _empty(campaign, scene, ground), "height", windows)
+        missing = resume(wip, _empty(campaign, scene, ground), "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
-        heights = zarr.open_array(wip / "height", mode="r+")
+        heights = open_array(wip, "height")
         for window in missing:
             heights[window] = ground.dem.heights(grid[window])
         lowest_m, highest_m = height_range(GridHeights(grid, heights), grid, where=ground.dem.path)
@@ -49,8 +48,7 @@ def terrain(campaign: Campaign) -> Path:
             "highest_m": highest_m,
             "datum": campaign.settings.scene.dem_datum,
         }
-        zarr.open_group(wip, mode="r+").attrs["terrain"] = report
-        finish(wip, folder)
+        finish(wip, folder, terrain=report)
     return folder
 
 
@@ -63,7 +61,7 @@ def _empty(campaign: Campaign, scene: OpenScene, ground: Ground) -> xr.Dataset:
             attrs={"frame": scene.grid.frame, "terrain": {}},
         ),
         "terrain",
-        module=__name__,
+        modules=[__name__],
         settings={**campaign.relevant("terrain"), **scene.spec},
         inputs=ground.inputs,
     )

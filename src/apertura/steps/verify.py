@@ -12,6 +12,7 @@ from rich.table import Table
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.export import product_files
 from apertura.load.scene import settled_scene
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.scene.grid import SceneGrid
@@ -121,8 +122,8 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
     console.print(table)
     console.print(_quality(campaign))
     if paths:
-        for path in sorted(campaign.results.rglob("*.tif")) + sorted(campaign.results.rglob("quicklook.png")):
-            print(path)
+        for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
+            print(campaign.results / file)
 
 
 def _quality(campaign: Campaign) -> Table:

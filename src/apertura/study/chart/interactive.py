@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from apertura.atomic import write_text
+
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>@TITLE@</title>
 <style>
@@ -114,6 +116,4 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
     """
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
     page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}").replace("@POINTS@", data)
-    draft = path.with_name(path.name + ".wip")
-    draft.write_text(page, encoding="utf-8")
-    draft.replace(path)
+    write_text(path, page)

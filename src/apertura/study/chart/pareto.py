@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from apertura.atomic import replacement
 from apertura.study.stability.charts import save
 
 LOOKS = {
@@ -44,7 +45,7 @@ def with_front(points: Sequence[Point]) -> list[Point]:
 
 def write_points(points: Sequence[Point], path: Path) -> None:
     """Write the points as CSV, one line each."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
         table.writeheader()
         for point in points:
