@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.simulation.hidden import Hidden
+from apertura.simulation.draw import ImpairmentDraw
 from apertura.simulation.impairments import Adc, Impairments
-from apertura.simulation.radar import Floats, Paths, Waveform, direct_path, echo_paths
+from apertura.simulation.radar import Floats, Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum
 
@@ -42,12 +42,12 @@ class Geometry:
 
 
 def receive(
-    waveform: Waveform,
+    waveform: TransmitWaveform,
     scatterers: Scatterers,
     geometry: Geometry,
     *,
     impairments: Impairments,
-    hidden: Hidden,
+    draw: ImpairmentDraw,
     transmitter: Impairments | None = None,
     path_offset_m: Mapping[str, float] | None = None,
     sidelink: bool = True,
@@ -62,7 +62,7 @@ def receive(
         The scene.
     geometry
         Where the antennas truly are.
-    impairments, hidden
+    impairments, draw
         What is wrong with the receiving node, and what was drawn of it.
     transmitter
         Impairments of the transmitting node, for its ripple; the receiving node itself if None.
@@ -93,14 +93,14 @@ def receive(
     power = spectral_power(waveform, echoes)
     heard = {"radar": (_with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power), power)}
     if sidelink:
-        heard["sidelink"] = (_sidelink(direct, impairments, hidden), spectral_power(waveform, direct))
+        heard["sidelink"] = (_sidelink(direct, impairments, draw), spectral_power(waveform, direct))
     return {
-        name: _channel(waveform, name, paths, level, transmitted=transmitted, impairments=impairments, hidden=hidden)
+        name: _channel(waveform, name, paths, level, transmitted=transmitted, impairments=impairments, draw=draw)
         for name, (paths, level) in heard.items()
     }
 
 
-def spectral_power(waveform: Waveform, paths: Paths, response: Complex | None = None) -> float:
+def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | None = None) -> float:
     """Return the mean of |Σ a·exp(-j2πfτ)|² over pulses and subcarriers."""
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
     parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
@@ -135,14 +135,14 @@ def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray
 
 
 def _channel(
-    waveform: Waveform,
+    waveform: TransmitWaveform,
     name: str,
     paths: Paths,
     power: float,
     *,
     transmitted: Complex,
     impairments: Impairments,
-    hidden: Hidden,
+    draw: ImpairmentDraw,
 ) -> Channel:
     radar = name == "radar"
     ripple = impairments.radar_ripple if radar else impairments.sidelink_ripple
@@ -151,8 +151,8 @@ def _channel(
         waveform,
         paths,
         transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
-        hidden.phase_rad,
-        hidden.start_s,
+        draw.phase_rad,
+        draw.start_s,
         cfo_hz=impairments.clock.cfo_hz,
         sfo_hz=impairments.clock.sfo_hz,
         noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
@@ -168,7 +168,7 @@ def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, o
     return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
 
 
-def _sidelink(direct: Paths, impairments: Impairments, hidden: Hidden) -> Paths:
+def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw) -> Paths:
     paths = direct
     for reflection in impairments.sidelink_multipath:
         later = Paths(
@@ -178,5 +178,5 @@ def _sidelink(direct: Paths, impairments: Impairments, hidden: Hidden) -> Paths:
         )
         paths = paths.and_also(later)
     shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
-    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * hidden.blocked) / 20)
+    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * draw.blocked) / 20)
     return Paths(paths.delay_s, paths.amplitude * gain[:, None], paths.delay_rate)

@@ -141,7 +141,7 @@ def _draw(sweep: Sweep, size: float, method: str, ideal: _Ideal, generator: np.r
     flown = sweep.flown(size)
     radar, sidelink, seen = receive_pair(flown, sweep.case(size), generator)
     logged = sweep.logged(flown, size, generator)
-    kept, transfer, chosen = correct(method, radar, sidelink, seen.hidden.kept)
+    kept, transfer, chosen = correct(method, radar, sidelink, seen.draw.kept)
     if not kept.any():
         return _Draw(REFUSED_DB, 0.0, (np.nan, np.nan), 0.0, 0.0, chosen)
     image = _alone if chosen == "none" else _divided
