@@ -135,12 +135,12 @@ def simulate(
     if print_spec is not None:
         print(simulation.specification_text(simulation.preset(print_spec)), end="")
         return
-    *specifications, directory = paths or [None]
-    if directory is None or len(specifications) + (preset is not None) > 1:
-        given = " ".join(map(str, paths or ["no folder"])) + (f" --preset {preset}" if preset else "")
-        raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name one of the two.")
-    chosen = specifications[0] if specifications else simulation.preset(preset or "demo")
-    print(simulation.simulate(directory, chosen, seed=seed))
+    paths = paths or []
+    if len(paths) + (preset is not None) not in {1, 2} or not paths:
+        given = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
+        raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+    chosen = paths[0] if len(paths) > 1 else simulation.preset(preset or "demo")
+    print(simulation.simulate(paths[-1], chosen, seed=seed))
 
 
 @step.command()

@@ -36,12 +36,16 @@ class Framing:
     array([ 1,  1,  1, -1, -1, -1, -1, -1, -1,  1,  1,  1], dtype=int8)
     """
 
-    register_bits: int = Field(10, ge=2, le=20, description="length k of the shift register: 2^k - 1 chips of preamble")
-    chip_samples: int = Field(4, ge=1, description="samples per chip; the sampling rate over it must fit the band")
-    counter_bits: int = Field(16, ge=1, description="width of the frame counter; it wraps at 2^counter_bits")
-    bit_chips: int = Field(15, ge=1, description="chips per payload bit, all of one sign: +1 for a one")
-    guard_samples: int = Field(256, ge=0, description="silence before the prefix, longer than the longest echo")
-    level_db: float = Field(0.0, description="power against the mean power of the symbol, dB")
+    register_bits: int = Field(
+        default=10, ge=2, le=20, description="length k of the shift register: 2^k - 1 chips of preamble"
+    )
+    chip_samples: int = Field(
+        default=4, ge=1, description="samples per chip; the sampling rate over it must fit the band"
+    )
+    counter_bits: int = Field(default=16, ge=1, description="width of the frame counter; it wraps at 2^counter_bits")
+    bit_chips: int = Field(default=15, ge=1, description="chips per payload bit, all of one sign: +1 for a one")
+    guard_samples: int = Field(default=256, ge=0, description="silence before the prefix, longer than the longest echo")
+    level_db: float = Field(default=0.0, description="power against the mean power of the symbol, dB")
 
     def preamble(self) -> Chips:
         """Return (chip,) int8 of ±1: a maximum-length sequence."""

@@ -13,6 +13,9 @@ from pydantic.dataclasses import dataclass
 Floats = NDArray[np.float64]
 STRICT_KEYS = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Of everything that a specification may hold: unknown keys are errors."""
+RadarPoint = Literal["radar_tx", "radar_rx"]
+AntennaPoint = Literal["radar_tx", "radar_rx", "sidelink"]
+ChannelName = Literal["radar", "sidelink"]
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -22,10 +25,10 @@ class Clock:
     The received signal turns by −cfo_hz at baseband and is sampled sfo_hz too often.
     """
 
-    cfo_hz: float = Field(0.0, description="local oscillator less its nominal frequency, Hz")
-    sfo_hz: float = Field(0.0, description="sampling rate less its nominal value, Hz")
+    cfo_hz: float = Field(default=0.0, description="local oscillator less its nominal frequency, Hz")
+    sfo_hz: float = Field(default=0.0, description="sampling rate less its nominal value, Hz")
     continuous_phase: bool = Field(
-        False,
+        default=False,
         description="the oscillator runs on from pulse to pulse (-2π·cfo·t) instead of restarting at each trigger",
     )
 
@@ -45,8 +48,8 @@ class Clock:
 class UniformPhase:
     """Carrier phase per pulse, uniform in ± a width."""
 
-    half_width_rad: float = Field(np.pi, ge=0, description="half width, rad; π: unknown altogether")
-    kind: Literal["uniform"] = Field("uniform", kw_only=True, repr=False)
+    half_width_rad: float = Field(default=np.pi, ge=0, description="half width, rad; π: unknown altogether")
+    kind: Literal["uniform"] = Field(default="uniform", kw_only=True, repr=False)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -54,25 +57,25 @@ class PhaseWalk:
     """Carrier phase as a random walk: free-running oscillators."""
 
     rad_per_root_s: float = Field(ge=0, description="root of the variance's growth in rad²/s")
-    kind: Literal["walk"] = Field("walk", kw_only=True, repr=False)
+    kind: Literal["walk"] = Field(default="walk", kw_only=True, repr=False)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Timing:
     """Start of the capture less start of the pulse."""
 
-    offset_s: float = Field(0.0, description="constant, s")
-    half_width_s: float = Field(0.0, ge=0, description="uniform in ± this per pulse, s")
-    jitter_samples: float = Field(0.0, ge=0, description="standard deviation of whole samples of trigger delay")
+    offset_s: float = Field(default=0.0, description="constant, s")
+    half_width_s: float = Field(default=0.0, ge=0, description="uniform in ± this per pulse, s")
+    jitter_samples: float = Field(default=0.0, ge=0, description="standard deviation of whole samples of trigger delay")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class TimeTag:
     """Error of the node's UTC tags."""
 
-    offset_s: float = Field(0.0, description="constant, s")
-    drift_ppm: float = Field(0.0, description="growing, microseconds per second")
-    jitter_s: float = Field(0.0, ge=0, description="standard deviation per pulse, s")
+    offset_s: float = Field(default=0.0, description="constant, s")
+    drift_ppm: float = Field(default=0.0, description="growing, microseconds per second")
+    jitter_s: float = Field(default=0.0, ge=0, description="standard deviation per pulse, s")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -93,8 +96,8 @@ class Blockage:
     """
 
     fraction: float = Field(ge=0, lt=1, description="share of the pulses")
-    mean_pulses: float = Field(10.0, ge=1, description="mean length of a burst, pulses")
-    attenuation_db: float = Field(60.0, ge=0, description="loss while shadowed, dB")
+    mean_pulses: float = Field(default=10.0, ge=1, description="mean length of a burst, pulses")
+    attenuation_db: float = Field(default=60.0, ge=0, description="loss while shadowed, dB")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -102,7 +105,7 @@ class Leakage:
     """Direct coupling of the radar antennas."""
 
     level_db: float = Field(description="against the RMS echo spectrum, dB")
-    path_m: float = Field(0.0, description="electrical path beyond the antennas' distance, m")
+    path_m: float = Field(default=0.0, description="electrical path beyond the antennas' distance, m")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -131,8 +134,8 @@ class Ripple:
 class Adc:
     """The converter."""
 
-    bits: int = Field(14, ge=1, le=16, description="bits of I and of Q")
-    backoff_db: float = Field(14.0, description="how far under full scale the RMS of I and of Q lies, dB")
+    bits: int = Field(default=14, ge=1, le=16, description="bits of I and of Q")
+    backoff_db: float = Field(default=14.0, description="how far under full scale the RMS of I and of Q lies, dB")
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -140,9 +143,9 @@ class Localization:
     """Logged position less true position: white noise after a moving average."""
 
     sigma_m: float = Field(ge=0, description="standard deviation per axis after the moving average, m")
-    window_s: float = Field(1.0, gt=0, description="length of the moving average, s")
-    points: tuple[Literal["radar_tx", "radar_rx", "sidelink"], ...] = Field(
-        ("radar_tx", "radar_rx", "sidelink"), description="antennas that are elsewhere than the log says"
+    window_s: float = Field(default=1.0, gt=0, description="length of the moving average, s")
+    points: tuple[AntennaPoint, ...] = Field(
+        default=("radar_tx", "radar_rx", "sidelink"), description="antennas that are elsewhere than the log says"
     )
 
 
@@ -154,22 +157,24 @@ class Impairments:
     and subcarriers, against the noise of one DFT bin. What else reaches the channel does not change the noise.
     """
 
-    clock: Clock = Field(Clock(), description="clock offset")
+    clock: Clock = Field(default=Clock(), description="clock offset")
     carrier_phase: Annotated[UniformPhase | PhaseWalk, Field(discriminator="kind")] | None = Field(
-        None, description="carrier phase per pulse: uniform or walk; null: coherent"
+        default=None, description="carrier phase per pulse: uniform or walk; null: coherent"
     )
-    timing: Timing = Field(Timing(), description="start of each capture")
-    missed_fraction: float = Field(0.0, ge=0, lt=1, description="share of the pulses at which the trigger fails")
-    time_tag: TimeTag = Field(TimeTag(), description="error of the UTC tags")
-    radar_snr_db: float | None = Field(None, description="SNR of the radar channel, dB; null: no noise")
-    sidelink_snr_db: float | None = Field(None, description="SNR of the sidelink, dB; null: no noise")
-    sidelink_gain_db: float = Field(0.0, description="gain of the direct path, dB")
-    sidelink_multipath: tuple[Reflection, ...] = Field((), description="reflections of the sidelink")
-    sidelink_blockage: Blockage | None = Field(None, description="shadowing of the sidelink")
-    leakage: Leakage | None = Field(None, description="direct coupling into the radar channel")
-    transmit_ripple: Ripple | None = Field(None, description="of the transmitter")
-    radar_ripple: Ripple | None = Field(None, description="of the radar receiver")
-    sidelink_ripple: Ripple | None = Field(None, description="of the sidelink receiver")
-    adc: Adc = Field(Adc(), description="converter")
-    localization: Localization | None = Field(None, description="error of the logged positions")
-    doppler: bool = Field(False, description="motion within the pulse; off: stop and go")
+    timing: Timing = Field(default=Timing(), description="start of each capture")
+    missed_fraction: float = Field(
+        default=0.0, ge=0, lt=1, description="share of the pulses at which the trigger fails"
+    )
+    time_tag: TimeTag = Field(default=TimeTag(), description="error of the UTC tags")
+    radar_snr_db: float | None = Field(default=None, description="SNR of the radar channel, dB; null: no noise")
+    sidelink_snr_db: float | None = Field(default=None, description="SNR of the sidelink, dB; null: no noise")
+    sidelink_gain_db: float = Field(default=0.0, description="gain of the direct path, dB")
+    sidelink_multipath: tuple[Reflection, ...] = Field(default=(), description="reflections of the sidelink")
+    sidelink_blockage: Blockage | None = Field(default=None, description="shadowing of the sidelink")
+    leakage: Leakage | None = Field(default=None, description="direct coupling into the radar channel")
+    transmit_ripple: Ripple | None = Field(default=None, description="of the transmitter")
+    radar_ripple: Ripple | None = Field(default=None, description="of the radar receiver")
+    sidelink_ripple: Ripple | None = Field(default=None, description="of the sidelink receiver")
+    adc: Adc = Field(default=Adc(), description="converter")
+    localization: Localization | None = Field(default=None, description="error of the logged positions")
+    doppler: bool = Field(default=False, description="motion within the pulse; off: stop and go")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import Generator
 
 from apertura.simulation.draw import ImpairmentDraw, draw_impairments, independent_streams
-from apertura.simulation.impairments import Impairments
+from apertura.simulation.impairments import AntennaPoint, Impairments, RadarPoint
 from apertura.simulation.radar import Floats, TransmitWaveform
 from apertura.simulation.recording import Geometry, receive
 from apertura.simulation.scene import Scatterers
@@ -87,8 +87,8 @@ def _geometry(
 ) -> Geometry:
     origin, nodes, time_s = campaign.specification.origin, campaign.specification.nodes, campaign.pulse_times(flight)
 
-    def place(name: str, point: str) -> Floats:
-        arm = dict(nodes[name].lever_arms_m).get(point, (0.0, 0.0, 0.0))
+    def place(name: str, point: AntennaPoint) -> Floats:
+        arm = nodes[name].lever_arms_m.get(point, (0.0, 0.0, 0.0))
         logged = phase_centre(origin, campaign.trajectories[flight.name, name], time_s, arm)
         return _true(logged, point, nodes[name].impairments, draws[name])
 
@@ -111,9 +111,12 @@ def _gain(
 ) -> Floats:
     """Return (pulse, point) float64: the field of both radar antennas, relative to their boresights."""
     gain = np.ones((1, 1))
-    ends = ((flight.transmitter, "radar_tx", geometry.radar_tx), (receiver, "radar_rx", geometry.radar_rx))
+    ends: tuple[tuple[str, RadarPoint, Floats], ...] = (
+        (flight.transmitter, "radar_tx", geometry.radar_tx),
+        (receiver, "radar_rx", geometry.radar_rx),
+    )
     for name, point, antenna_m in ends:
-        beam = dict(campaign.specification.nodes[name].antennas).get(point)
+        beam = campaign.specification.nodes[name].antennas.get(point)
         if beam is not None:
             path, time_s = campaign.trajectories[flight.name, name], campaign.pulse_times(flight)
             turn = body_turn(campaign.specification.origin, path, time_s)

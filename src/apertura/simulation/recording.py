@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.draw import ImpairmentDraw
-from apertura.simulation.impairments import Adc, Impairments
+from apertura.simulation.impairments import Adc, ChannelName, Impairments
 from apertura.simulation.radar import Floats, Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum
@@ -49,7 +49,7 @@ def receive(
     impairments: Impairments,
     draw: ImpairmentDraw,
     transmitter: Impairments | None = None,
-    path_offset_m: Mapping[str, float] | None = None,
+    path_offset_m: Mapping[ChannelName, float] | None = None,
     sidelink: bool = True,
 ) -> dict[str, Channel]:
     """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.

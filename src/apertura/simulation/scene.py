@@ -71,8 +71,8 @@ class PointTarget:
     """A point."""
 
     position_m: Vector = Field(description="east, north, up, m")
-    amplitude: complex = Field(1.0, description="echo amplitude at 1 m × 1 m")
-    kind: Literal["point"] = Field("point", kw_only=True, repr=False)
+    amplitude: complex = Field(default=1.0, description="echo amplitude at 1 m × 1 m")
+    kind: Literal["point"] = Field(default="point", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:  # noqa: ARG002
         """Return the one point, east-north-up (m)."""
@@ -86,8 +86,8 @@ class Line:
     start_m: Vector = Field(description="east, north, up, m")
     end_m: Vector = Field(description="east, north, up, m")
     count: int = Field(gt=0, description="number of points")
-    amplitude: complex = Field(1.0, description="echo amplitude of all points together")
-    kind: Literal["line"] = Field("line", kw_only=True, repr=False)
+    amplitude: complex = Field(default=1.0, description="echo amplitude of all points together")
+    kind: Literal["line"] = Field(default="line", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:  # noqa: ARG002
         """Return `count` points, east-north-up (m)."""
@@ -111,8 +111,8 @@ class Plate:
     side_m: Vector = Field(description="from the corner along one side, m")
     other_side_m: Vector = Field(description="from the corner along the other side, m")
     counts: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]] = Field(description="points along each")
-    amplitude: complex = Field(1.0, description="echo amplitude of all points together")
-    kind: Literal["plate"] = Field("plate", kw_only=True, repr=False)
+    amplitude: complex = Field(default=1.0, description="echo amplitude of all points together")
+    kind: Literal["plate"] = Field(default="plate", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:  # noqa: ARG002
         """Return counts[0] × counts[1] points, east-north-up (m)."""
@@ -128,9 +128,11 @@ class Clutter:
 
     bounds_m: tuple[float, float, float, float] = Field(description="east min, north min, east max, north max, m")
     reflectivity: float = Field(ge=0, description="mean power per square metre; 1: one unit point target per m²")
-    density_per_m2: float = Field(10.0, gt=0, description="points per m²; several per resolution cell look like ground")
-    up_m: float = Field(0.0, description="height above the origin, m")
-    kind: Literal["clutter"] = Field("clutter", kw_only=True, repr=False)
+    density_per_m2: float = Field(
+        default=10.0, gt=0, description="points per m²; several per resolution cell look like ground"
+    )
+    up_m: float = Field(default=0.0, description="height above the origin, m")
+    kind: Literal["clutter"] = Field(default="clutter", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:
         """Draw the points and their amplitudes, east-north-up (m)."""

@@ -16,15 +16,13 @@ from pydantic.fields import FieldInfo
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, Impairments
+from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
 from apertura.simulation.radar import Floats, TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
 from apertura.validation import read_yaml, validated
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
-RadarPoint = Literal["radar_tx", "radar_rx"]
-Channels = Mapping[Literal["radar", "sidelink"], float]
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -39,9 +37,11 @@ class WaveformSpecification:
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
     carrier_is: Literal["band_start", "band_centre"] = Field(
-        "band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+        default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
     )
-    code: Literal["qpsk", "newman"] = Field("qpsk", description="code symbols: random QPSK, or Newman's flat symbol")
+    code: Literal["qpsk", "newman"] = Field(
+        default="qpsk", description="code symbols: random QPSK, or Newman's flat symbol"
+    )
 
     @model_validator(mode="after")
     def _dft_fits(self) -> Self:
@@ -73,19 +73,21 @@ class WaveformSpecification:
 class SimulatedNode:
     """One UAV: what it carries, how it logs, and what is wrong with it."""
 
-    lever_arms_m: Mapping[Literal["radar_tx", "radar_rx", "sidelink"], Vector] = Field(
+    lever_arms_m: Mapping[AntennaPoint, Vector] = Field(
         default_factory=dict, description="forward, right, down from the logged point to each antenna, m; missing: zero"
     )
-    path_offset_m: Channels = Field(
+    path_offset_m: Mapping[ChannelName, float] = Field(
         default_factory=dict, description="true electrical path beyond geometry as receiver, m; missing: zero"
     )
-    stated_path_offset_m: Channels | None = Field(None, description="what the config says instead; null: the truth")
-    attitude: Literal["log", "course", "none"] = Field("log", description="what the config says of attitude")
-    log_format: Literal["csv", "pos", "pos_utc"] = Field(
-        "csv", description="csv with attitude, pos (RTKLIB in GPST) or pos_utc"
+    stated_path_offset_m: Mapping[ChannelName, float] | None = Field(
+        default=None, description="what the config says instead; null: the truth"
     )
-    log_rate_hz: float = Field(10.0, gt=0, description="epochs of the log per second, Hz")
-    impairments: Impairments = Field(Impairments(), description="what is wrong with it")
+    attitude: Literal["log", "course", "none"] = Field(default="log", description="what the config says of attitude")
+    log_format: Literal["csv", "pos", "pos_utc"] = Field(
+        default="csv", description="csv with attitude, pos (RTKLIB in GPST) or pos_utc"
+    )
+    log_rate_hz: float = Field(default=10.0, gt=0, description="epochs of the log per second, Hz")
+    impairments: Impairments = Field(default=Impairments(), description="what is wrong with it")
     antennas: Mapping[RadarPoint, GaussianBeam] = Field(
         default_factory=dict, description="beams of the radar antennas; missing: the same in all directions"
     )
@@ -108,12 +110,12 @@ class SimulatedFlight:
     pulses: int = Field(gt=0, description="number of pulses")
     start_utc: Annotated[
         str, BeforeValidator(_utc_text), Field(pattern=r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:[\d.]+)?)?$")
-    ] = Field("2025-05-14T09:30:00", description="UTC of the first pulse, ISO 8601")
-    kind: Literal["image", "calibration"] = Field("image", description="as in flights.tsv")
-    framing: Framing | None = Field(None, description="preamble and frame counter; null: no frame numbers")
-    first_frame: int = Field(0, ge=0, description="number of the first frame")
-    continuous: bool = Field(False, description="recorders run through instead of being triggered")
-    targets: tuple[Target, ...] | None = Field(None, description="what stands there in this flight only")
+    ] = Field(default="2025-05-14T09:30:00", description="UTC of the first pulse, ISO 8601")
+    kind: Literal["image", "calibration"] = Field(default="image", description="as in flights.tsv")
+    framing: Framing | None = Field(default=None, description="preamble and frame counter; null: no frame numbers")
+    first_frame: int = Field(default=0, ge=0, description="number of the first frame")
+    continuous: bool = Field(default=False, description="recorders run through instead of being triggered")
+    targets: tuple[Target, ...] | None = Field(default=None, description="what stands there in this flight only")
 
     @model_validator(mode="after")
     def _transmitter_flies(self) -> Self:
@@ -128,11 +130,13 @@ class ImageGrid:
 
     crs: str = Field(pattern=r"^EPSG:\d+$", description="projected CRS, EPSG:…")
     half_width_m: float | None = Field(
-        None, gt=0, description="half the width of a square about the origin, m, instead of bounds_m"
+        default=None, gt=0, description="half the width of a square about the origin, m, instead of bounds_m"
     )
-    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field("auto", description="outer pixel edges, m")
-    spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
-    height_m: float | None = Field(None, description="ellipsoidal height, m; null: that of the origin")
+    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
+        default="auto", description="outer pixel edges, m"
+    )
+    spacing_m: float | Literal["auto"] = Field(default="auto", description="pixel spacing, m, or auto")
+    height_m: float | None = Field(default=None, description="ellipsoidal height, m; null: that of the origin")
 
     @model_validator(mode="after")
     def _square_has_a_spacing(self) -> Self:

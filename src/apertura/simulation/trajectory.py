@@ -61,9 +61,13 @@ class Sampled:
 class Wobble:
     """Smooth random motion about what was meant to be flown, as wind and a position controller leave it."""
 
-    sigma_m: Vector = Field((0.03, 0.05, 0.04), description="standard deviation east, north, up, m")
-    attitude_sigma_deg: Vector = Field((2.0, 2.0, 3.0), description="standard deviation of roll, pitch, yaw, degrees")
-    smoothing_s: float = Field(1.0, gt=0, description="standard deviation of the Gaussian that smooths white noise, s")
+    sigma_m: Vector = Field(default=(0.03, 0.05, 0.04), description="standard deviation east, north, up, m")
+    attitude_sigma_deg: Vector = Field(
+        default=(2.0, 2.0, 3.0), description="standard deviation of roll, pitch, yaw, degrees"
+    )
+    smoothing_s: float = Field(
+        default=1.0, gt=0, description="standard deviation of the Gaussian that smooths white noise, s"
+    )
 
     def around(self, path: Trajectory, duration_s: float, generator: Generator) -> Sampled:
         """Return `path` with the motion drawn, from 10 s before the first pulse to 10 s after `duration_s`.
@@ -101,8 +105,8 @@ class Straight:
 
     start_m: Vector = Field(description="east, north, up of the origin at the first pulse, m")
     velocity_m_s: Vector = Field(description="east, north, up, m/s")
-    wobble: Wobble | None = Field(None, description="random motion about it; null: none")
-    kind: Literal["straight"] = Field("straight", kw_only=True, repr=False)
+    wobble: Wobble | None = Field(default=None, description="random motion about it; null: none")
+    kind: Literal["straight"] = Field(default="straight", kw_only=True, repr=False)
 
     def position(self, time_s: Floats) -> Floats:
         """Return (time, 3) float64, metres east, north, up of the origin."""
@@ -132,10 +136,11 @@ class Waypoints:
     time_s: tuple[float, ...] = Field(min_length=2, description="seconds after the first pulse, increasing")
     position_m: tuple[Vector, ...] = Field(description="east, north, up of the origin at each, m")
     attitude_deg: tuple[Vector, ...] | None = Field(
-        None, description="roll, pitch, yaw (clockwise from north) at each, degrees; null: level and along the course"
+        default=None,
+        description="roll, pitch, yaw (clockwise from north) at each, degrees; null: level and along the course",
     )
-    wobble: Wobble | None = Field(None, description="random motion about it; null: none")
-    kind: Literal["waypoints"] = Field("waypoints", kw_only=True, repr=False)
+    wobble: Wobble | None = Field(default=None, description="random motion about it; null: none")
+    kind: Literal["waypoints"] = Field(default="waypoints", kw_only=True, repr=False)
 
     @model_validator(mode="after")
     def _one_place_per_time(self) -> Self:
