@@ -10,8 +10,10 @@ import pytest
 import sigmf
 import yaml
 from numpy.testing import assert_allclose
+from typer.testing import CliRunner
 
 from apertura.campaign import Campaign
+from apertura.cli import app
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
 from apertura.simulation import preset, read_specification, simulate, specification_text
@@ -190,16 +192,13 @@ def test_a_calibration_flight_has_its_own_reflector_and_the_config_its_stated_of
     assert config["nodes"]["b"]["path_offset_m"] == {"radar": 0.0}
 
 
-def stream_of(simulation, name, adc=Adc(16, 20.0)):  # noqa: B008
+def stream_of(simulation, name, **settings):
     """A node's continuous recording as complex samples per channel, and its channels."""
     flight = simulation.flights[0]
     channels = flown(simulation)[0][name].channels
     time_s = np.arange(flight.pulses) / simulation.waveform.prf_hz
-    blocks = list(
-        continuous_blocks(
-            channels, time_s, adc, np.random.default_rng(0), framing=flight.framing, first_frame=flight.first_frame
-        )
-    )
+    frames = {"framing": flight.framing, "first_frame": flight.first_frame}
+    blocks = list(continuous_blocks(channels, time_s, Adc(16, 20.0), np.random.default_rng(0), **frames, **settings))
     counts = np.concatenate(blocks).astype(float)
     return counts[..., 0] + 1j * counts[..., 1], channels, time_s, blocks
 
@@ -266,12 +265,11 @@ def test_a_continuous_recording_is_the_definition_on_the_nodes_own_clock():
         assert_allclose(stream[near, 0] * scale, expected, atol=1e-3 * abs(expected).max())
 
 
-def test_a_smaller_block_changes_nothing_but_the_memory(monkeypatch):
+def test_a_smaller_block_changes_nothing_but_the_memory():
     noisy = Impairments(radar_snr_db=20.0, sidelink_snr_db=20.0)
     simulation = small_simulation(framing=FRAMING, continuous=True, secondary=noisy)
     whole, _, _, blocks = stream_of(simulation, "b")
-    monkeypatch.setattr("apertura.simulation.continuous._SAMPLES_AT_ONCE", 3000)
-    pieces, _, _, small = stream_of(simulation, "b")
+    pieces, _, _, small = stream_of(simulation, "b", block_samples=3000)
     assert (pieces == whole).all()
     assert max(map(len, small)) <= 3000 < max(map(len, blocks))
 
@@ -291,9 +289,9 @@ def test_the_log_is_off_by_the_localization_error():
     seen, _ = flown(simulation)
     logged = phase_centre(ORIGIN, flight.tracks["b"], np.arange(6) / 500)
     assert abs(seen["b"].draw.position_error_m).max() > 0.01
-    for place in (seen["b"].geometry.radar_rx, seen["b"].geometry.sidelink_rx):
+    for place in (seen["b"].truth.radar_rx, seen["b"].truth.sidelink_rx):
         assert_allclose(logged - place, seen["b"].draw.position_error_m, atol=1e-8)
-    assert_allclose(seen["b"].geometry.radar_tx, phase_centre(ORIGIN, flight.tracks["a"], np.arange(6) / 500))
+    assert_allclose(seen["b"].truth.radar_tx, phase_centre(ORIGIN, flight.tracks["a"], np.arange(6) / 500))
 
 
 def test_between_frames_there_is_noise_alone():
@@ -529,3 +527,17 @@ def test_parts_given_in_python_replace_those_of_the_specification(tmp_path):
     assert (settings.waveform.subcarriers, settings.waveform.prf_hz) == (32, 400.0)
     with pytest.raises(CampaignError, match="nodes are a, b, z, but tracks are of a, b"):
         simulate(tmp_path / "other", small_simulation(), impairments={"z": Impairments()})
+
+
+def test_the_command_line_takes_a_specification_or_a_preset_and_a_seed(tmp_path):
+    def run(*arguments):
+        return CliRunner().invoke(app, ["simulate", *map(str, arguments)])
+
+    printed = run("--print-spec", "swarm").stdout
+    assert CampaignSpecification(**yaml.safe_load(printed)) == preset("swarm")
+    (tmp_path / "spec.yaml").write_text(SPEC)
+    run(tmp_path / "spec.yaml", tmp_path / "first", "--seed", 4)
+    simulate(tmp_path / "again", tmp_path / "spec.yaml", seed=4)
+    assert contents(tmp_path / "first") == contents(tmp_path / "again")
+    for arguments in ((), ("a", "b", "c"), ("a", "b", "--preset", "demo"), ("a", "--preset", "dmeo")):
+        assert isinstance(run(*arguments).exception, CampaignError)

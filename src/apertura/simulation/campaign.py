@@ -25,7 +25,7 @@ from apertura.simulation.files import (
     write_recording,
 )
 from apertura.simulation.impairments import Adc
-from apertura.simulation.observation import SimulatedRecording, fly
+from apertura.simulation.observation import Observation, fly
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import (
@@ -166,7 +166,7 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
 
 
 def _write_samples(
-    stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight, recording: SimulatedRecording, generator: Generator
+    stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight, recording: Observation, generator: Generator
 ) -> None:
     waveform, adc = campaign.waveform, campaign.specification.nodes[stem.name].impairments.adc
     time_s, draw, framing = campaign.pulse_times(flight), recording.draw, flight.framing
@@ -208,7 +208,7 @@ def _write_samples(
 
 
 def _captures(
-    recording: SimulatedRecording, adc: Adc, kept: NDArray[np.intp], generator: Generator
+    recording: Observation, adc: Adc, kept: NDArray[np.intp], generator: Generator
 ) -> Iterator[NDArray[np.int16]]:
     """Yield (sample, channel, 2) counts of a few captures at a time."""
     channels = recording.channels

@@ -19,7 +19,6 @@ from apertura.simulation.radar import Floats, TransmitWaveform
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate
 
-_SAMPLES_AT_ONCE = 2**18
 Chips = NDArray[np.int8]
 
 
@@ -117,6 +116,7 @@ def continuous_blocks(
     *,
     framing: Framing | None = None,
     first_frame: int = 0,
+    block_samples: int = 2**18,
 ) -> Iterator[NDArray[np.int16]]:
     """Yield (sample, channel, 2) int16 counts of a whole flight, a bounded number of samples at a time.
 
@@ -134,6 +134,8 @@ def continuous_blocks(
         What goes before each symbol; None: nothing.
     first_frame
         Number of the first pulse.
+    block_samples
+        How many samples of noise alone to make at a time.
 
     Raises
     ------
@@ -151,7 +153,7 @@ def continuous_blocks(
     streams = dict(zip(channels, independent_streams(generator, len(channels)), strict=True))
     done = 0
     for pulse, (start, stop) in enumerate([*regions, (total, total)]):
-        pieces = [(begin, min(begin + _SAMPLES_AT_ONCE, start)) for begin in range(done, start, _SAMPLES_AT_ONCE)]
+        pieces = [(begin, min(begin + block_samples, start)) for begin in range(done, start, block_samples)]
         for begin, end in [*pieces, (start, stop)]:
             counts = []
             for name, channel in channels.items():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import pulse_samples
-from apertura.simulation.observation import SimulatedRecording
+from apertura.simulation.observation import Observation
 from apertura.simulation.radar import Floats
 from apertura.simulation.recording import full_scale
 from apertura.simulation.scene import Origin, PointTarget, Target, scatterers
@@ -182,7 +182,7 @@ def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict
 
 
 def flight_truth(
-    campaign: DrawnCampaign, flight: SimulatedFlight, recordings: Mapping[str, SimulatedRecording]
+    campaign: DrawnCampaign, flight: SimulatedFlight, recordings: Mapping[str, Observation]
 ) -> dict[str, Any]:
     """Return everything that was drawn of a flight, node by node."""
     specification = campaign.specification

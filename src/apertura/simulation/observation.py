@@ -1,7 +1,7 @@
 """What nodes observe, as channels without samples yet: of a drawn flight, or of one pair of nodes given as arrays."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -17,27 +17,30 @@ from apertura.simulation.trajectory import body_turn, phase_centre, phase_centre
 
 
 @dataclass(frozen=True)
-class SimulatedRecording:
-    """What one node records in one flight, and what nobody tells the processor.
+class Observation:
+    """A node's channels in one flight, and what the processor is not told.
 
     Attributes
     ----------
     channels
-        Name → channel, ready to be sampled.
+        `radar` and, of a node without the transmitter's clock, `sidelink`: for `samples` or `transfer_functions`.
     draw
-        What was drawn of the node's impairments.
-    geometry
-        True phase centres, ECEF.
+        What was drawn of the receiver's impairments.
+    truth
+        Where the antennas truly were.
+    noise
+        A generator per channel, for their noise; only where arrays were given.
     """
 
     channels: Mapping[str, Channel]
     draw: ImpairmentDraw
-    geometry: Geometry
+    truth: Geometry
+    noise: Mapping[str, Generator] = field(default_factory=dict)
 
 
 def fly(
     campaign: DrawnCampaign, flight: SimulatedFlight, scatterers: Scatterers, generator: Generator
-) -> dict[str, SimulatedRecording]:
+) -> dict[str, Observation]:
     """Return what each node of a flight records.
 
     Parameters
@@ -57,7 +60,7 @@ def fly(
         )
         for name in flight.tracks
     }
-    recordings = {}
+    observations = {}
     for name in flight.tracks:
         geometry = _geometry(campaign, flight, name, draws)
         geometry = replace(geometry, gain=_gain(campaign, flight, name, geometry, scatterers))
@@ -71,8 +74,8 @@ def fly(
             path_offset_m=nodes[name].path_offset_m,
             sidelink=name != flight.transmitter,
         )
-        recordings[name] = SimulatedRecording(channels, draws[name], geometry)
-    return recordings
+        observations[name] = Observation(channels, draws[name], geometry)
+    return observations
 
 
 def _possible(impairments: Impairments, flight: SimulatedFlight) -> Impairments:
@@ -122,28 +125,6 @@ def _gain(
             turn = body_turn(campaign.specification.origin, path, time_s)
             gain = gain * beam.gain(turn, antenna_m, scatterers.position_m)
     return gain
-
-
-@dataclass(frozen=True)
-class Observation:
-    """A pair's channels, and what the processor is not told.
-
-    Attributes
-    ----------
-    channels
-        `radar` and, where asked for, `sidelink`: for `samples` or `transfer_functions`.
-    draw
-        What was drawn of the receiver.
-    truth
-        Where the antennas truly were.
-    noise
-        A generator per channel, for their noise.
-    """
-
-    channels: Mapping[str, Channel]
-    draw: ImpairmentDraw
-    truth: Geometry
-    noise: Mapping[str, Generator]
 
 
 def observe(

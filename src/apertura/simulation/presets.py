@@ -49,7 +49,7 @@ def demo(*, pulses: int = 300) -> CampaignSpecification:
     """
     tracks = {"uav1": _pass_by(-1.9, pulses), "uav2": _pass_by(2.8, pulses)}
     nodes = {"uav1": _PRIMARY, "uav2": _secondary(0.911, 0.402, tag_s=3.7e-3)}
-    return _by_the_danube("tandem_demo", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
+    return _over_the_demo_scene("tandem_demo", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
 
 
 def swarm(*, pulses: int = 240) -> CampaignSpecification:
@@ -60,7 +60,7 @@ def swarm(*, pulses: int = 240) -> CampaignSpecification:
         name = f"uav{number}"
         nodes[name] = _secondary(0.4 * number, 0.2 * number, tag_s=1.3e-3 * (number - 3.3))
         tracks[name] = _pass_by(middle_m, pulses, right_m=right_m, up_m=up_m)
-    return _by_the_danube("swarm", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
+    return _over_the_demo_scene("swarm", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
 
 
 def continuous(*, pulses: int = 60) -> CampaignSpecification:
@@ -121,14 +121,11 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
 
 
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
-    "demo": demo,
-    "paper": paper,
-    "swarm": swarm,
-    "continuous": continuous,
+    made.__name__: made for made in (demo, paper, swarm, continuous)
 }
 
 
-def _by_the_danube(name: str, nodes: dict[str, SimulatedNode], flight: SimulatedFlight) -> CampaignSpecification:
+def _over_the_demo_scene(name: str, nodes: dict[str, SimulatedNode], flight: SimulatedFlight) -> CampaignSpecification:
     grid = ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.05)
     return CampaignSpecification(name, DEMO_ORIGIN, _DEMO_WAVEFORM, _DEMO_TARGETS, nodes, (flight,), grid)
 

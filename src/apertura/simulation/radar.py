@@ -156,7 +156,7 @@ def echo_paths(
 
     Notes
     -----
-    Source: ../shared/DESIGN.md section 3 (delays) and 4 (R⁻² amplitude); docs/theory/simulate.md, eq. 1.
+    Source: docs/theory/simulate.md, eq. 1.
 
     Examples
     --------
