@@ -91,12 +91,24 @@ def receive(
     sent = (transmitter or impairments).transmit_ripple
     transmitted = sent.response(waveform.frequency_hz) if sent else np.ones(len(waveform.codes), np.complex128)
     power = spectral_power(waveform, echoes)
-    heard = {"radar": (_with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power), power)}
+    leaked = _with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power)
+    heard = {"radar": (leaked, power, impairments.radar_ripple, impairments.radar_snr_db)}
     if sidelink:
-        heard["sidelink"] = (_sidelink(direct, impairments, draw), spectral_power(waveform, direct))
+        power = spectral_power(waveform, direct)
+        paths = _sidelink(direct, impairments, draw)
+        heard["sidelink"] = (paths, power, impairments.sidelink_ripple, impairments.sidelink_snr_db)
     return {
-        name: _channel(waveform, name, paths, level, transmitted=transmitted, impairments=impairments, draw=draw)
-        for name, (paths, level) in heard.items()
+        name: Channel(
+            waveform,
+            paths,
+            transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
+            draw.phase_rad,
+            draw.start_s,
+            cfo_hz=impairments.clock.cfo_hz,
+            sfo_hz=impairments.clock.sfo_hz,
+            noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
+        )
+        for name, (paths, power, ripple, snr_db) in heard.items()
     }
 
 
@@ -132,31 +144,6 @@ def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray
     limit = 2 ** (adc.bits - 1)
     counts = np.rint(np.ascontiguousarray(samples)[..., None].view(np.float64) * (limit / full_scale_amplitude))
     return np.asarray(np.clip(counts, -limit, limit - 1), np.int16)
-
-
-def _channel(
-    waveform: TransmitWaveform,
-    name: str,
-    paths: Paths,
-    power: float,
-    *,
-    transmitted: Complex,
-    impairments: Impairments,
-    draw: ImpairmentDraw,
-) -> Channel:
-    radar = name == "radar"
-    ripple = impairments.radar_ripple if radar else impairments.sidelink_ripple
-    snr_db = impairments.radar_snr_db if radar else impairments.sidelink_snr_db
-    return Channel(
-        waveform,
-        paths,
-        transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
-        draw.phase_rad,
-        draw.start_s,
-        cfo_hz=impairments.clock.cfo_hz,
-        sfo_hz=impairments.clock.sfo_hz,
-        noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
-    )
 
 
 def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, offset_m: float, power: float) -> Paths:

@@ -57,16 +57,9 @@ class WaveformSpecification:
 
     def drawn(self, generator: Generator) -> TransmitWaveform:
         """Return the waveform with its code symbols."""
-        return TransmitWaveform(
-            qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers),
-            self.carrier_hz,
-            self.carrier_is,
-            self.subcarrier_spacing_hz,
-            self.symbol_s,
-            self.cyclic_prefix_s,
-            self.sample_rate_hz,
-            self.prf_hz,
-        )
+        codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
+        sent = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code"}}
+        return TransmitWaveform(codes, **sent)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
