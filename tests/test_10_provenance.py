@@ -40,7 +40,7 @@ def touched(copied, file, module):
         ("ingest/rtklib.py", "ingest", True),
         ("simulation/presets.py", "image", False),
         ("constants.py", "image", True),
-        ("settings/node.py", "ingest", True),
+        ("settings/nodes.py", "ingest", True),
         ("store/locks.py", "ingest", True),
         ("cli.py", "ingest", False),
     ],

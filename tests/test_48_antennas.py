@@ -24,7 +24,7 @@ from apertura.simulation import (
 )
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.steps import echo, image, ingest, profile, scene
-from apertura.steps.plan import plan_pair
+from apertura.steps.plan import expected_plan
 from apertura.store import open_stage
 
 PULSES, STEP_M, BACK_M, UP_M = 80, 0.1, 11.5, 4.8
@@ -185,7 +185,7 @@ def test_the_beam_turns_with_the_yaw_that_was_logged(beamed):
     turned = [",".join([*line.split(",")[:-1], str(float(line.split(",")[-1]) - 180)]) for line in lines]
     log.write_text("\n".join([head, *turned]) + "\n")
     campaign = stated(beamed, BEAM)
-    message = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))
+    message = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))
     slant = np.radians(DEPRESSION_DEG)
     towards = np.array([STEP_M * (PULSES - 1) / 2, BACK_M, UP_M])
     off_deg = np.degrees(np.arccos(towards @ [0, -np.cos(slant), np.sin(slant)] / np.linalg.norm(towards)))
@@ -194,7 +194,7 @@ def test_the_beam_turns_with_the_yaw_that_was_logged(beamed):
 
 def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beamed):
     campaign = stated(beamed, BEAM | {"boresight_deg": [-90.0, -DEPRESSION_DEG]})
-    before = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))
+    before = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))
     for part in ("uav1's radar_tx", "uav1's radar_rx", "right is +90", "yaw (clockwise from north)", "pattern ends at"):
         assert part in before
     assert complaint(lambda: imaged(campaign)) == before
@@ -237,11 +237,10 @@ def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     np.testing.assert_allclose(east_north_up, [AHEAD, RIGHT, [0, 0, -1]], atol=1e-4)
 
 
-@pytest.mark.parametrize("override", [{"pulse_thinning": 4}, {"midpoint": True}])
-def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(beamed, override):
-    message = complaint(lambda: plan_pair(stated(beamed, BEAM, **override), "f01", "uav1-uav1"))
-    assert f"processing.{next(iter(override))}" in message
-    reasons = plan_pair(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
-    assert "weigh every pulse" in reasons["pulse_thinning"]
+def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(beamed):
+    message = complaint(lambda: expected_plan(stated(beamed, BEAM, presum=4), "f01", "uav1-uav1"))
+    assert "config/config.yaml: processing.presum" in message
+    reasons = expected_plan(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
+    assert "weigh every pulse" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: of 80 pulses")
-    assert "antenna" not in plan_pair(stated(beamed, None), "f01", "uav1-uav1").reasons
+    assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons

@@ -99,9 +99,10 @@ def _compiled(closure: Mapping[str, Path]) -> list[Path]:
 
 
 def _source(name: str) -> Path | None:
-    if name.split(".", maxsplit=1)[0] != _PACKAGE.name:
+    package, *parts = name.split(".")
+    if package != _PACKAGE.name or not parts:  # the package itself only hands out public names, nobody runs it
         return None
-    base = _PACKAGE.joinpath(*name.split(".")[1:])
+    base = _PACKAGE.joinpath(*parts)
     return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
 
 

@@ -27,26 +27,6 @@ rule scene:
         "apertura step scene > {log} 2>&1"
 
 
-rule costs:
-    output:
-        "results/costs.json",
-    log:
-        "results/logs/costs.log",
-    benchmark:
-        "results/benchmarks/costs.tsv"
-    conda:
-        "../../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura.planning.machine"),
-    message:
-        "keeping what imaging costs here, so that all jobs plan alike"
-    shell:
-        "apertura step costs > {log} 2>&1"
-
-
 rule terrain:
     input:
         "results/scene.json",
@@ -100,7 +80,6 @@ rule tiles:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
-        "results/costs.json",
         campaign.terrain_sources(),
         lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
     output:
@@ -129,7 +108,6 @@ rule image:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
-        "results/costs.json",
         campaign.terrain_sources(),
         lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
         [

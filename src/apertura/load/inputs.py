@@ -3,18 +3,18 @@
 import xarray as xr
 
 from apertura.echo.compression import window_weights
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.geometry.aperture import Aperture
 
 
-def spectra_of(echo: xr.Dataset, window: str) -> Spectra:
+def phase_history_of(echo: xr.Dataset, window: str) -> PhaseHistory:
     """Return the transfer functions of an echo stage as arrays, weighted by a window over the subcarriers."""
-    return Spectra(
+    return PhaseHistory(
         echo.transfer.values,
         echo.frequency.values,
         window_weights(window, len(echo.subcarrier)),
         echo.reference_delay.values,
-        echo.tx_position.values,
-        echo.rx_position.values,
+        aperture_of(echo),
     )
 
 
@@ -26,6 +26,10 @@ def profiles_of(profile: xr.Dataset) -> Profiles:
         profile.attrs["step_m"],
         profile.attrs["centre_frequency_hz"],
         profile.attrs["oversampling"],
-        profile.tx_position.values,
-        profile.rx_position.values,
+        aperture_of(profile),
     )
+
+
+def aperture_of(stage: xr.Dataset) -> Aperture:
+    """Return the phase centres of an echo or profile stage."""
+    return Aperture(stage.tx_position.values, stage.rx_position.values)

@@ -8,7 +8,7 @@ import zarr
 
 from apertura.campaign import Campaign
 from apertura.fusion.sums import coherent_sum, noncoherent_sum
-from apertura.steps.scene import scene_grid
+from apertura.load.scene import settled_scene
 from apertura.steps.stamping import stamped
 from apertura.store import finish, lay_out, open_stage, writing
 
@@ -23,7 +23,7 @@ def cube(campaign: Campaign) -> Path:
         for pair in flight.pairs
     }
     side = campaign.settings.processing.tile_px
-    folder = campaign.stage("cube")
+    windows, folder = list(settled_scene(campaign).grid.tiles(side)), campaign.stage("cube")
     with writing(folder) as wip:
         empty = _empty(images, [flight.name for flight in flights], pairs)
         chunks = {"image": (1, 1, side, side), "coherent": (1, side, side), "noncoherent": (1, side, side)}
@@ -32,7 +32,7 @@ def cube(campaign: Campaign) -> Path:
         for place, flight in enumerate(flights):
             present = [images[flight.name, pair] for pair in flight.pairs]
             peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present])
-            for window in scene_grid(campaign).tiles(side):
+            for window in windows:
                 stack = np.stack([image.image[window].values for image in present])
                 for pair, block in zip(flight.pairs, stack, strict=True):
                     arrays["image"][place, pairs.index(pair), *window] = block

@@ -14,12 +14,11 @@ from apertura import __version__
 from apertura.campaign import Campaign
 from apertura.contracts import canonical_json
 from apertura.export import EXPORTS
-from apertura.geometry.geodesy import local_crs
+from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
 from apertura.quality.measures import Raster, coherence_factor, survey
-from apertura.quality.point_targets import Patch, find_peak, ground_position
-from apertura.scene.grid import LOCAL
-from apertura.steps.scene import scene_grid
+from apertura.quality.point_targets import Patch, find_peak
+from apertura.scene.grid import SceneGrid
 from apertura.store import open_stage, write_json
 
 
@@ -39,12 +38,14 @@ class Amplitude:
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
-    """Write slc, power and db GeoTIFFs and the quicklook of one pair; return their paths."""
+    """Write slc, power and db GeoTIFFs and the quicklook of one pair, or of 'fused'; return their paths."""
+    if pair == "fused":
+        return export_fused(campaign, flight)
     dataset = open_stage(campaign.stage("image", flight, pair), "image")
     tags = _tags(dataset, dataset.attrs["quality"])
     title = f"{campaign.settings.campaign} · flight {flight} · {pair}"
-    folder = campaign.results / flight / pair
-    return [_write(campaign, folder / name, dataset.image, tags, title) for name in EXPORTS]
+    folder, grid = campaign.results / flight / pair, settled_scene(campaign).grid
+    return [_write(grid, folder / name, dataset.image, tags, title) for name in EXPORTS]
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
@@ -57,32 +58,32 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     quality = _worst(images)
     tags, folder = _tags(dataset, quality), campaign.results / flight / "fused"
     title = f"{campaign.settings.campaign} · flight {flight} · coherent sum of {' + '.join(pairs)}"
+    grid = settled_scene(campaign).grid
     sums: dict[str, Raster] = {"coherent": coherent, "noncoherent": amplitude}
     written = [
-        _write(campaign, folder / f"{kind}_{name}", sums[kind], tags, title)
+        _write(grid, folder / f"{kind}_{name}", sums[kind], tags, title)
         for kind, names in (("coherent", ("slc.tif", "power.tif", "db.tif")), ("noncoherent", ("power.tif", "db.tif")))
         for name in names
     ]
     report = folder / "image.json"
-    write_json(report, quality | _fused_report(campaign, flight, sums, images))
-    return [*written, _write(campaign, folder / "quicklook.png", coherent, tags, title), report]
+    write_json(report, quality | _fused_report(campaign, flight, grid, sums, images))
+    return [*written, _write(grid, folder / "quicklook.png", coherent, tags, title), report]
 
 
-def _write(campaign: Campaign, path: Path, image: Raster, tags: dict[str, str], title: str) -> Path:
-    grid = scene_grid(campaign)
-    crs = local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs
+def _write(grid: SceneGrid, path: Path, image: Raster, tags: dict[str, str], title: str) -> Path:
     product = path.name.removeprefix("coherent_").removeprefix("noncoherent_")
-    EXPORTS[product](path, image, transform=Affine(*grid.transform), crs=crs, tags=tags, title=title)
+    EXPORTS[product](path, image, transform=Affine(*grid.transform), crs=grid.crs_wkt, tags=tags, title=title)
     return path
 
 
-def _fused_report(campaign: Campaign, flight: str, sums: dict[str, Raster], images: list[xr.Dataset]) -> dict[str, Any]:
-    grid = scene_grid(campaign)
+def _fused_report(
+    campaign: Campaign, flight: str, grid: SceneGrid, sums: dict[str, Raster], images: list[xr.Dataset]
+) -> dict[str, Any]:
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     found = {kind: survey(layer, windows) for kind, layer in sums.items()}
     top = found["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
-    x, y = ground_position(grid, peak)
+    x, y = map(float, grid.map_at(peak.row, peak.column))
     values = [
         complex(Patch(image.image, top.row, top.column).at(peak.row, peak.column))
         / image.attrs["quality"]["brightest"]["amplitude"]

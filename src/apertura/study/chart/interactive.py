@@ -39,7 +39,7 @@ const make = (name,attributes,text) => {
   if (text!==undefined) node.textContent = text;
   svg.appendChild(node); return node;
 };
-const thin = p => p.pulse_thinning>1 ? `, ${p.pulse_thinning}:1 pulses` : "";
+const thin = p => p.presum>1 ? `, ${p.presum}:1 pulses` : "";
 const words = p => `${p.setting}${thin(p)}: ${p.seconds.toPrecision(3)} s `
   +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db.toFixed(1)} dB (predicted `
   +`${p.predicted_error_db.toFixed(1)}), ${p.pixel_pulses_per_s.toExponential(2)} pixel·pulses/s`
@@ -70,7 +70,7 @@ function draw() {
     mark.addEventListener("pointerenter",()=>{document.getElementById("tip").textContent = words(p);});
   }
 }
-const columns = ["setting","pulse_thinning","seconds","predicted_seconds","error_db","predicted_error_db",
+const columns = ["setting","presum","seconds","predicted_seconds","error_db","predicted_error_db",
   "pixel_pulses_per_s"];
 function table(by="seconds") {
   const rows = document.getElementById("rows"), head = document.createElement("tr"); rows.replaceChildren(head);

@@ -23,7 +23,7 @@ class Point:
 
     engine: str
     setting: str
-    pulse_thinning: int
+    presum: int
     seconds: float
     pixel_pulses_per_s: float
     error_db: float
@@ -90,7 +90,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     )
     for point in points:
         if point.planned:
-            thin = f", {point.pulse_thinning}:1 pulses" if point.pulse_thinning > 1 else ""
+            thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
             label = f"planner's choice: {point.setting}{thin}"
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
     axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")

@@ -1,4 +1,4 @@
-"""The scene every study looks at: the paper's five targets as arrays, thinned to what a question needs."""
+"""The scene of every study: the paper's five targets as arrays, with as few pulses and subcarriers as suffice."""
 
 from dataclasses import dataclass, replace
 
@@ -13,13 +13,19 @@ from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import transfer_functions
-from apertura.study.window import demodulated, window_samples
+from apertura.study.dft_window import demodulated, window_samples
 
 Complexes = NDArray[np.complex64]
 
+LENGTH_M = 30.0
+"""Aperture, flown at 1 m/s."""
+
+RX_AHEAD_M = 4.7
+"""Distance of the receiver ahead of the transmitter, along the track, in the bistatic studies."""
+
 
 @dataclass(frozen=True)
-class Bench:
+class PaperScene:
     """What is transmitted, over which targets, from where.
 
     Attributes
@@ -47,16 +53,8 @@ class Bench:
         return np.asarray(np.linalg.norm(self.geometry.sidelink_tx - self.geometry.sidelink_rx, axis=1))
 
 
-def paper_bench(
-    *,
-    pulses: int,
-    subcarriers: int,
-    rx_ahead_m: float = 0.0,
-    length_m: float = 30.0,
-    speed_m_s: float = 1.0,
-    qpsk: bool = False,
-) -> Bench:
-    """Return the paper's simulated scene with fewer pulses and subcarriers over the same aperture and band.
+def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qpsk: bool = False) -> PaperScene:
+    """Return the paper's simulated scene with fewer pulses and subcarriers over the same 30 m at 1 m/s and band.
 
     Parameters
     ----------
@@ -66,35 +64,32 @@ def paper_bench(
         A divisor of 4096, at least 128: then the scene is shorter than the unambiguous path c/Δf.
     rx_ahead_m
         Distance of the receiver ahead of the transmitter; 0 for the monostatic pair.
-    length_m, speed_m_s
-        Aperture and ground speed, which give the repetition frequency.
     qpsk
         Random QPSK codes, whose leakage between subcarriers is like noise, instead of the flat quadratic-phase
         code, which turns part of it into a shift.
 
     Notes
     -----
-    Source: docs/theory/study.md, "Thinning".
+    Source: docs/theory/study.md, "Fewer pulses and subcarriers".
 
     Examples
     --------
-    >>> bench = paper_bench(pulses=300, subcarriers=128)
-    >>> float(bench.waveform.prf_hz), float(bench.frequency_hz[-1] - bench.frequency_hz[0])
+    >>> scene = reduced_scene(pulses=300, subcarriers=128)
+    >>> float(scene.waveform.prf_hz), float(scene.frequency_hz[-1] - scene.frequency_hz[0])
     (10.0, 406400000.0)
     """
-    waveform = paper_waveform(prf_hz=pulses * speed_m_s / length_m)
+    waveform = paper_waveform(prf_hz=pulses / LENGTH_M)
     every = len(waveform.codes) // subcarriers
     codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else newman_codes(subcarriers)
     waveform = replace(waveform, codes=codes, subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz)
-    scatterers, geometry = paper_scene(pulses=pulses, length_m=length_m, rx_ahead_m=rx_ahead_m)
-    return Bench(waveform, scatterers, geometry)
+    return PaperScene(waveform, *paper_scene(pulses=pulses, length_m=LENGTH_M, rx_ahead_m=rx_ahead_m))
 
 
-PERFECT = Impairments()
+NO_IMPAIRMENTS = Impairments()
 
 
 @dataclass(frozen=True)
-class Case:
+class Disturbance:
     """What goes wrong in one observation.
 
     Attributes
@@ -109,41 +104,52 @@ class Case:
         Pass the samples through the converter of the receiver.
     """
 
-    receiver: Impairments = PERFECT
+    receiver: Impairments = NO_IMPAIRMENTS
     transmitter: Impairments | None = None
     sampled: bool = False
     quantised: bool = False
 
 
-def receive_pair(bench: Bench, case: Case, generator: Generator) -> tuple[Complexes, Complexes, Observation]:
+UNDISTURBED = Disturbance()
+UNDISTURBED_PAIR = Disturbance(transmitter=NO_IMPAIRMENTS)
+
+
+def receive_pair(
+    scene: PaperScene, disturbance: Disturbance, generator: Generator
+) -> tuple[Complexes, Complexes, Observation]:
     """Return transfer functions of radar and sidelink, (pulse, subcarrier) complex64, and what was drawn.
 
     Examples
     --------
-    >>> bench = paper_bench(pulses=4, subcarriers=128, rx_ahead_m=4.7)
-    >>> radar, sidelink, _ = receive_pair(bench, Case(transmitter=Impairments()), np.random.default_rng(0))
+    >>> scene = reduced_scene(pulses=4, subcarriers=128, rx_ahead_m=4.7)
+    >>> radar, sidelink, _ = receive_pair(scene, UNDISTURBED_PAIR, np.random.default_rng(0))
     >>> radar.shape, sidelink.shape
     ((4, 128), (4, 128))
     """
-    seen = observe(
-        bench.waveform,
-        bench.scatterers,
-        bench.geometry,
+    observation = observe(
+        scene.waveform,
+        scene.scatterers,
+        scene.geometry,
         generator,
-        receiver=case.receiver,
-        transmitter=case.transmitter,
+        receiver=disturbance.receiver,
+        transmitter=disturbance.transmitter,
     )
-    both = [_channel(seen, name, case) for name in ("radar", "sidelink")]
-    return both[0], both[1], seen
+    radar = _transfer(observation, "radar", disturbance)
+    return radar, _transfer(observation, "sidelink", disturbance), observation
 
 
-def _channel(seen: Observation, name: str, case: Case) -> Complexes:
-    channel, noise = seen.channels[name], seen.noise[name]
-    if not case.sampled:
+def receive_undisturbed(scene: PaperScene) -> Complexes:
+    """Return the radar's transfer functions, (pulse, subcarrier) complex64, with nothing wrong and without noise."""
+    return receive_pair(scene, UNDISTURBED, np.random.default_rng(0))[0]
+
+
+def _transfer(observation: Observation, name: str, disturbance: Disturbance) -> Complexes:
+    channel, noise = observation.channels[name], observation.noise[name]
+    if not disturbance.sampled:
         return transfer_functions(channel, noise).astype(np.complex64)
     samples = window_samples(channel, noise)
-    if case.quantised:
-        adc = case.receiver.adc
+    if disturbance.quantised:
+        adc = disturbance.receiver.adc
         scale = full_scale(channel, adc)
         counts = digitize(samples, adc, scale)
         samples = (counts[..., 0] + 1j * counts[..., 1]) * (scale / 2 ** (adc.bits - 1))
