@@ -23,10 +23,9 @@ from apertura.load.pair import open_pair
 from apertura.load.plan import job_of, plan_pair
 from apertura.load.scene import expected_scene, open_scene, settled_scene
 from apertura.scene.grid import SceneGrid
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.plan import grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
-from apertura.simulation.scene import PointTarget, Scene
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.simulation.presets import DEMO_ORIGIN
+from apertura.simulation.scene import PointTarget
 from apertura.steps import profile, scene, terrain
 from apertura.steps.plan import expected_plan
 from apertura.steps.verify import verify
@@ -68,13 +67,11 @@ def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=None,
 @pytest.fixture(scope="module")
 def hillside(tmp_path_factory):
     """The tiny campaign with three targets on a plane tilted by 20°, imaged with its DEM."""
-    generator = np.random.default_rng(7)
-    plan = replace(tandem(generator, pulses=60), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
+    plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     right = np.array([ALONG[1], -ALONG[0]])  # apart in range, so that a short aperture does not mix them
     places = [across * right + along * ALONG for across, along in ((0.0, 0.0), (2.0, 0.8), (-2.0, -0.6))]
     targets = tuple(PointTarget((x, y, SLOPE * float(UPHILL @ (x, y)))) for x, y in places)
-    plan = replace(plan, scene=Scene(DEMO_ORIGIN, targets))
-    root = write_campaign(tmp_path_factory.mktemp("hillside") / "campaign", plan, generator)
+    root = simulate(tmp_path_factory.mktemp("hillside") / "campaign", plan, targets=targets, seed=7)
     write_plane(root)
     edit_scene(root, dem="dem.tif", dem_datum="ellipsoid")
     return run_steps(root)

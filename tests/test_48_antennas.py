@@ -11,13 +11,18 @@ from test_41_bad_input import complaint, edit_config
 
 from apertura.campaign import Campaign
 from apertura.quality.point_targets import cut_through, find_peak
-from apertura.simulation.antenna import Antenna
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.flight import Straight
-from apertura.simulation.impairments import Impairments
-from apertura.simulation.plan import Flight, Node, grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
-from apertura.simulation.scene import PointTarget, Scene
+from apertura.simulation import (
+    GaussianBeam,
+    ImageGrid,
+    Impairments,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    preset,
+    simulate,
+)
+from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.steps import echo, image, ingest, profile, scene
 from apertura.steps.plan import expected_plan
 from apertura.store import open_stage
@@ -31,23 +36,22 @@ BEAM = {"boresight_deg": [90.0, -DEPRESSION_DEG], "beamwidth_deg": [15.0, 60.0]}
 
 def fly(folder, antennas, snr_db):
     """Straight along azimuth 40°, the one target abeam of the middle."""
-    generator = np.random.default_rng(5)
-    plan = tandem(generator, pulses=PULSES)
+    plan = preset("demo", pulses=PULSES)
     speed = STEP_M * plan.waveform.prf_hz
     start = -RIGHT * BACK_M - AHEAD * STEP_M * (PULSES - 1) / 2 + [0, 0, UP_M]
     plan = replace(
         plan,
-        scene=Scene(DEMO_ORIGIN, (PointTarget((0, 0, 0)),)),
-        nodes=(Node("uav1", impairments=Impairments(radar_snr_db=snr_db), antennas=antennas),),
-        flights=(Flight("f01", "uav1", {"uav1": Straight(tuple(start), tuple(AHEAD * speed))}, PULSES),),
-        grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.2, spacing_m=0.05),
+        targets=(PointTarget((0, 0, 0)),),
+        nodes={"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=snr_db), antennas=antennas)},
+        flights=(SimulatedFlight("f01", "uav1", {"uav1": Straight(tuple(start), tuple(AHEAD * speed))}, PULSES),),
+        scene=ImageGrid("EPSG:32632", half_width_m=3.2, spacing_m=0.05),
     )
-    return write_campaign(folder / "campaign", plan, generator)
+    return simulate(folder / "campaign", plan, seed=5)
 
 
 @pytest.fixture(scope="module")
 def _beamed(tmp_path_factory):
-    looking = Antenna((90.0, -DEPRESSION_DEG), (15.0, 60.0))
+    looking = GaussianBeam((90.0, -DEPRESSION_DEG), (15.0, 60.0))
     return fly(tmp_path_factory.mktemp("beams"), {"radar_tx": looking, "radar_rx": looking}, -10.0)
 
 

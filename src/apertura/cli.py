@@ -142,15 +142,23 @@ def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> N
 
 @app.command()
 def simulate(
-    directory: Annotated[Path, typer.Argument(help="campaign folder to make")],
+    paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
+    preset: Annotated[str | None, typer.Option(help="demo (the default), paper, swarm or continuous")] = None,
     seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
+    print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
 ) -> None:
-    """Write a small tandem flight as a campaign folder of raw IQ, with truth.json."""
-    import numpy as np
+    """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""
+    from apertura import simulation
 
-    from apertura.simulation.presets import tandem_demo
-
-    print(tandem_demo(directory, np.random.default_rng(seed)))
+    if print_spec is not None:
+        print(simulation.specification_text(simulation.preset(print_spec)), end="")
+        return
+    paths = paths or []
+    if len(paths) + (preset is not None) not in {1, 2} or not paths:
+        given = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
+        raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+    chosen = paths[0] if len(paths) > 1 else simulation.preset(preset or "demo")
+    print(simulation.simulate(paths[-1], chosen, seed=seed))
 
 
 @step.command()

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic_core import ArgsKwargs
 
 from apertura.errors import CampaignError
 
@@ -90,7 +91,7 @@ def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":
         return key, "missing"
-    shown = "" if isinstance(item["input"], dict | BaseModel) else f" (found {item['input']!r})"
+    shown = "" if isinstance(item["input"], dict | BaseModel | ArgsKwargs) else f" (found {item['input']!r})"
     return key, f"{item['msg'].removeprefix('Value error, ')}{shown}"
 
 
