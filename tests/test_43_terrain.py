@@ -16,9 +16,9 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
+from apertura.imaging.stages import phase_history_of, profiles_of
 from apertura.load import pair as pairs
 from apertura.load.ground import Ground
-from apertura.load.inputs import phase_history_of, profiles_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import job_of, plan_pair
 from apertura.load.scene import expected_scene, open_scene, settled_scene

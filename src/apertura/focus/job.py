@@ -75,6 +75,8 @@ class Job:
         errors of tables weigh that much more. None before anything was recorded.
     beams, illumination
         Of the antennas, where they have any, over all pulses.
+    recorded
+        Whether the phase history is there, which the double sum reads.
     """
 
     aperture: Aperture
@@ -94,6 +96,7 @@ class Job:
     content_db: float | None = None
     beams: Beams | None = None
     illumination: Illumination | None = None
+    recorded: bool = True
 
     @property
     def pixels(self) -> int:

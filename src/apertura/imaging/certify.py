@@ -61,7 +61,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
     overview, grid = survey(target, formation.windows), formation.grid
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
-    track = formation.history.aperture.tx_m
+    track = formation.profiles.aperture.tx_m
     along = grid.direction(track[-1] - track[0], peak.row, peak.column)
     cuts = {
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency
 from apertura.focus.engines import reference
-from apertura.focus.inputs import PhaseHistory
+from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job, Signal
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.range_profiles import RangeWindow
@@ -64,6 +65,34 @@ def imaging_job(
         terrain=ground,
         content_db=None if history is None else _content_db(history, grid, ground.full, beams),
         beams=beams,
+    )
+
+
+def profiles_job(profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None) -> Job:
+    """Return the planner's job of range profiles alone: their band is taken as full and flat, their echo as unseen.
+
+    Parameters
+    ----------
+    profiles
+        In the frame of the pixels.
+    grid, ground, beams
+        As `imaging_job`.
+    """
+    bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
+    centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
+    return Job(
+        aperture=profiles.aperture,
+        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
+        shape=grid.shape,
+        spacing_m=grid.spacing_m,
+        centre_hz=centre,
+        bandwidth_hz=bandwidth_hz,
+        subcarriers=samples,
+        signal=Signal(centre, profiles.oversampling, profiles.step_m, samples),
+        frame=grid.frame,
+        terrain=ground,
+        beams=beams,
+        recorded=False,
     )
 
 

@@ -18,9 +18,9 @@ from apertura.echo.demodulate import subcarrier_numbers
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
+from apertura.imaging.stages import phase_history_of
 from apertura.ingest import PHASE_HISTORIES, TRACKS
 from apertura.load.antennas import beams_of, body_axes
-from apertura.load.inputs import phase_history_of
 from apertura.load.scene import Flown
 from apertura.settings import OfdmWaveform
 from apertura.store import manifest_of, open_stage

@@ -82,13 +82,6 @@ class OpenScene:
         """What image.json says of the terrain; nothing of flat ground."""
         return {"terrain": self.parents[0].attrs["terrain"]} if self.parents else {}
 
-    @property
-    def coordinates(self) -> dict[str, Any]:
-        """Coordinates y, x and spatial_ref of a raster stage."""
-        step, _, west, _, _, north = self.grid.transform
-        reference = {"crs_wkt": self.grid.crs_wkt, "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
-        return {"y": self.grid.y_m, "x": self.grid.x_m, "spatial_ref": ((), 0, reference)}
-
 
 def settled_scene(campaign: Campaign) -> OpenScene:
     """Return what results/scene.json settled, on level ground: whoever needs the ground itself opens the scene."""

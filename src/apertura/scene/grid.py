@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,6 +79,13 @@ class SceneGrid:
     def crs_wkt(self) -> str:
         """The CRS of rasters on this grid, as GDAL writes it."""
         return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """Coordinates y, x and spatial_ref (CF grid mapping) of an xarray raster on this grid."""
+        step, _, west, _, _, north = self.transform
+        reference = {"crs_wkt": self.crs_wkt, "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+        return {"y": self.y_m, "x": self.x_m, "spatial_ref": ((), 0, reference)}
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:

@@ -14,8 +14,8 @@ from apertura.focus.engines import ENGINES
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.certify import certified, measures
 from apertura.imaging.formation import Formation
+from apertura.imaging.stages import profiles_of
 from apertura.load.antennas import antennas_report
-from apertura.load.inputs import profiles_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
@@ -118,7 +118,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     empty = stamped(
         xr.Dataset(
             {"image": (("y", "x"), np.broadcast_to(np.complex64(0), scene.grid.shape))},
-            coords=scene.coordinates,
+            coords=scene.grid.coordinates,
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),
         "image",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
-from apertura.load.inputs import phase_history_of
+from apertura.imaging.stages import phase_history_of
 from apertura.load.scene import open_scene
 from apertura.scene.clearance import check_antennas
 from apertura.settings import CONFIG

@@ -57,7 +57,7 @@ def _empty(campaign: Campaign, scene: OpenScene, ground: Ground) -> xr.Dataset:
     return stamped(
         xr.Dataset(
             {"height": (("y", "x"), np.broadcast_to(np.float64(0), scene.grid.shape))},
-            coords=scene.coordinates,
+            coords=scene.grid.coordinates,
             attrs={"frame": scene.grid.frame, "terrain": {}},
         ),
         "terrain",

@@ -14,7 +14,7 @@ from apertura.campaign import Campaign
 from apertura.focus.engines import load_engine, reference
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.load.inputs import profiles_of
+from apertura.imaging.stages import profiles_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import job_of, plan_job
 from apertura.load.scene import OpenScene, open_scene
