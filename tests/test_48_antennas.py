@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from conftest import copy_writable
-from test_41_bad_input import complaint, edit_config
+from folders import complaint, copy_writable, edit_config
 
 from apertura.campaign import Campaign
 from apertura.quality.point_targets import cut_through, find_peak
