@@ -1,4 +1,4 @@
-"""Patterns, axes and footprints of antennas, and what the planner makes of them."""
+"""Patterns, axes and weights of antennas, and what the planner makes of them."""
 
 from dataclasses import replace
 
@@ -8,11 +8,12 @@ from campaigns import draw
 from test_33_planner import compiled, mono, net, plan, track
 
 from apertura.antenna.beam import Beam, Beams
-from apertura.antenna.illumination import NO_BEAMS, Footprint, footprint, illuminate
+from apertura.antenna.illumination import illuminate
 from apertura.antenna.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
 from apertura.errors import CampaignError
 from apertura.focus.engines import load_engine, native, reference
 from apertura.focus.engines.native_prediction import pixel_seconds
+from apertura.focus.engines.native_weights import NO_BEAMS, PatchWeights, patch_weights
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import body_axes
 from apertura.planning.planner import make_plan
@@ -95,7 +96,7 @@ def jobs(beams, *, shape=(200, 200)):
 
 def test_pulses_in_the_dark_cost_less_than_without_beams_and_lit_ones_more():
     shared = (1.0, 0.0, 0.0)
-    lit, half, dark = (pixel_seconds(shared, 2, Footprint(1 - share, 0.0, share, 0.0, 2)) for share in (0, 0.5, 1))
+    lit, half, dark = (pixel_seconds(shared, 2, PatchWeights(1 - share, 0.0, share, 0.0, 2)) for share in (0, 0.5, 1))
     assert half == pytest.approx((lit + dark) / 2)
     assert 2 * dark < pixel_seconds(shared, 2, NO_BEAMS) < lit / 2.5
 
@@ -121,8 +122,8 @@ def test_the_ways_native_weighs_are_foreseen(width_deg):
     native.form(native.prepare(scene.profiles(places)), places, beams=beams, counts=counts)
     middle = places[8::16, 8::16]
     steps = np.stack([(places[8::16, 9::16] - middle).reshape(-1, 3), (places[9::16, 8::16] - middle).reshape(-1, 3)])
-    found = footprint(beams, Aperture(scene.tx, scene.rx), steps, middle.reshape(-1, 3))
-    np.testing.assert_allclose([found.smooth, found.rough, found.dark], counts[1:] / counts.sum(), atol=0.1)
+    found = patch_weights(beams, Aperture(scene.tx, scene.rx), steps, middle.reshape(-1, 3))
+    np.testing.assert_allclose([found.smooth, found.pixelwise, found.dark], counts[1:] / counts.sum(), atol=0.1)
 
 
 @compiled
@@ -158,7 +159,7 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db)
     engine = load_engine(found.engine)
     inputs = {"phase_history": drawn.history, "profiles": found.inputs(drawn.profiles)}[engine.READS]
-    places = drawn.grid.positions()
+    places = drawn.grid.positions(0.0)
     image = engine.form(
         engine.prepare(inputs, **found.setting.options), places, beams=beams, **found.setting.form_options
     )

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_34_engine_native import AXES, Scene, _runs, decibels, ecef, fly, grid, scatter
+from test_34_engine_native import AXES, Scene, decibels, ecef, fly, grid, scatter
 
 from apertura.antenna.beam import Beam, Beams
-from apertura.focus.engines import native, numba, reference
+from apertura.focus.engines import native, native_binding, numba, reference
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 
@@ -49,7 +49,7 @@ def exact(scene: Scene, pixels: NDArray[np.float64], beams: Beams) -> NDArray[np
 
 @pytest.fixture(params=native.INSTRUCTION_SETS)
 def isa(request, monkeypatch):
-    if not _runs(request.param):
+    if not native_binding.runs(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
     return request.param

@@ -335,7 +335,7 @@ def test_blocked_pulses_are_dropped_by_every_method():
     everything = np.ones(60, bool)
     for method in CHOICES[1:]:
         kept, transfer, _ = correct(method, radar, sidelink, everything)
-        assert (kept == ~observation.hidden.blocked).all()
+        assert (kept == ~observation.draw.blocked).all()
         assert len(transfer) == kept.sum() < 60
     assert correct("none", radar, sidelink, everything)[0].all()
 

@@ -57,7 +57,7 @@ rule layers:
         "results/scene.json",
         campaign.terrain_sources(),
     output:
-        multiext("results/layers/", "incidence.tif", "bistatic_angle.tif", "mask.tif"),
+        [f"results/layers/{export.file}" for export in exports_in("layers")],
     log:
         "results/logs/layers.log",
     benchmark:
@@ -68,7 +68,7 @@ rule layers:
     resources:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
-        code=code_sha256("apertura.steps.layers"),
+        code=code_sha256("apertura.steps.layers", *export_modules("layers")),
     message:
         "drawing how the scene is seen"
     shell:
@@ -95,7 +95,7 @@ rule tiles:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image"),
+        code=code_sha256("apertura.steps.image", *ENGINES.values()),
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -129,7 +129,7 @@ rule image:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image"),
+        code=code_sha256("apertura.steps.image", *ENGINES.values()),
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:

@@ -9,6 +9,7 @@ from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import Illumination
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
+from apertura.scene.ground_models import GroundModels
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +64,8 @@ class Job:
         'ecef' or 'local'.
     tile_px, threads
         Side of a tile; tiles formed at once.
-    heights_m, heights_step_px
-        (row, column) float64 of a DEM above the flat model, in the middle of blocks of so many pixels; None without.
+    terrain
+        The scene's ground and its cheaper models.
     path_limit_m
         Longest total path inside the cyclic prefix.
     memory_bytes
@@ -74,6 +75,8 @@ class Job:
         errors of tables weigh that much more. None before anything was recorded.
     beams, illumination
         Of the antennas, where they have any, over all pulses.
+    recorded
+        Whether the phase history is there, which the double sum reads.
     """
 
     aperture: Aperture
@@ -87,13 +90,13 @@ class Job:
     frame: str = "ecef"
     tile_px: int = 256
     threads: int = 1
-    heights_m: NDArray[np.float64] | None = None
-    heights_step_px: int = 1
+    terrain: GroundModels = field(default_factory=GroundModels.flat)
     path_limit_m: float = np.inf
     memory_bytes: float = np.inf
     content_db: float | None = None
     beams: Beams | None = None
     illumination: Illumination | None = None
+    recorded: bool = True
 
     @property
     def pixels(self) -> int:

@@ -13,11 +13,11 @@ from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, rea
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import OpenScene
 from apertura.settings import Antenna
 
 _STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
-_NET = 33
+_POINTS = 33
 
 
 def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
@@ -66,10 +66,10 @@ def lit(
     campaign: Campaign,
     pair: str,
     beams: Beams | None,
-    grid: SceneGrid,
+    scene: OpenScene,
     aperture: Aperture,
-) -> dict[str, Any]:
-    """Return beams and illumination as the planner's job takes them, nothing without beams.
+) -> Illumination | None:
+    """Return how many pulses see each point of the scene; None without beams.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def lit(
         Which.
     beams
         Of the pair.
-    grid
+    scene
         The campaign's.
     aperture
         Of the pair.
@@ -88,13 +88,12 @@ def lit(
         If no pulse sees anything of the scene.
     """
     if beams is None:
-        return {}
-    rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
-    net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij"))
-    illumination = illuminate(beams, aperture, net.reshape(-1, 3))
+        return None
+    points = scene.grid.sample_points(_POINTS, scene.level.height_m)
+    illumination = illuminate(beams, aperture, points.reshape(-1, 3))
     if illumination.unseen == 1:
-        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], aperture)
-    return {"beams": beams, "illumination": illumination}
+        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
+    return illumination
 
 
 def _refuse(

@@ -18,12 +18,11 @@ from apertura.echo.demodulate import subcarrier_numbers
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
+from apertura.imaging.stages import phase_history_of
 from apertura.ingest import PHASE_HISTORIES, TRACKS
 from apertura.load.antennas import beams_of, body_axes
-from apertura.load.inputs import phase_history_of
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import Flown
 from apertura.settings import OfdmWaveform
-from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
 
 
@@ -33,6 +32,8 @@ class OpenPair:
 
     Attributes
     ----------
+    flight, name
+        Which: the name is transmitter-receiver.
     aperture
         Phase centres.
     frequency_hz, weight
@@ -45,6 +46,8 @@ class OpenPair:
         Of the antennas; None where they look everywhere alike.
     """
 
+    flight: str
+    name: str
     aperture: Aperture
     frequency_hz: NDArray[np.float64]
     weight: NDArray[np.float64]
@@ -52,14 +55,10 @@ class OpenPair:
     history: PhaseHistory | None = None
     beams: Beams | None = None
 
-
-def campaign_grid(campaign: Campaign, pair: OpenPair) -> SceneGrid:
-    """Return the campaign's grid, settled or as it will be."""
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
-        return scene_grid(campaign)
-    aperture = pair.aperture
-    return settle(asked, *aperture.legs, pair.frequency_hz, pair.path_limit_m, root=campaign.root)[0]
+    @property
+    def flown(self) -> Flown:
+        """What `auto` settles the grid from."""
+        return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
 
 
 def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> OpenPair:
@@ -75,7 +74,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
-    return OpenPair(history.aperture, history.frequency_hz, history.weight, limit_m, history, beams)
+    return OpenPair(flight, pair, history.aperture, history.frequency_hz, history.weight, limit_m, history, beams)
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
@@ -100,7 +99,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     weight = window_weights(campaign.settings.processing.window, len(frequency))
     limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
     aperture = Aperture(places[0], places[1])
-    return OpenPair(aperture, frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
+    return OpenPair(flight, pair, aperture, frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
 
 
 def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:

@@ -20,13 +20,12 @@ def check_geometry(job: Job) -> dict[str, str]:
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, a platform is at or below flat ground, or no echo of the scene
-        arrives inside the prefix.
+        If there is no pulse, a position is not finite, or no echo of the scene arrives inside the prefix.
     """
     aperture, ground_m = job.aperture, job.ground_m
     _check_finite(aperture)
     up = vertical(ground_m)
-    flags = _check_heights(job, up)
+    flags: dict[str, str] = {}
     over = np.zeros(len(aperture), bool)
     for leg in aperture.legs:
         over |= _over(leg, ground_m, up, job.spacing_m)
@@ -49,22 +48,6 @@ def check_geometry(job: Job) -> dict[str, str]:
     return flags
 
 
-def _check_heights(job: Job, up: NDArray[np.float64]) -> dict[str, str]:
-    """Refuse a platform at or below flat ground; flag one below all of a DEM, which may look up a hillside."""
-    flags = {}
-    lowest_m = None if job.heights_m is None else float(job.heights_m.min())
-    for leg, which in zip(job.aperture.legs, ("transmitter", "receiver"), strict=True):
-        height = (leg - job.ground_m[0, 0]) @ up
-        if lowest_m is None:
-            _check_above(height, which)
-        elif height.min() <= lowest_m:
-            flags["platform_below_scene"] = (
-                f"the {which} is {lowest_m - height.min():.1f} m below the lowest ground of the scene: check the unit "
-                f"and the datum of the DEM, unless the radar looks up a hillside"
-            )
-    return flags
-
-
 def _check_finite(aperture: Aperture) -> None:
     if len(aperture) == 0:
         raise CampaignError(
@@ -77,17 +60,6 @@ def _check_finite(aperture: Aperture) -> None:
             where="track",
             expected="a position for every pulse",
             remedy="Mend the flight log.",
-        )
-
-
-def _check_above(height_m: NDArray[np.float64], which: str) -> None:
-    low = int(height_m.argmin())
-    if height_m[low] <= 0:
-        raise CampaignError(
-            f"the {which} is {height_m[low]:.2f} m above the ground at pulse {low}",
-            where="config/config.yaml: scene.height_m",
-            expected="a platform above the ground",
-            remedy="Check height_m and its datum (logs may count from the geoid), and the heights in the flight log.",
         )
 
 

@@ -11,6 +11,7 @@ from apertura.antenna.illumination import Illumination
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import Profiles
 from apertura.focus.presum import Presum, presummed
+from apertura.scene.terrain import Terrain
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class Plan:
     flags
         Limits that the job exceeds: name → what was found, in one line.
     presum, middle_m
-        What `inputs` applies: the low-pass sum over pulses, and the point they are aligned to.
-    tilt_m
-        Of a tilted plane: height above the flat model at pixel (0, 0), per row and per column, metres.
+        The low-pass sum over pulses, and the point they are aligned to; settings of `fallbacks` go without.
+    terrain
+        The ground that is imaged on: as it is, a plane through it, or level.
     illumination
         Of the job.
     """
@@ -69,9 +70,9 @@ class Plan:
     memory_bytes: int
     disk_bytes: int
     flags: Mapping[str, str]
+    terrain: Terrain
     presum: Presum | None = field(default=None, repr=False)
     middle_m: NDArray[np.float64] | None = field(default=None, repr=False)
-    tilt_m: tuple[float, float, float] | None = None
     illumination: Illumination | None = field(default=None, repr=False)
 
     @property
@@ -87,13 +88,13 @@ class Plan:
     @property
     def choices(self) -> dict[str, Any]:
         """Choice → value: all that the image's pixels depend on, and no prediction."""
-        return {decision.name: decision.value for decision in self.decisions} | {"tilt_m": self.tilt_m}
+        return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
+
+    @property
+    def presumming(self) -> tuple[Presum, NDArray[np.float64]] | None:
+        """The low-pass sum over pulses and the point they are aligned to; None: every pulse as it is."""
+        return None if self.presum is None or self.middle_m is None else (self.presum, self.middle_m)
 
     def inputs(self, profiles: Profiles) -> Profiles:
-        """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same.
-
-        Settings of `fallbacks` are given the profiles as they are.
-        """
-        if self.presum is None or self.middle_m is None:
-            return profiles
-        return presummed(profiles, self.presum, self.middle_m)
+        """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same."""
+        return profiles if self.presumming is None else presummed(profiles, *self.presumming)

@@ -14,7 +14,7 @@ from apertura.planning.checks import check_geometry
 from apertura.planning.memory import block_decision, bytes_needed
 from apertura.planning.plan import Decision, Plan
 from apertura.planning.search import Search
-from apertura.planning.terrain_model import decide_terrain, tilt
+from apertura.planning.terrain_model import decide_terrain
 
 MARGIN_DB = 3.0
 """Predicted errors lie this far below what is asked."""
@@ -42,7 +42,7 @@ def make_plan(
     Raises
     ------
     CampaignError
-        If the job holds no pulse, a platform is below the ground, or what is asked cannot run here.
+        If the job holds no pulse, or what is asked cannot run here.
 
     Notes
     -----
@@ -78,11 +78,9 @@ def make_plan(
         memory_bytes=memory,
         disk_bytes=disk,
         flags=flags | missed,
+        terrain=job.terrain.called(str(terrain.value)),
         presum=presum,
         middle_m=job.points_m[len(job.points_m) // 2],
-        tilt_m=tilt(job.heights_m, job.heights_step_px)
-        if terrain.value == "tilted_plane" and job.heights_m is not None
-        else None,
         illumination=job.illumination,
     )
 

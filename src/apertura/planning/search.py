@@ -132,10 +132,11 @@ class Search:
 
     def _engines(self) -> list[str]:
         """Return the engines that can run here and that what is asked for leaves."""
-        runnable = [name for name in ENGINES if load_engine(name).available()]
+        reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
+        runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
         if self.engine is not None and self.engine not in runnable:
             raise CampaignError(
-                f"engine {self.engine} was not built when apertura was installed",
+                f"engine {self.engine} was not built when apertura was installed, or reads what is not there",
                 where=f"{self.where}.engine",
                 expected=f"an engine that can run here: {', '.join(runnable)}",
                 remedy="Install with a C++ compiler, or choose another engine.",

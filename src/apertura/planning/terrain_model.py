@@ -1,12 +1,12 @@
 """The simplest model of the ground that keeps focus and place: a plane, a tilted plane, or the DEM."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.focus.job import Job
 from apertura.planning.checks import vertical
 from apertura.planning.plan import Decision
+from apertura.scene.terrain import FlatGround
 
 FOCUS_RAD = 0.4
 SHIFT_PIXELS = 0.5
@@ -37,7 +37,7 @@ def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processi
     chosen = _by_rule(job)
     if asked is None or asked == chosen.value:
         return chosen
-    if job.heights_m is None:
+    if isinstance(job.terrain.full, FlatGround):
         raise CampaignError(
             f"terrain is {asked}",
             where=f"{where}.terrain",
@@ -48,15 +48,13 @@ def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processi
 
 
 def _by_rule(job: Job) -> Decision:
-    limit_m, rule = _tolerance(job)
-    if job.heights_m is None:
+    (limit_m, rule), ground = _tolerance(job), job.terrain
+    if isinstance(ground.full, FlatGround):
         return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit_m:.3g} m: {rule}")
-    relief_m = float(np.abs(job.heights_m).max())
-    if relief_m < limit_m:
-        return Decision("terrain", "plane", f"relief {relief_m:.3g} m; {rule}")
-    rest_m = float(np.abs(job.heights_m - plane_through(job.heights_m)).max())
-    value = "tilted_plane" if rest_m < limit_m else "dem"
-    return Decision("terrain", value, f"relief {relief_m:.3g} m, {rest_m:.3g} m off a tilted plane; {rule}")
+    if ground.relief_m < limit_m:
+        return Decision("terrain", "plane", f"relief {ground.relief_m:.3g} m; {rule}")
+    off_plane = f"relief {ground.relief_m:.3g} m, {ground.off_plane_m:.3g} m off a tilted plane; {rule}"
+    return Decision("terrain", "tilted_plane" if ground.off_plane_m < limit_m else "dem", off_plane)
 
 
 def _tolerance(job: Job) -> tuple[float, str]:
@@ -72,27 +70,3 @@ def _tolerance(job: Job) -> tuple[float, str]:
         f"wobble {wobble_m:.3f} m rms and ground range from {nearest:.1f} m bear {focus_m:.3g} m (0.4 rad), "
         f"half a pixel of shift {shift_m:.3g} m"
     )
-
-
-def plane_through(heights_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least-squares plane through heights (row, column), metres, at the same points.
-
-    Examples
-    --------
-    >>> tilted = np.arange(4.0)[:, None] + 2 * np.arange(3.0)
-    >>> bool(np.allclose(plane_through(tilted), tilted))
-    True
-    """
-    row, column = np.indices(heights_m.shape)
-    basis = np.stack([np.ones(heights_m.size), row.ravel(), column.ravel()], -1)
-    fitted = basis @ np.linalg.lstsq(basis, heights_m.ravel(), rcond=None)[0]
-    return np.asarray(fitted.reshape(heights_m.shape))
-
-
-def tilt(heights_m: NDArray[np.float64], step_px: int) -> tuple[float, float, float]:
-    """Return the plane through heights of blocks of pixels: height at pixel (0, 0), per row and per column, metres."""
-    plane = plane_through(heights_m)
-    down, right = (
-        float(np.diff(plane[:2, :2], axis=axis)[0, 0]) / step_px if plane.shape[axis] > 1 else 0.0 for axis in (0, 1)
-    )
-    return (float(plane[0, 0]) - (down + right) * (step_px - 1) / 2, down, right)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.quality.measures import Raster
-from apertura.scene.grid import SceneGrid
 
 PATCH_PX = 64
 
@@ -232,9 +231,3 @@ def half_power_width(power: NDArray[np.float64], middle: int) -> float:
         k = int(below[0])
         sides.append(k - 1 + (side[k - 1] - half) / (side[k - 1] - side[k]))
     return float(sum(sides))
-
-
-def ground_position(grid: SceneGrid, peak: Peak) -> tuple[float, float]:
-    """Return easting and northing (m, in the grid's CRS) of a peak."""
-    west, _, _, north = grid.bounds_m
-    return (west + (peak.column + 0.5) * grid.spacing_m, north - (peak.row + 0.5) * grid.spacing_m)

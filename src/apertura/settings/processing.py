@@ -1,11 +1,11 @@
-"""Section `processing`: how to compute."""
+"""Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector."""
 
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from apertura.focus.engines import ENGINES, load_engine
-from apertura.settings.section import Section
+from apertura.settings.section import Metres3, Name, Section
 
 
 class Processing(Section):
@@ -60,3 +60,11 @@ class Processing(Section):
                 option = ".".join(map(str, first["loc"]))
                 raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
         return self
+
+
+class Calibration(Section):
+    """Which flight the path offsets come from."""
+
+    flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
+    reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
+    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")

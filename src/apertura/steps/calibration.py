@@ -6,18 +6,16 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
-from apertura.contracts import canonical_json
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_projected
-from apertura.provenance import chained_sha256, code_sha256
+from apertura.geometry.geodesy import frame_from_map
+from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
-from apertura.scene.grid import LOCAL
 from apertura.settings import Calibration
-from apertura.store import open_stage, write_json
+from apertura.store import open_stage
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:
@@ -72,7 +70,7 @@ def _asked(campaign: Campaign) -> Calibration:
 
 
 def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: str) -> dict[str, Any]:
-    reflector = _place(campaign.settings.scene.crs, asked.reflector_m)
+    reflector = frame_from_map(campaign.settings.scene.crs, *asked.reflector_m)
     path_m = np.asarray(
         sum(np.linalg.norm(echo[name].values - reflector, axis=1) for name in ("tx_position", "rx_position"))
     )
@@ -91,11 +89,6 @@ def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: st
         "phase_std_rad": round(float(np.std(phase)), 4),
         "flags": {**echo.attrs["flags"], **found.flags},
     }
-
-
-def _place(crs: str, reflector_m: tuple[float, float, float]) -> NDArray[np.float64]:
-    x, y, height = (np.array(value) for value in reflector_m)
-    return np.array(reflector_m) if crs == LOCAL else ecef_from_projected(crs, x, y, height)
 
 
 def calibration_spec(found: dict[str, Any] | None) -> str:

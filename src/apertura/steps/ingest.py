@@ -24,7 +24,7 @@ def raw(campaign: Campaign, flight: str, node: str) -> Path:
     stamp = stamped(
         dataset,
         "raw",
-        module=__name__,
+        modules=[__name__],
         settings=campaign.relevant("raw") if recording.framing else {},
         inputs=_hashes(campaign.root, *files),
     )
@@ -45,7 +45,7 @@ def track(campaign: Campaign, flight: str, node: str) -> Path:
         )
     dataset = TRACKS[log.suffix](log, node=node)
     folder = campaign.stage("track", flight, node)
-    save_stage(stamped(dataset, "track", module=__name__, inputs=_hashes(campaign.root, log)), folder)
+    save_stage(stamped(dataset, "track", modules=[__name__], inputs=_hashes(campaign.root, log)), folder)
     return folder
 
 

@@ -9,7 +9,7 @@ from scipy import fft
 from scipy.signal import CZT
 
 from apertura.echo.demodulate import subcarrier_numbers
-from apertura.simulation.radar import Waveform
+from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.synthesis import Channel, noise, path_spectrum, sampling_rate
 
 _PULSES_AT_ONCE = 32
@@ -68,12 +68,12 @@ def _symbols(
     return total
 
 
-def demodulated(samples: NDArray[np.complexfloating], waveform: Waveform) -> NDArray[np.complex64]:
+def demodulated(samples: NDArray[np.complexfloating], waveform: TransmitWaveform) -> NDArray[np.complex64]:
     """Return (pulse, subcarrier) complex64 transfer functions: the DFT of window samples, code removed.
 
     Examples
     --------
-    >>> wave = Waveform(np.full(2, 2.0), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
+    >>> wave = TransmitWaveform(np.full(2, 2.0), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
     >>> demodulated(2 * np.exp(2j * np.pi * np.arange(8) / 8)[None], wave).round(6) + 0
     array([[0.+0.j, 1.+0.j]], dtype=complex64)
     """

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.observation import Observation, observe
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.radar import Waveform, newman_codes, qpsk_codes
+from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import transfer_functions
@@ -38,7 +38,7 @@ class PaperScene:
         Phase centres as the logs say.
     """
 
-    waveform: Waveform
+    waveform: TransmitWaveform
     scatterers: Scatterers
     geometry: Geometry
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from apertura.atomic import whole
+from apertura.atomic import replacement
 
 Row = TypeVar("Row")
 
@@ -28,7 +28,7 @@ def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -
         Significant digits of floats; None: as many as tell them apart.
     """
     records = [_record(row, digits) for row in rows]
-    with whole(path) as draft, draft.open("w", encoding="utf-8", newline="") as stream:
+    with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(records[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(records)

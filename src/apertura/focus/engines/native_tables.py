@@ -10,10 +10,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-TAPS = 16
-MARGIN = 16  # empty cells at both ends, so that a look-up window may hang over
-# Sine terms, cosine terms, half turns taken off first: the forms of native/phase.hpp, cheapest first.
-PHASE_FORMS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
+from apertura.focus.engines.native_constants import KERNEL
+
+TAPS = KERNEL.taps
+MARGIN = KERNEL.window  # empty cells at both ends, so that a look-up window may hang over
+# Sine terms, cosine terms, half turns taken off first: the polynomials of native/phase.hpp, cheapest first.
+PHASE_POLYNOMIALS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 
 BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
 """Where errors over the band are looked at, its edges at ±1: Chebyshev nodes, dense at the edges."""
@@ -42,8 +44,8 @@ class Tables:
         Total path across one cell, metres.
     carrier_rad_per_cell
         Carrier phase over one cell.
-    phase_form, phase
-        Index into `PHASE_FORMS` and its (9,) float32 coefficients.
+    phase_polynomial, phase_coefficients
+        Index into `PHASE_POLYNOMIALS` and its (9,) float32 coefficients.
     degree
         Of the polynomials, 1 or 2.
     error_db
@@ -56,14 +58,14 @@ class Tables:
     first_path_m: NDArray[np.float64]
     cell_m: float
     carrier_rad_per_cell: float
-    phase_form: int
-    phase: NDArray[np.float32]
+    phase_polynomial: int
+    phase_coefficients: NDArray[np.float32]
     degree: int
     error_db: float
 
 
 @dataclass(frozen=True)
-class Plan:
+class TableDesign:
     """How samples become cells.
 
     Attributes
@@ -74,7 +76,7 @@ class Plan:
         (up, degree + 1, 16) float32, filters giving each coefficient at each position of the cell.
     lead
         (up,) int32, sample of the first tap relative to the first of the `down` samples.
-    phase_form, phase
+    phase_polynomial, phase_coefficients
         As in `Tables`.
     squared_error
         (160,) float64, mean squared error of a frequency at each place of `BAND`, over the places in a cell.
@@ -84,8 +86,8 @@ class Plan:
     down: int
     taps: NDArray[np.float32]
     lead: NDArray[np.int32]
-    phase_form: int
-    phase: NDArray[np.float32]
+    phase_polynomial: int
+    phase_coefficients: NDArray[np.float32]
     squared_error: NDArray[np.float64]
 
     def error_db(self, window: NDArray[np.float64]) -> float:
@@ -137,7 +139,9 @@ def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=64)
-def plan(profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: int, degree: int) -> Plan:
+def design_table(
+    profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: int, degree: int
+) -> TableDesign:
     """Design the filters and the phase polynomials of a table, and predict its error.
 
     Parameters
@@ -158,8 +162,8 @@ def plan(profile_oversampling: float, carrier_rad_per_sample: float, *, oversamp
 
     Examples
     --------
-    >>> found = plan(2.0, 9.2, oversampling=6, degree=2)
-    >>> found.up, found.down, found.error_db(np.ones(1)) < -74
+    >>> design = design_table(2.0, 9.2, oversampling=6, degree=2)
+    >>> design.up, design.down, design.error_db(np.ones(1)) < -74
     (3, 1, True)
     """
     up, down = ratio(profile_oversampling, oversampling)
@@ -172,18 +176,18 @@ def plan(profile_oversampling: float, carrier_rad_per_sample: float, *, oversamp
     taps = np.linalg.lstsq(_stacked(basis), _stacked(wanted), rcond=1e-9)[0].T.reshape(up, degree + 1, TAPS)
     given = np.einsum("pkt,wt->pkw", taps, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
-    form, phase = _phase(carrier_rad_per_cell)
+    polynomial, phase = _phase(carrier_rad_per_cell)
     error = _squared_error(
         given,
         omega,
         starts - whole,
         samples_per_cell=down / up,
         carrier_rad_per_cell=carrier_rad_per_cell,
-        form=form,
+        polynomial=polynomial,
         phase=phase,
     )
     lead = whole.astype(np.int32) - _LEAD
-    return Plan(up, down, np.ascontiguousarray(taps, np.float32), lead, form, phase, error)
+    return TableDesign(up, down, np.ascontiguousarray(taps, np.float32), lead, polynomial, phase, error)
 
 
 def _stacked(values: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -196,14 +200,14 @@ def _coefficients(omega: NDArray[np.float64], degree: int) -> NDArray[np.complex
     level, slope = wave.sum(1), 12 * (wave * _WITHIN).sum(1)
     if degree == 1:
         return np.stack([level, slope])
-    bow = 180 * (wave * (_WITHIN**2 - 1 / 12)).sum(1)
-    return np.stack([level - bow / 12, slope, bow])
+    curvature = 180 * (wave * (_WITHIN**2 - 1 / 12)).sum(1)
+    return np.stack([level - curvature / 12, slope, curvature])
 
 
 def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
-    """Return the cheapest phase form that holds the carrier inside a cell, and its coefficients."""
+    """Return the cheapest phase polynomial that holds the carrier inside a cell, and its coefficients."""
     u = 0.5 * np.cos(np.pi * (np.arange(200) + 0.5) / 200)
-    for sines, cosines, reduced in PHASE_FORMS:
+    for sines, cosines, reduced in PHASE_POLYNOMIALS:
         scale = np.pi if reduced else carrier_rad_per_cell
         even, odd = u[:, None] ** (2 * np.arange(cosines)), u[:, None] ** (2 * np.arange(sines) + 1)
         cosine = np.linalg.lstsq(even, np.cos(scale * u), rcond=None)[0]
@@ -213,7 +217,7 @@ def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
             break
     phase = np.zeros(9, np.float32)
     phase[:cosines], phase[4 : 4 + sines], phase[8] = cosine, sine, carrier_rad_per_cell / np.pi
-    return PHASE_FORMS.index((sines, cosines, reduced)), phase
+    return PHASE_POLYNOMIALS.index((sines, cosines, reduced)), phase
 
 
 def _squared_error(
@@ -223,13 +227,13 @@ def _squared_error(
     *,
     samples_per_cell: float,
     carrier_rad_per_cell: float,
-    form: int,
+    polynomial: int,
     phase: NDArray[np.float32],
 ) -> NDArray[np.float64]:
     """Return the mean squared error at each frequency, over place in the cell and position of the cell."""
     powers = _WITHIN ** np.arange(given.shape[1])[:, None]
     value = np.einsum("pkw,ku->pwu", given, powers)
-    sines, cosines, reduced = PHASE_FORMS[form]
+    sines, cosines, reduced = PHASE_POLYNOMIALS[polynomial]
     turns = _WITHIN * phase[8] if reduced else np.zeros_like(_WITHIN)
     u = turns - np.rint(turns) if reduced else _WITHIN
     sign = np.where(np.rint(turns) % 2 == 0, 1, -1)

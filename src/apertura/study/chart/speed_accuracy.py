@@ -14,14 +14,13 @@ from apertura.campaign import Campaign
 from apertura.focus.engines import load_engine, reference
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.load.inputs import profiles_of
-from apertura.load.pair import campaign_grid, open_pair
+from apertura.imaging.stages import profiles_of
+from apertura.load.pair import open_pair
+from apertura.load.plan import job_of, plan_job
+from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.plan import Plan
 from apertura.planning.search import Search
 from apertura.quality.measures import numerical_error
-from apertura.scene.grid import SceneGrid
-from apertura.steps.plan import campaign_job, plan_job
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.chart.interactive import write_page
 from apertura.study.chart.pareto import Point, draw_points, with_front, write_points
@@ -81,7 +80,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     adds to the planned error is added to that of every setting.
     """
     opened = open_pair(campaign, flight, pair)
-    grid, processing = campaign_grid(campaign, opened), campaign.settings.processing
+    scene, processing = open_scene(campaign), campaign.settings.processing
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
@@ -89,10 +88,9 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         raise ValueError("the echo stage is not there")
     history, beams = opened.history[block], opened.beams and opened.beams[block]
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
-    heights = open_heights(campaign)
-    job = campaign_job(campaign, pair, opened, grid, heights)
+    job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job), Search(job)
-    part = _part(history, profiles[block], grid, heights, total_pixels=job.pixels, beams=beams)
+    part = _part(history, profiles[block], scene, total_pixels=job.pixels, beams=beams)
     points = [
         replace(
             point,
@@ -101,7 +99,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         )
         for point in measure(part, plan, _settings(search), seconds=seconds)
     ]
-    size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(history)} pulses"
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     paths[0].parent.mkdir(parents=True, exist_ok=True)
@@ -114,17 +112,16 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
 def _part(
     history: PhaseHistory,
     profiles: Profiles,
-    grid: SceneGrid,
-    heights: Heights,
+    scene: OpenScene,
     *,
     total_pixels: int,
     beams: Beams | None,
 ) -> Part:
     window = []
-    for size in grid.shape:
+    for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
         window.append(slice(first, min(size, first + SIDE_PX)))
-    pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
+    pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
     picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
     begin = perf_counter()
     exact = reference.form(history, pixels[picked[:, 0], picked[:, 1]], beams=beams)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from apertura.atomic import whole
+from apertura.atomic import replacement
 from apertura.study.stability.outcomes import Outcome
 from apertura.study.stability.summary import LEVELS_DB, Tolerance
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
@@ -121,5 +121,5 @@ def _words(tolerance: Tolerance) -> str:
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG that is the same for the same figure."""
     FigureCanvasAgg(figure)
-    with whole(path) as draft:
-        figure.savefig(draft, format="png", dpi=110, metadata={"Software": None})
+    with replacement(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

@@ -135,7 +135,7 @@ def _draw(
     flown = sweep.flown(size)
     radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
-    kept, transfer, chosen = correct(method, radar, sidelink, observation.hidden.kept)
+    kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
     if not kept.any():
         return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
     history_of = point_response.phase_history if chosen == "none" else point_response.divided_history

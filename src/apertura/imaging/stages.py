@@ -33,3 +33,20 @@ def profiles_of(profile: xr.Dataset) -> Profiles:
 def aperture_of(stage: xr.Dataset) -> Aperture:
     """Return the phase centres of an echo or profile stage."""
     return Aperture(stage.tx_position.values, stage.rx_position.values)
+
+
+def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann") -> PhaseHistory | Profiles:
+    """Return what an engine reads: arrays as they are, or those of a stage `echo` or `profile`.
+
+    Raises
+    ------
+    TypeError
+        If a dataset is another stage.
+    """
+    if isinstance(given, PhaseHistory | Profiles):
+        return given
+    if "transfer" in given:
+        return phase_history_of(given, window)
+    if "profile" in given:
+        return profiles_of(given)
+    raise TypeError(f"a dataset with {sorted(map(str, given.variables))}: must be a stage echo or profile")

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Hidden:
+class ImpairmentDraw:
     """What was drawn for one node and flight, pulse by pulse.
 
     Attributes
@@ -39,7 +39,9 @@ class Hidden:
     position_error_m: Floats
 
 
-def draw(impairments: Impairments, time_s: Floats, sample_rate_hz: float, generator: Generator) -> Hidden:
+def draw_impairments(
+    impairments: Impairments, time_s: Floats, sample_rate_hz: float, generator: Generator
+) -> ImpairmentDraw:
     """Draw what is random about a node in one flight.
 
     Parameters
@@ -55,13 +57,14 @@ def draw(impairments: Impairments, time_s: Floats, sample_rate_hz: float, genera
 
     Examples
     --------
-    >>> drawn = draw(Impairments(carrier_phase=UniformPhase()), np.arange(5.0), 1e9, np.random.default_rng(1))
+    >>> wrong = Impairments(carrier_phase=UniformPhase())
+    >>> drawn = draw_impairments(wrong, np.arange(5.0), 1e9, np.random.default_rng(1))
     >>> drawn.phase_rad.round(2), drawn.start_s
     (array([...]), array([0., 0., 0., 0., 0.]))
     """
     streams = independent_streams(generator, 6)
     pulses = time_s.size
-    return Hidden(
+    return ImpairmentDraw(
         kept=streams[0].random(pulses) >= impairments.missed_fraction,
         phase_rad=_phases(impairments, time_s, streams[1]),
         start_s=_starts(impairments.timing, pulses, sample_rate_hz, streams[2]),

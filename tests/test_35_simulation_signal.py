@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apertura.simulation.frame import Framing
-from apertura.simulation.hidden import draw
+from apertura.simulation.continuous import Framing
+from apertura.simulation.draw import draw_impairments
 from apertura.simulation.impairments import (
     Adc,
     Blockage,
@@ -23,7 +23,7 @@ from apertura.simulation.impairments import (
 )
 from apertura.simulation.observation import observe
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.radar import Paths, Waveform, qpsk_codes
+from apertura.simulation.radar import Paths, TransmitWaveform, qpsk_codes
 from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, samples, transfer_functions
@@ -33,7 +33,7 @@ C = 299_792_458.0
 
 def small_waveform(carrier_is="band_start", subcarriers=200):
     codes = qpsk_codes(subcarriers, np.random.default_rng(7))
-    return Waveform(codes, 1.2e9, carrier_is, 1e6, 1.25e-6, 0.25e-6, 256e6, 100.0)
+    return TransmitWaveform(codes, 1.2e9, carrier_is, 1e6, 1.25e-6, 0.25e-6, 256e6, 100.0)
 
 
 def two_uavs(pulses=6):
@@ -253,7 +253,7 @@ def test_drawn_impairments_have_the_statistics_asked_for():
         sidelink_blockage=Blockage(0.2, mean_pulses=8.0),
         localization=Localization(0.02, window_s=1.0),
     )
-    drawn = draw(wrong, time_s, 1e9, np.random.default_rng(0))
+    drawn = draw_impairments(wrong, time_s, 1e9, np.random.default_rng(0))
     assert 1 - drawn.kept.mean() == pytest.approx(0.1, abs=0.01)
     assert np.diff(drawn.phase_rad).std() == pytest.approx(0.5 / np.sqrt(100), rel=0.03)
     assert drawn.start_s.mean() == pytest.approx(1e-9, abs=0.1e-9)
@@ -270,7 +270,7 @@ def test_switching_one_impairment_on_leaves_the_others_as_drawn():
     time_s = np.arange(100) / 10
     few = Impairments(missed_fraction=0.3, timing=Timing(half_width_s=1e-9))
     more = replace(few, carrier_phase=UniformPhase(), localization=Localization(0.1), sidelink_blockage=Blockage(0.3))
-    first, second = (draw(wrong, time_s, 1e9, np.random.default_rng(3)) for wrong in (few, more))
+    first, second = (draw_impairments(wrong, time_s, 1e9, np.random.default_rng(3)) for wrong in (few, more))
     assert (first.kept == second.kept).all()
     assert (first.start_s == second.start_s).all()
     assert second.phase_rad.std() > 1
@@ -282,7 +282,7 @@ def test_localization_error_moves_only_the_antennas_named():
     seen = observe(
         small_waveform(), scatterers, logged, np.random.default_rng(0), receiver=wrong, transmitter=Impairments()
     )
-    assert_allclose(logged.radar_rx - seen.truth.radar_rx, seen.hidden.position_error_m, atol=1e-12)
+    assert_allclose(logged.radar_rx - seen.truth.radar_rx, seen.draw.position_error_m, atol=1e-12)
     assert (seen.truth.sidelink_rx == logged.sidelink_rx).all()
     assert (seen.truth.radar_tx == logged.radar_tx).all()
 
