@@ -10,7 +10,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.contracts import check
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import PHASE_HISTORIES, TRACKS, read_sigmf
+from apertura.ingest import open_recording, read_phase_history, read_track
 
 HEADER = (
     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  {}                  latitude(deg) longitude(deg)  height(m)   Q\n"
@@ -19,7 +19,7 @@ HEADER = (
 
 def pos(path, system, *lines):
     path.write_text(HEADER.format(system) + "\n".join(lines) + "\n")
-    return TRACKS[".pos"](path, node="a")
+    return read_track(path, node="a")
 
 
 def test_gpst_is_eighteen_seconds_ahead_of_utc(tmp_path):
@@ -48,7 +48,7 @@ def test_gps_weeks_and_calendar_dates_are_the_same_times(tmp_path):
 def test_a_solution_that_does_not_say_what_it_holds_is_refused(tmp_path, text, expected):
     (tmp_path / "a.pos").write_text(text)
     with pytest.raises(CampaignError, match=expected):
-        TRACKS[".pos"](tmp_path / "a.pos", node="a")
+        read_track(tmp_path / "a.pos", node="a")
 
 
 def test_a_csv_log_keeps_position_and_attitude(tmp_path):
@@ -57,7 +57,7 @@ def test_a_csv_log_keeps_position_and_attitude(tmp_path):
         "time_utc,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,yaw_deg\n"
         "2025-05-14T09:30:00Z,48.0,9.0,600.0,1,2,359\n2025-05-14T09:30:01.5Z,48.0,9.0,601.0,1,2,1\n"
     )
-    track = check(TRACKS[".csv"](path, node="a"), "track")
+    track = check(read_track(path, node="a"), "track")
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values[1]), [48.0, 9.0, 601.0], atol=1e-9)
     np.testing.assert_allclose(np.degrees(track.attitude.values[0]), [1, 2, 359])
     assert track.time.values[1] - track.time.values[0] == np.timedelta64(1500, "ms")
@@ -66,7 +66,13 @@ def test_a_csv_log_keeps_position_and_attitude(tmp_path):
 def test_a_csv_log_without_a_column_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("time_utc,latitude_deg,longitude_deg\n2025-05-14T09:30:00Z,48,9\n")
     with pytest.raises(CampaignError, match="no column height_m"):
-        TRACKS[".csv"](tmp_path / "a.csv", node="a")
+        read_track(tmp_path / "a.csv", node="a")
+
+
+def raw_of(*files):
+    opened = open_recording(files)
+    opened.check_hash()
+    return opened.cut(opened.captures, node="a")
 
 
 def recording(folder, samples, captures, **header):
@@ -86,7 +92,7 @@ def recording(folder, samples, captures, **header):
         "annotations": [],
     }
     (folder / "a.sigmf-meta").write_text(json.dumps(meta))
-    return read_sigmf(folder / "a.sigmf-meta", data, node="a")
+    return raw_of(folder / "a.sigmf-meta", data)
 
 
 def capture(start, second, **more):
@@ -121,7 +127,7 @@ def test_another_datatype_is_refused(shared, tmp_path):
 def test_a_real_recording_of_another_maker_is_read(shared):
     folder = shared / "sigmf_nbiot"
     names = [folder / f"V16-beacon-NB-IoT-uplink.sigmf-{kind}" for kind in ("meta", "data")]
-    raw = check(read_sigmf(*names, node="beacon"), "raw")
+    raw = check(raw_of(*names), "raw")
     assert raw.iq.shape == (1, 1, 512000, 2)
     assert raw.attrs["sample_rate_hz"] == 640000
 
@@ -129,7 +135,7 @@ def test_a_real_recording_of_another_maker_is_read(shared):
 def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
     """The antenna's distance to the scene centre is r0, so an echo from there has no phase left."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
-    echo = check(PHASE_HISTORIES["afrl_mat"](files, pair="a-a"), "echo")
+    echo = check(read_phase_history("afrl_mat", files, pair="a-a"), "echo")
     assert echo.transfer.shape == (234, 424)
     distance = np.linalg.norm(echo.tx_position.values, axis=1)
     np.testing.assert_allclose(echo.reference_delay.values * SPEED_OF_LIGHT_M_S / 2, distance, atol=2e-3)

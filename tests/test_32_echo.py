@@ -5,7 +5,7 @@ import pytest
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.echo.demodulate import demodulate, remove_path, subcarrier_numbers
+from apertura.echo.demodulate import Numerology, demodulate, remove_path, subcarrier_numbers
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from apertura.geometry.phase_centres import phase_centres
@@ -29,7 +29,7 @@ def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
     codes = np.exp(2j * np.pi * np.random.default_rng(1).random(COUNT))
     delay = delay_samples / RATE
     captured = np.round(symbol(delay, codes, numbers) * 3).astype(np.complex64)
-    transfer = demodulate(captured, numbers=numbers, prefix_samples=PREFIX, dft_samples=64)[0] / codes / 600
+    transfer = demodulate(captured, Numerology(1e9, RATE, numbers, PREFIX, 64))[0] / codes / 600
     expected = np.exp(-2j * np.pi * (1e9 + numbers * SPACING) * delay)
     np.testing.assert_allclose(transfer, expected, atol=2e-3)
 
@@ -37,13 +37,13 @@ def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
 def test_an_echo_beyond_the_prefix_is_no_longer_a_pure_delay():
     numbers, codes = subcarrier_numbers(COUNT, carrier_is="band_start"), np.ones(COUNT, complex)
     late = symbol(30 / RATE, codes, numbers).astype(np.complex64)
-    transfer = demodulate(late, numbers=numbers, prefix_samples=PREFIX, dft_samples=64)[0] / 200
+    transfer = demodulate(late, Numerology(1e9, RATE, numbers, PREFIX, 64))[0] / 200
     assert np.abs(np.abs(transfer) - 1).max() > 0.1
 
 
 def test_the_dft_needs_prefix_and_one_period():
     with pytest.raises(ValueError, match="needs 80"):
-        demodulate(np.ones((1, 79), np.complex64), numbers=np.arange(4), prefix_samples=16, dft_samples=64)
+        demodulate(np.ones((1, 79), np.complex64), Numerology(1e9, RATE, np.arange(4), 16, 64))
 
 
 def band():

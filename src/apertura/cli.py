@@ -136,19 +136,11 @@ def simulate(
 
 
 @step.command()
-def raw(flight: str, node: str, campaign: Directory = HERE) -> None:
-    """Read a node's recording into raw.zarr."""
-    from apertura.steps import ingest
+def ingest(flight: str, node: str, campaign: Directory = HERE) -> None:
+    """Read a node's recording and flight log into raw.zarr and track.zarr."""
+    from apertura.steps import ingest as steps
 
-    print(ingest.raw(Campaign.load(campaign), flight, node))
-
-
-@step.command()
-def track(flight: str, node: str, campaign: Directory = HERE) -> None:
-    """Read a node's flight log into track.zarr."""
-    from apertura.steps import ingest
-
-    print(ingest.track(Campaign.load(campaign), flight, node))
+    print(*steps.ingest(Campaign.load(campaign), flight, node), sep="\n")
 
 
 @step.command()

@@ -3,11 +3,14 @@
 import ast
 import functools
 import hashlib
+import re
 import sysconfig
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parent
+_ROW = re.compile(r"apertura(\.\w+)+:\w+")
+"""A table's row that names a function which is imported when it is used: "apertura.ingest.rtklib:read_rtklib_pos"."""
 
 
 def sha256_file(path: Path) -> str:
@@ -31,6 +34,7 @@ def sha256_tree(folder: Path) -> dict[str, str]:
 def code_sha256(*modules: str) -> str:
     """Return the hash of the source of `modules` and of every apertura module they import, however deep.
 
+    Modules that a table's row names as a string, "apertura.ingest.rtklib:read_rtklib_pos", count as imported.
     A stage's hash therefore changes when, and only when, code it can run has changed. Compiled code counts by
     what it was built from: each ``*.sha256`` that was installed beside one of the modules.
 
@@ -113,4 +117,6 @@ def _imports(path: Path) -> tuple[str, ...]:
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and _ROW.fullmatch(node.value):
+            names.append(node.value.partition(":")[0])
     return tuple(names)
