@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from scipy.spatial.transform import Rotation
 
 from apertura.errors import CampaignError
 
@@ -147,6 +146,8 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     >>> (body_axes(np.radians([0.0, 0.0, 90.0])) @ [1.0, 0.0, 0.0]).round(12) + 0.0  # nose east
     array([0., 1., 0.])
     """
+    from scipy.spatial.transform import Rotation  # a tenth of a second that most steps need not pay
+
     flat = np.reshape(attitude_rad, (-1, 3))
     matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()
     return np.asarray(matrices.reshape(*np.shape(attitude_rad)[:-1], 3, 3))
@@ -155,7 +156,7 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
 def local_crs(name: str) -> str:
     """Return an engineering CRS for a frame without a place on Earth.
 
-    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth (DESIGN section 6).
+    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth.
 
     Examples
     --------

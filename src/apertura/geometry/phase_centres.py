@@ -1,13 +1,15 @@
 """Where each antenna was at each pulse and how the body was turned, from a logged track, attitude and lever arms."""
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
 
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import body_axes, ned_axes
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
 
 
 def phase_centres(
@@ -51,8 +53,7 @@ def phase_centres(
 
     Notes
     -----
-    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
-    (DESIGN section 3).
+    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED.
     """
     _check_covered(track_time, at, where)
     centres = _spline(track_time, position)(_seconds(at - track_time[0]))
@@ -91,7 +92,9 @@ def attitude_axes(
     return ned @ body
 
 
-def _spline(track_time: NDArray[np.datetime64], position: NDArray[np.float64]) -> BSpline:
+def _spline(track_time: NDArray[np.datetime64], position: NDArray[np.float64]) -> "BSpline":
+    from scipy.interpolate import make_interp_spline  # a third of a second that most steps need not pay
+
     return make_interp_spline(_seconds(track_time - track_time[0]), position, k=min(3, len(track_time) - 1))
 
 
