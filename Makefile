@@ -11,12 +11,14 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 setup: $(SETUP)
 
-# uv comes first, by hash; it then installs everything else by hash, and the package from this folder.
+# uv comes first, by hash; it then installs everything else by hash, and the package from this folder. All is compiled
+# to bytecode now: where Python may not write it later, every start would compile a step's 3000 imported files again.
 $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMakeLists.txt native/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt
-	$(BIN)/uv pip sync --quiet --python $(BIN)/python --require-hashes requirements/all.txt
+	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q src
 	touch $@
 
 demo: $(SETUP)
@@ -48,6 +50,7 @@ lint: $(SETUP)
 	$(BIN)/ruff format --check src tests benchmarks
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/clang-format --dry-run -Werror native/*.?pp
 	$(BIN)/lint-imports
 	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
 	$(BIN)/snakemake --lint --directory build/lint
@@ -56,6 +59,7 @@ format: $(SETUP)
 	$(BIN)/ruff check --fix src tests benchmarks
 	$(BIN)/ruff format src tests benchmarks
 	$(BIN)/snakefmt Snakefile workflow
+	$(BIN)/clang-format -i native/*.?pp
 
 # Needs a registry; the files name none.
 lock: $(SETUP)

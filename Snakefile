@@ -1,12 +1,8 @@
-# `snakemake --directory CAMPAIGN` runs a campaign folder; `apertura run CAMPAIGN` does the same.
-configfile: "config/config.yaml"
-
-
+# `snakemake --directory CAMPAIGN` runs a campaign folder; `apertura run CAMPAIGN` does the same. No `configfile:`: YAML
+# from a stranger would run as code; the workflow reads and checks config/config.yaml itself.
 module apertura:
     snakefile:
         "workflow/Snakefile"
-    config:
-        config
 
 
 use rule * from apertura

@@ -1,20 +1,23 @@
 """Random small campaigns as arrays: what a planner must cope with, from 30 m to 10 km and 0.4 to 10 GHz."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.focus.inputs import Profiles, Spectra
-from apertura.load.pair import Outlook
-from apertura.planning.plan import Job
-from apertura.scene.auto_grid import swath
+from apertura.echo.compression import window_weights
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.job import Job
+from apertura.geometry.aperture import Aperture
+from apertura.imaging.job import imaging_job
+from apertura.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, range_compress
 from apertura.scene.grid import SceneGrid
-from apertura.steps.plan import job_of
-from apertura.steps.profile import GUARD_SAMPLES, OVERSAMPLING
-from apertura.steps.terrain import Heights
+from apertura.scene.ground_models import GroundModels
+from apertura.scene.swath import swath
+from apertura.scene.terrain import FlatGround
+
+FLAT = FlatGround(0.0)
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Drawn:
     """A campaign: what was recorded, where it is imaged, how exact that has to be."""
 
     name: str
-    spectra: Spectra
+    history: PhaseHistory
     profiles: Profiles
     grid: SceneGrid
     job: Job
@@ -39,19 +42,18 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
     bandwidth = min(between(50e6, 600e6), 0.4 * carrier)
     wavelength = C / carrier
     spacing = min(between(wavelength / 8, 1.0), range_m / pixels)
-    grid = SceneGrid("local", 0.0, pixels * spacing, spacing, (pixels, pixels - 7), 0.0)
+    grid = SceneGrid("local", 0.0, pixels * spacing, spacing, (pixels, pixels - 7))
     tx, rx = _fly(
         generator, grid, range_m, wavelength, pulses=pulses, step_m=between(wavelength / 60, range_m / pulses)
     )
     window = str(generator.choice(["hann", "none"]))
-    spectra = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
+    history = _record(generator, grid, tx, rx, carrier_hz=carrier, bandwidth_hz=bandwidth, window=window)
     accuracy = float(generator.choice([-50.0, -60.0, -70.0, -80.0]))
-    profiles = compressed(spectra, grid, window)
-    outlook = Outlook(tx, rx, spectra.frequency_hz, spectra.weight, np.inf, spectra)
+    profiles = compressed(history, grid, window)
     name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
-    return Drawn(
-        name, spectra, profiles, grid, job_of(outlook, grid, Heights((), None), tile_px=256, threads=1), accuracy
-    )
+    ground = GroundModels.flat(0.0)
+    job = imaging_job(history.aperture, history.frequency_hz, history.weight, grid, ground, history=history)
+    return Drawn(name, history, profiles, grid, job, accuracy)
 
 
 def _fly(
@@ -91,14 +93,14 @@ def _record(
     carrier_hz: float,
     bandwidth_hz: float,
     window: str,
-) -> Spectra:
-    near, far = swath(grid, tx, rx)
+) -> PhaseHistory:
+    near, far = swath(grid, FLAT, Aperture(tx, rx))
     cells = (far - near).max() * bandwidth_hz / C + 2 * GUARD_SAMPLES / OVERSAMPLING
     count = int(np.ceil(1.2 * cells)) + 16
     frequency = carrier_hz + bandwidth_hz * (np.arange(count) / count - 0.5)
     targets = generator.integers(1, 25)
     rows, columns = (generator.uniform(0, size - 1, targets) for size in grid.shape)
-    places = grid.positions_at(rows, columns)
+    places = grid.positions_at(rows, columns, 0.0)
     gains = generator.standard_normal(targets) + 1j * generator.standard_normal(targets)
     path = sum(np.linalg.norm(places - antenna[:, None], axis=-1) for antenna in (tx, rx))
     reference = near / C
@@ -108,24 +110,10 @@ def _record(
     noise = 10 ** (generator.uniform(-60, 10) / 20)
     transfer += noise * (generator.standard_normal(transfer.shape) + 1j * generator.standard_normal(transfer.shape))
     weights = window_weights(window, count)
-    return Spectra(transfer.astype(np.complex64), frequency, weights, reference, tx, rx)
+    return PhaseHistory(transfer.astype(np.complex64), frequency, weights, reference, Aperture(tx, rx))
 
 
-def compressed(spectra: Spectra, grid: SceneGrid, window: str) -> Profiles:
-    """Return the range profiles of an echo, as the profile step makes them."""
-    near, far = swath(grid, spectra.tx_position_m, spectra.rx_position_m)
-    frequency = spectra.frequency_hz
-    step, length = range_step(frequency, oversampling=OVERSAMPLING)
-    start = near - GUARD_SAMPLES * step
-    count = int(np.ceil((far - near).max() / step)) + 2 * GUARD_SAMPLES + 1
-    samples = compress(
-        spectra.transfer,
-        frequency,
-        weight=window_weights(window, len(frequency)),
-        reference_delay_s=spectra.reference_delay_s,
-        start_m=start,
-        count=count,
-        oversampling=OVERSAMPLING,
-    )
-    centre, oversampling = centre_frequency(frequency), length / len(frequency)
-    return Profiles(samples, start, step, centre, oversampling, spectra.tx_position_m, spectra.rx_position_m)
+def compressed(history: PhaseHistory, grid: SceneGrid, window: str) -> Profiles:
+    """Return the range profiles of an echo under a window, as the profile step makes them."""
+    weighted = replace(history, weight=window_weights(window, len(history.frequency_hz)))
+    return range_compress(weighted, grid, FLAT)

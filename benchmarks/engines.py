@@ -26,7 +26,7 @@ from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import compress, window_weights
-from apertura.focus.engines import native, numba
+from apertura.focus.engines import native, native_binding, numba
 
 
 @dataclass
@@ -66,16 +66,10 @@ class Contestant:
 def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
     """Return the compiled engine in each instruction set and geometry."""
     flat = jobs["bistatic"]
-    found = []
-    for isa in ("avx512", "avx2", "portable"):
-        try:
-            os.environ["APERTURA_ISA"] = isa
-            native.instruction_set()
-        except ValueError:
-            continue
-        found.append(
-            Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
-        )
+    found = [
+        Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
+        for isa in filter(native_binding.runs, native.INSTRUCTION_SETS)
+    ]
     fast, linear = found[0].isa, {"oversampling": 10, "degree": 1}
     found += [
         Contestant(f"native {fast}", name, former(job), job, isa=fast) for name, job in jobs.items() if job is not flat
@@ -164,7 +158,7 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
 def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return antennas from the scene's middle, their mean distance to it, and the middle."""
     middle = job.pixels.mean((0, 1))
-    tx, rx = job.profiles.tx_position_m - middle, job.profiles.rx_position_m - middle
+    tx, rx = (leg - middle for leg in job.profiles.aperture.legs)
     return tx, rx, (np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1)) / 2, middle
 
 

@@ -13,6 +13,7 @@ from job import GUARD, Job, exact, response, total_path
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import native
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 RANGES_M = (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
 CARRIERS_HZ = (0.4e9, 1.2e9, 3.5e9, 10e9)
@@ -41,7 +42,10 @@ def patch(range_m: float, carrier_hz: float, spacing_m: float, *, pulses: int = 
         path = total_path(tx, rx, place[None])
         samples += gain * np.exp(-2j * np.pi * carrier_hz / C * path) * response(at - path)
     return Job(
-        Profiles(samples.astype(np.complex64), start, STEP_M, carrier_hz, 2.0, tx, rx), pixels, points, amplitude
+        Profiles(samples.astype(np.complex64), start, STEP_M, carrier_hz, 2.0, Aperture(tx, rx)),
+        pixels,
+        points,
+        amplitude,
     )
 
 

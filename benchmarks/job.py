@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16
@@ -101,7 +102,7 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
     for place, gain in zip(scatterers, amplitude, strict=True):
         path = total_path(tx, rx, place[None])
         samples += gain * np.exp(-1j * wavenumber * path) * response(at - path)
-    profiles = Profiles(samples.astype(np.complex64), start, step, CENTRE_HZ, 2.0, tx, rx)
+    profiles = Profiles(samples.astype(np.complex64), start, step, CENTRE_HZ, 2.0, Aperture(tx, rx))
     return Job(profiles, pixels, scatterers, amplitude)
 
 
@@ -116,7 +117,7 @@ def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
     history = np.zeros((len(reference_path_m), SUBCARRIERS), np.complex128)
     first_hz = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
     for place, gain in zip(job.scatterers, job.amplitude, strict=True):
-        path = total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, place[None])
+        path = total_path(*job.profiles.aperture.legs, place[None])
         turn = -2j * np.pi / C * (path - reference_path_m[:, None])
         coarse = gain * np.exp(turn * (first_hz + SPACING_HZ * block))
         history += (coarse[:, :, None] * np.exp(turn * SPACING_HZ * fine)[:, None, :]).reshape(history.shape)
@@ -126,10 +127,10 @@ def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
 def exact(job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ) -> NDArray[np.complex128]:
     """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
     wavenumber = 2 * np.pi * carrier_hz / C
-    here = total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, places)
+    here = total_path(*job.profiles.aperture.legs, places)
     image = np.zeros(len(places), np.complex128)
     for place, gain in zip(job.scatterers, job.amplitude, strict=True):
-        apart = here - total_path(job.profiles.tx_position_m, job.profiles.rx_position_m, place[None])
+        apart = here - total_path(*job.profiles.aperture.legs, place[None])
         image += gain * (np.exp(1j * wavenumber * apart) * response(apart)).sum(0)
     return image
 

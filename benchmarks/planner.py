@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from campaigns import Drawn, draw
 
-from apertura.focus.engines import ENGINES, numba, reference
-from apertura.planning.candidates import Setting, candidates
-from apertura.planning.machine import read_costs
+from apertura.focus.engines import load_engine, numba, reference
+from apertura.focus.engines.engine import Setting
 from apertura.planning.plan import Plan
 from apertura.planning.planner import make_plan
-from apertura.planning.view import look
+from apertura.planning.search import Search
 from apertura.quality.measures import numerical_error
 
 
@@ -34,11 +33,11 @@ class Runner:
     def go(self) -> np.ndarray:
         pixels = self.pixels
         begin = time.process_time()
-        engine, profiles = ENGINES[self.setting.engine], self.drawn.profiles
-        history = self.drawn.spectra if engine.reads == "echo" else profiles
-        if self.plan is not None and engine.reads == "profile":
-            history = self.plan.history(profiles)
-        image = engine.form(engine.prepare(history, **self.setting.options), pixels, **self.setting.form_options)
+        engine, profiles = load_engine(self.setting.engine), self.drawn.profiles
+        inputs = self.drawn.history if engine.READS == "phase_history" else profiles
+        if self.plan is not None and engine.READS == "profiles":
+            inputs = self.plan.inputs(profiles)
+        image = engine.form(engine.prepare(inputs, **self.setting.options), pixels, **self.setting.form_options)
         self.seconds.append(time.process_time() - begin)
         return image
 
@@ -48,26 +47,25 @@ class Runner:
 
     @property
     def pixels(self) -> np.ndarray:
-        return self.drawn.grid.positions()
+        return self.drawn.grid.positions(0.0)
 
 
 def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
     """Return (plan's setting, errors as it was made and redone, ratio to the best, the best setting)."""
-    plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db, costs=read_costs())
+    plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     picked = np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T
-    exact = reference.form(drawn.spectra, drawn.grid.positions()[*picked])
+    exact = reference.form(drawn.history, drawn.grid.positions(0.0)[*picked])
 
     def error_db(runner: Runner) -> float:
         return numerical_error(runner.go()[*picked].astype(np.complex64), exact).rms_db
 
     mine = [Runner(drawn, plan.setting, plan)]
     reached = [error_db(mine[0])]
-    for better in plan.better:
+    for better in plan.fallbacks:
         if reached[-1] > drawn.accuracy_db:
             mine.append(Runner(drawn, better))
             reached.append(error_db(mine[-1]))
-    view = look(drawn.job.tx_position_m[::8], drawn.job.rx_position_m[::8], drawn.job.net_m, drawn.job.spacing_m)
-    every = candidates(view, drawn.job.signal, drawn.job.load, read_costs())
+    every = Search(drawn.job).settings(len(drawn.job.aperture))
     every = [s for s in every if s.engine == "native"] or [s for s in every if s.engine == "numba"]
     others = [Runner(drawn, setting) for setting in every]
     met = [runner for runner in others if error_db(runner) <= drawn.accuracy_db]
@@ -90,7 +88,7 @@ def main() -> None:
     parser.add_argument("--pulses", type=int, default=400)
     asked = parser.parse_args()
     warm = draw(np.random.default_rng(999), pixels=16, pulses=8)
-    numba.form(numba.prepare(warm.profiles), warm.grid.positions())
+    numba.form(numba.prepare(warm.profiles), warm.grid.positions(0.0))
     ratios, redone, missed = [], 0, 0
     for seed in range(asked.first, asked.first + asked.campaigns):
         drawn = draw(np.random.default_rng(seed), pixels=asked.size, pulses=asked.pulses)

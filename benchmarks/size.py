@@ -15,7 +15,6 @@ import resource
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +22,14 @@ import zarr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import native
-from apertura.focus.engines.tables import Tables
+from apertura.focus.engines.engine import Setting
+from apertura.focus.engines.native_tables import Tables
 from apertura.focus.inputs import Profiles
-from apertura.focus.tiles import Former, form_blocks
+from apertura.focus.tiles import compute_tiles, image_array
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import ecef_from_projected
 from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 
@@ -48,37 +50,31 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
     samples = np.empty(shape, np.complex64)
     for part in np.array_split(samples, 32):
         part.real, part.imag = generator.standard_normal((2, *part.shape), np.float32)
-    return Profiles(samples, np.full(pulses, nearest), step_m, CENTRE_HZ, 2.0, tx, rx)
+    return Profiles(samples, np.full(pulses, nearest), step_m, CENTRE_HZ, 2.0, Aperture(tx, rx))
 
 
 def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
     """Return seconds of the whole image by the kernel alone, from tiles on its diagonal."""
     corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // native.PATCH * native.PATCH
-    tiles = [grid[c : c + TILE, c : c + TILE].positions() for c in corners]
+    tiles = [grid[c : c + TILE, c : c + TILE].positions(0.0) for c in corners]
     begin = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda pixels: native.form(tables, pixels), tiles))
     return (time.perf_counter() - begin) * grid.shape[0] * grid.shape[1] / (TILE * TILE * len(tiles))
 
 
-def image_seconds(history: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
+def image_seconds(profiles: Profiles, grid: SceneGrid, *, blocks: int, threads: int) -> tuple[float, float]:
     """Return seconds of forming into zarr, tables, places and all, and of the kernel alone, block after block."""
-    alone = paused = 0.0
-
-    def former(part: slice) -> Former:
-        nonlocal alone, paused
-        tables = native.prepare(history.of_pulses(part))
-        begin = time.perf_counter()
-        alone += kernel_seconds(tables, grid, threads)
-        paused += time.perf_counter() - begin
-        return partial(native.form, tables)
-
+    alone = sum(
+        kernel_seconds(native.prepare(profiles[part]), grid, threads) for part in profiles.aperture.blocks(blocks)
+    )
     with tempfile.TemporaryDirectory() as folder:
         array = zarr.create_array(folder, shape=grid.shape, chunks=(TILE, TILE), dtype="complex64")
-        begin, scratch, pulses = time.perf_counter(), Path(folder), len(history.samples)
-        how = {"blocks": blocks, "write": array.__setitem__, "scratch": scratch, "threads": threads}
-        form_blocks(former, pulses, grid, grid.tiles(TILE), **how)
-        return time.perf_counter() - begin - paused, alone
+        begin = time.perf_counter()
+        setting = Setting("native", {}, {}, -60.0, 1.0, pulse_blocks=blocks)
+        image = image_array(profiles, setting, grid, FlatGround(0.0), side_px=TILE)
+        compute_tiles(image, list(grid.tiles(TILE)), array, threads=threads)
+        return time.perf_counter() - begin, alone
 
 
 def main() -> None:
@@ -89,7 +85,7 @@ def main() -> None:
     parser.add_argument("--blocks", type=int, default=2, help="of pulses, whose tables are held one after the other")
     parser.add_argument("--threads", type=int, default=2)
     asked = parser.parse_args()
-    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size), 0.0)
+    grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size))
     history = profiles(grid, asked.pulses)
     spent, alone = image_seconds(history, grid, blocks=asked.blocks, threads=asked.threads)
     found = {

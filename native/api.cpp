@@ -1,20 +1,19 @@
 // The entry points that Python binds, and the choice of the instruction set.
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 #include <new>
 #include <vector>
 
 #include "patch.hpp"
 
+using apertura::kPatchSide;
 using apertura::kPixels;
-using apertura::kSide;
 using apertura::Patch;
 
-#define APERTURA_DECLARE(form)                                                                      \
-  extern "C" void apertura_add_##form(const ApertureJob*, const Patch*, int64_t, int64_t, float*); \
-  extern "C" void apertura_expand_##form(const TableJob*, float*);
+#define APERTURA_DECLARE(isa)                                                                     \
+  extern "C" void apertura_add_##isa(const ApertureJob*, const Patch*, int64_t, int64_t, float*); \
+  extern "C" void apertura_expand_##isa(const TableJob*, float*);
 
 APERTURA_DECLARE(portable)
 #ifdef APERTURA_X86
@@ -24,7 +23,8 @@ APERTURA_DECLARE(avx512)
 
 namespace {
 
-struct Entry {
+// The kernel compiled for one instruction set.
+struct Isa {
   const char* name;
   bool runs;
   void (*add)(const ApertureJob*, const Patch*, int64_t, int64_t, float*);
@@ -32,71 +32,85 @@ struct Entry {
 };
 
 // Fastest first.
-const Entry* find(const char* name) {
+const Isa* find(const char* name) {
 #ifdef APERTURA_X86
   static const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   static const bool has_avx512 = has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
                                  __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
 #endif
-  static const Entry entries[] = {
+  static const Isa isas[] = {
 #ifdef APERTURA_X86
       {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512},
       {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2},
 #endif
       {"portable", true, apertura_add_portable, apertura_expand_portable},
   };
-  for (const Entry& entry : entries)
-    if (entry.runs && (!*name || std::strcmp(name, entry.name) == 0)) return &entry;
+  for (const Isa& isa : isas)
+    if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
   return nullptr;
 }
 
-constexpr int64_t kPulses = 64;      // in one pass: with kRegion, what the second-level cache holds
-constexpr int64_t kRegion = 128;     // pixels on a side of what is finished before going on
+constexpr int64_t kPulses = 64;   // in one pass: with kRegion, what the second-level cache holds
+constexpr int64_t kRegion = 128;  // pixels on a side of what is finished before going on
+constexpr int64_t kSum = 2 * kPixels;
 
 // Writes the sums of one patch to its pixels.
 template <class Real>
 void write(const ApertureJob& job, const Patch& patch, const Real* total) {
-  for (int i = 0; i < patch.rows; i++)
-    for (int j = 0; j < patch.columns; j++) {
-      const int block = i / 8 * 8 + j / 8 * 4 + i / 4 % 2 * 2 + j / 4 % 2, slot = block * 16 + i % 4 * 4 + j % 4;
-      const int64_t pixel = (patch.row + i) * job.columns + patch.column + j;
-      const double* at = job.pixels + 3 * pixel;
-      const bool placed = std::isfinite(at[0] + at[1] + at[2]);
-      job.image[2 * pixel] = placed ? float(total[slot]) : std::nanf("");
-      job.image[2 * pixel + 1] = placed ? float(total[kPixels + slot]) : std::nanf("");
-    }
+  for (int64_t slot = 0; slot < kPixels; slot++) {
+    if (!holds(patch, slot)) continue;
+    const int64_t row = patch.row + apertura::pixel_row(slot), column = patch.column + apertura::pixel_column(slot);
+    const int64_t pixel = row * job.columns + column;
+    const double* at = job.pixels + 3 * pixel;
+    const bool placed = std::isfinite(at[0] + at[1] + at[2]);
+    job.image[2 * pixel] = placed ? float(total[slot]) : std::nanf("");
+    job.image[2 * pixel + 1] = placed ? float(total[kPixels + slot]) : std::nanf("");
+  }
 }
 
 // Forms the patches of one region, blocks of pulses in the outer loop. The order of summation of a patch does not
 // depend on the region or the tile.
 template <class Real>
-void form_region(const ApertureJob& job, const Entry& entry, int64_t top, int64_t left, std::vector<Patch>& patches,
+void form_region(const ApertureJob& job, const Isa& isa, int64_t top, int64_t left, std::vector<Patch>& patches,
                  std::vector<Real>& totals) {
   // A quarter of the tolerance, seen by both legs.
-  const double bend = 0.125 * job.tolerance_rad / job.radians_per_cell;
-  size_t count = 0;
-  for (int64_t row = top; row < top + kRegion && row < job.rows; row += kSide)
-    for (int64_t column = left; column < left + kRegion && column < job.columns; column += kSide)
-      apertura::fit(job, row, column, bend, patches[count++]);
+  const double deviation_cells = 0.125 * job.tolerance_rad / job.radians_per_cell;
+  int64_t count = 0;
+  for (int64_t row = top; row < top + kRegion && row < job.rows; row += kPatchSide)
+    for (int64_t column = left; column < left + kRegion && column < job.columns; column += kPatchSide)
+      apertura::fit(job, row, column, deviation_cells, patches[count++]);
   std::fill(totals.begin(), totals.end(), Real(0));
   for (int64_t begin = 0; begin < job.pulses; begin += kPulses) {
     const int64_t end = begin + kPulses < job.pulses ? begin + kPulses : job.pulses;
-    for (size_t n = 0; n < count; n++) {
-      alignas(64) float sum[2 * kPixels] = {};
-      entry.add(&job, &patches[n], begin, end, sum);
-      for (int slot = 0; slot < 2 * kPixels; slot++) totals[n * 2 * kPixels + slot] += Real(sum[slot]);
+    for (int64_t n = 0; n < count; n++) {
+      alignas(64) float sum[kSum] = {};
+      isa.add(&job, &patches[n], begin, end, sum);
+      for (int64_t slot = 0; slot < kSum; slot++) totals[n * kSum + slot] += Real(sum[slot]);
     }
   }
-  for (size_t n = 0; n < count; n++) write(job, patches[n], &totals[n * 2 * kPixels]);
+  for (int64_t n = 0; n < count; n++) write(job, patches[n], &totals[n * kSum]);
 }
 
 template <class Real>
-void form_tile(const ApertureJob& job, const Entry& entry) {
-  constexpr size_t count = (kRegion / kSide) * (kRegion / kSide);
+void form_tile(const ApertureJob& job, const Isa& isa) {
+  constexpr int64_t count = (kRegion / kPatchSide) * (kRegion / kPatchSide);
   std::vector<Patch> patches(count);
-  std::vector<Real> totals(count * 2 * kPixels);
+  std::vector<Real> totals(count * kSum);
   for (int64_t top = 0; top < job.rows; top += kRegion)
-    for (int64_t left = 0; left < job.columns; left += kRegion) form_region(job, entry, top, left, patches, totals);
+    for (int64_t left = 0; left < job.columns; left += kRegion) form_region(job, isa, top, left, patches, totals);
+}
+
+// Runs `work` with the instruction set of that name. Returns what the entry points return.
+template <class Work>
+int run(const char* name, const Work& work) {
+  const Isa* isa = find(name);
+  if (!isa) return 2;
+  try {
+    work(*isa);
+  } catch (const std::bad_alloc&) {
+    return 1;
+  }
+  return 0;
 }
 
 }  // namespace
@@ -104,33 +118,22 @@ void form_tile(const ApertureJob& job, const Entry& entry) {
 extern "C" {
 
 // The instruction set that `name` ("" for the best) selects here, or null if this machine has none of that name.
-__attribute__((visibility("default"))) const char* apertura_form(const char* name) {
-  const Entry* entry = find(name);
-  return entry ? entry->name : nullptr;
+__attribute__((visibility("default"))) const char* apertura_isa(const char* name) {
+  const Isa* isa = find(name);
+  return isa ? isa->name : nullptr;
 }
 
 // 0, or 1 if memory ran out, or 2 if this machine lacks the instruction set.
 __attribute__((visibility("default"))) int apertura_expand(const char* name, const TableJob* job) {
-  const Entry* entry = find(name);
-  if (!entry) return 2;
-  try {
-    std::vector<float> scratch(size_t(2 * job->down * (job->steps + 48) + job->up * 2 * (job->degree + 1) * job->steps));
-    entry->expand(job, scratch.data());
-  } catch (const std::bad_alloc&) {
-    return 1;
-  }
-  return 0;
+  return run(name, [job](const Isa& isa) {
+    std::vector<float> scratch(apertura::scratch_length(*job));
+    isa.expand(job, scratch.data());
+  });
 }
 
 __attribute__((visibility("default"))) int apertura_image(const char* name, const ApertureJob* job) {
-  const Entry* entry = find(name);
-  if (!entry) return 2;
-  try {
-    job->wide_sum ? form_tile<double>(*job, *entry) : form_tile<float>(*job, *entry);
-  } catch (const std::bad_alloc&) {
-    return 1;
-  }
-  return 0;
+  return run(name,
+             [job](const Isa& isa) { job->wide_sum ? form_tile<double>(*job, isa) : form_tile<float>(*job, isa); });
 }
 
 }  // extern "C"

@@ -1,4 +1,5 @@
-// Eight pulses over one patch: which form each pulse may take, and the pixel loop of the fast forms.
+// Eight pulses over one patch: which path variant each pulse takes, and the pixel loop of the fast variants.
+// Equation numbers in brackets are those of docs/theory/engine.md.
 #pragma once
 #include "lanes.hpp"
 #include "paths.hpp"
@@ -6,179 +7,204 @@
 
 namespace {
 
-// Fast forms: one look-up window for a group of four blocks (one block with 8 lanes), or a wide one for each block; all
-// blocks bend alike, or each its own way; shallow: heights inside a block need no curvature. Where antennas weigh, pulses that may go fast all go the one way that holds
-// for all of them.
-constexpr bool kGrouped = kLanes == 16;
-// Fast forms but for the first two bend block by block.
-enum Form { kShared, kShallow, kSharedWide, kOwn, kWeighted, kExact, kSkip, kForms };
+// How the path of a patch's pixels is taken for one pulse, cheapest first. Curvature is the second-order part of the
+// path inside a block, (5a). Windows are the 16 cells of the table that a look-up can reach: narrow ones serve a group
+// of four blocks with 16 lanes, one block (8 cells) with 8 lanes, and are not used with 4; wide ones serve one block.
+enum Variant {
+  kSharedCurvature,  // narrow window, all blocks curve as the origin does
+  kLinearHeights,    // the same, where heights inside a block need no second-order term
+  kWideWindow,       // shared curvature, wide windows
+  kOwnCurvature,     // wide windows, each block has its own curvature
+  kWeighted,         // the same, weighted by the antennas' beams: holds for all pulses that may go fast
+  kExactPath,        // each pixel in float64 (exact.hpp)
+  kSkipped,          // no echo, or no beam, reaches the patch
+  kVariants
+};
+constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four blocks
 
+// What the pixel loop reads: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block.
 struct Batch {
-  alignas(64) float path[kBatch][kBlocks];  // at the centre, from the window's first cell
+  alignas(64) float path[kBatch][kBlocks];  // at the block's centre, in cells from the window's first cell
   alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks], h[kBatch][kBlocks];  // its derivatives
+  // Own curvature: its second-order coefficients, (5a).
   alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks], yy[kBatch][kBlocks];
   alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
-  alignas(64) int32_t window[kBatch][kBlocks];  // first cell, from `row`
-  alignas(64) float bend[kBatch][16];           // shared curvature over the pixels of any block
-  alignas(64) float tilt[kBatch][16];           // shared change of the height slope over them
-  float lift[kBatch];                           // shared second derivative along the height
-  alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // of the antennas
+  alignas(64) int32_t window[kBatch][kBlocks];     // first cell, from `row`
+  alignas(64) float shared_curvature[kBatch][16];  // x'^2 xx + x'y' xy + y'^2 yy at the pixels of any block
+  alignas(64) float shared_slope_h[kBatch][16];    // x' xh + y' yh at them
+  float shared_hh[kBatch];
+  alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // (7)
   float weight_h[kBatch];
-  const float* row[kBatch];
-  int order[kForms][kBatch];
-  int count[kForms];
+  const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
+  int64_t order[kVariants][kBatch];  // the pulses of each variant
+  int64_t count[kVariants];
 };
 
-// Pixels of a block from its centre.
+// x' and y': pixels of a block from its centre.
 alignas(64) constexpr float kLaneX[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f,
                                           -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f};
 alignas(64) constexpr float kLaneY[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
                                           .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
-// Places the look-up windows of one pulse. Returns the form it may take: every index stays inside its window and
-// every window inside the table, or the pulse goes the exact way.
-template <bool kTerrain, bool kOwnCurvature>
-inline Form place(const ApertureJob& job, const Patch& patch, const Aim& aim, int64_t pulse, int q, Batch& batch) {
-  constexpr int kParts = kBlocks / kLanes;
-  const float rough = patch.roughest, first = aim.first[q], last = aim.last[q];
-  Truth inside = kTrue, narrow = kTrue;
-  Lanes path[kParts], low[kParts], lowest[kParts], top[kParts];
-  for (int part = 0; part < kParts; part++) {
-    const int b = part * kLanes;
-    Slope s;
-    add_leg<kTerrain, kOwnCurvature>(patch, aim.leg[0], q, b, s);
-    add_leg<kTerrain, kOwnCurvature>(patch, aim.leg[1], q, b, s);
-    path[part] = s.path + aim.rest[q];
-    Lanes span = 1.5f * (magnitude(s.x) + magnitude(s.y)) + aim.margin[q];
-    if constexpr (kTerrain) span += rough * magnitude(s.h);
-    top[part] = path[part] + span;
+// Expands the paths of one pulse about the patch's blocks and sets their look-up windows. Returns the variant it takes:
+// every index stays inside its window and every window inside the table, or the pulse takes exact paths.
+template <bool kTerrain, bool kCurvature>
+inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, int64_t pulse,
+                            int64_t q, Batch& batch) {
+  constexpr int64_t kParts = kBlocks / kLanes;
+  const float first = origin.first_window[q], last = origin.last_window[q];
+  LaneMask inside = kAllLanes, narrow = kAllLanes;
+  Lanes path[kParts], low[kParts], lowest[kParts], high[kParts];
+  for (int64_t part = 0; part < kParts; part++) {
+    const int64_t b = part * kLanes;
+    // (3) to (5): path and derivatives at the block centres, both legs added.
+    BlockPaths s;
+    add_block_leg<kTerrain, kCurvature>(patch, origin.leg[0], q, b, s);
+    add_block_leg<kTerrain, kCurvature>(patch, origin.leg[1], q, b, s);
+    path[part] = s.path + origin.fraction[q];
+    // How far a pixel's path lies from its block's at most: 1.5 pixels along both axes, the heights, the curvature.
+    Lanes span = 1.5f * (magnitude(s.x) + magnitude(s.y)) + origin.curvature_bound[q];
+    if constexpr (kTerrain) span += patch.rise_max * magnitude(s.h);
+    high[part] = path[part] + span;
     low[part] = floor(path[part] - span);
+    // A window begins at the block's lowest cell, or at the lowest of its group; it must lie in the table and reach far
+    // enough.
     lowest[part] = kGrouped ? least_of_four(low[part]) : low[part];
     inside &= at_most(splat(first), low[part]) & at_most(low[part], splat(last)) &
-              at_most(top[part] - low[part], splat(kWindow - 0.51f));
-    narrow &= at_most(top[part] - lowest[part], splat(kNarrow - 0.51f));
+              at_most(high[part] - low[part], splat(kWindow - apertura::kWindowMargin));
+    narrow &= at_most(high[part] - lowest[part], splat(kNarrow - apertura::kWindowMargin));
     store(batch.x[q] + b, s.x), store(batch.y[q] + b, s.y);
     if constexpr (kTerrain) store(batch.h[q] + b, s.h);
-    if constexpr (kOwnCurvature)
-      store(batch.xx[q] + b, s.xx), store(batch.xy[q] + b, s.xy), store(batch.yy[q] + b, s.yy);
-    if constexpr (kOwnCurvature && kTerrain)
+    if constexpr (kCurvature) store(batch.xx[q] + b, s.xx), store(batch.xy[q] + b, s.xy), store(batch.yy[q] + b, s.yy);
+    if constexpr (kCurvature && kTerrain)
       store(batch.xh[q] + b, s.xh), store(batch.yh[q] + b, s.yh), store(batch.hh[q] + b, s.hh);
   }
   if (!all(inside)) {
-    Truth before = kTrue, behind = kTrue;
-    for (int part = 0; part < kParts; part++) {
-      before &= at_most(top[part], splat(first - 1));
+    // A patch that lies before or behind all of the profile gets nothing of this pulse.
+    LaneMask before = kAllLanes, behind = kAllLanes;
+    for (int64_t part = 0; part < kParts; part++) {
+      before &= at_most(high[part], splat(first - 1));
       behind &= at_most(splat(last + kWindow + 1), low[part]);
     }
-    return all(before) || all(behind) ? kSkip : kExact;
+    return all(before) || all(behind) ? kSkipped : kExactPath;
   }
-  const bool shared = !kOwnCurvature && kLanes != 4 && all(narrow);
-  for (int part = 0; part < kParts; part++) {
-    const Lanes begin = shared ? lowest[part] : low[part];
+  // Paths count from the first cell of the window, so that a rounded path is an index into it.
+  const bool narrow_windows = !kCurvature && kLanes != 4 && all(narrow);
+  for (int64_t part = 0; part < kParts; part++) {
+    const Lanes begin = narrow_windows ? lowest[part] : low[part];
     store(batch.path[q] + part * kLanes, path[part] - begin);
-    *reinterpret_cast<Whole*>(batch.window[q] + part * kLanes) = __builtin_convertvector(begin, Whole);
+    *reinterpret_cast<IntLanes*>(batch.window[q] + part * kLanes) = __builtin_convertvector(begin, IntLanes);
   }
-  batch.row[q] = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(aim.start[q]);
-  if constexpr (kOwnCurvature) return kOwn;
-  for (int lane = 0; lane < 16; lane += kLanes) {
+  batch.row[q] = job.cells + (pulse + q) * 2 * (job.degree + 1) * job.width + int64_t(origin.whole[q]);
+  if constexpr (kCurvature) return kOwnCurvature;
+  // Shared curvature depends on the pixel's place in its block alone: once per pulse, for all blocks.
+  for (int64_t lane = 0; lane < 16; lane += kLanes) {
     const Lanes x = load(kLaneX + lane), y = load(kLaneY + lane);
-    store(batch.bend[q] + lane, x * (x * aim.xx[q] + y * aim.xy[q]) + y * y * aim.yy[q]);
-    if constexpr (kTerrain) store(batch.tilt[q] + lane, x * aim.xh[q] + y * aim.yh[q]);
+    store(batch.shared_curvature[q] + lane, x * (x * origin.xx[q] + y * origin.xy[q]) + y * y * origin.yy[q]);
+    if constexpr (kTerrain) store(batch.shared_slope_h[q] + lane, x * origin.xh[q] + y * origin.yh[q]);
   }
-  batch.lift[q] = aim.hh[q];
-  if (!shared) return kSharedWide;
-  return kTerrain && aim.shallow[q] ? kShallow : kShared;
+  batch.shared_hh[q] = origin.hh[q];
+  if (!narrow_windows) return kWideWindow;
+  return kTerrain && origin.linear_heights[q] ? kLinearHeights : kSharedCurvature;
 }
 
-// Sorts eight pulses into forms.
+// Sorts eight pulses by the variant they take.
 template <bool kTerrain>
-inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
-  Aim aim;
-  aim_at<kTerrain>(job, patch, pulse, aim);
-  constexpr Form kMost = kTerrain ? kShallow : kShared;
-  int most = 0;  // in a register: nearly all pulses take this form
-  for (int form = 0; form < kForms; form++) batch.count[form] = 0;
-  for (int q = 0; q < pulses; q++) {
-    Form form = kExact;
-    if (aim.holds[q] == 2)
-      form = place<kTerrain, false>(job, patch, aim, pulse, q, batch);
-    else if (aim.holds[q] == 1)
-      form = place<kTerrain, true>(job, patch, aim, pulse, q, batch);
-    if (form == kMost)
+inline void sort_pulses(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, Batch& batch) {
+  OriginPaths origin;
+  find_origin_paths<kTerrain>(job, patch, pulse, origin);
+  constexpr Variant kMost = kTerrain ? kLinearHeights : kSharedCurvature;
+  int64_t most = 0;  // in a register: nearly all pulses take this variant
+  for (int64_t variant = 0; variant < kVariants; variant++) batch.count[variant] = 0;
+  for (int64_t q = 0; q < pulses; q++) {
+    Variant variant = kExactPath;
+    if (origin.holds[q] == 2)
+      variant = expand_paths<kTerrain, false>(job, patch, origin, pulse, q, batch);
+    else if (origin.holds[q] == 1)
+      variant = expand_paths<kTerrain, true>(job, patch, origin, pulse, q, batch);
+    if (variant == kMost)
       batch.order[kMost][most++] = q;
     else
-      batch.order[form][batch.count[form]++] = q;
+      batch.order[variant][batch.count[variant]++] = q;
   }
   batch.count[kMost] = most;
 }
 
-// Path of a block's pixels, in cells from its window.
-template <bool kTerrain, Form kForm>
-inline Lanes place_pixels(const Patch& patch, const Batch& batch, int q, int b, int part) {
+// (5b): path of a block's pixels, in cells from the first cell of its window.
+template <bool kTerrain, Variant kVariant>
+inline Lanes pixel_paths(const Patch& patch, const Batch& batch, int64_t q, int64_t b, int64_t part) {
   const Lanes x = load(kLaneX + part), y = load(kLaneY + part);
   Lanes t;
-  if constexpr (kForm >= kOwn)
+  if constexpr (kVariant >= kOwnCurvature)
     t = batch.path[q][b] + x * (batch.x[q][b] + x * batch.xx[q][b] + y * batch.xy[q][b]) +
         y * (batch.y[q][b] + y * batch.yy[q][b]);
   else
-    t = (load(batch.bend[q] + part) + batch.path[q][b]) + x * batch.x[q][b] + y * batch.y[q][b];
+    t = (load(batch.shared_curvature[q] + part) + batch.path[q][b]) + x * batch.x[q][b] + y * batch.y[q][b];
   if constexpr (kTerrain) {
     const Lanes rise = load(patch.rise + b * 16 + part);
-    if constexpr (kForm == kShallow)
+    if constexpr (kVariant == kLinearHeights)
       t += rise * batch.h[q][b];
-    else if constexpr (kForm >= kOwn)
+    else if constexpr (kVariant >= kOwnCurvature)
       t += rise * (batch.h[q][b] + x * batch.xh[q][b] + y * batch.yh[q][b] + rise * batch.hh[q][b]);
     else
-      t += rise * (load(batch.tilt[q] + part) + batch.h[q][b] + rise * batch.lift[q]);
+      t += rise * (load(batch.shared_slope_h[q] + part) + batch.h[q][b] + rise * batch.shared_hh[q]);
   }
   return t;
 }
 
-// The pixel loop: for each window's blocks, all pulses of one form. `sum` is re then im, block by block.
-template <class Phase, int kDegree, bool kTerrain, Form kForm>
-inline void add_form(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
-  constexpr bool kWide = kForm != kShared && kForm != kShallow;
-  constexpr int kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
-  const int count = batch.count[kForm];
+// The pixel loop: for the blocks of each window, all pulses of one variant. `sum` is re then im, block by block.
+template <class Phase, int64_t kDegree, bool kTerrain, Variant kVariant>
+inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
+  constexpr bool kWide = kVariant != kSharedCurvature && kVariant != kLinearHeights;
+  constexpr int64_t kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
+  const int64_t count = batch.count[kVariant];
   if (count == 0) return;
-  const Phase phase(job.phase);
+  const Phase phase(job.phase_coefficients);
   const int64_t width = job.width;
-  for (int group = 0; group < kBlocks; group += kBundle) {
+  for (int64_t group = 0; group < kBlocks; group += kBundle) {
     if (!patch.present[group]) continue;
+    // The image of these blocks stays in registers over all pulses.
     Lanes re[kVectors], im[kVectors];
     float* here = sum + group * 16;
-    for (int v = 0; v < kVectors; v++) re[v] = load(here + v * kLanes), im[v] = load(here + kPixels + v * kLanes);
-    for (int n = 0; n < count; n++) {
-      const int q = batch.order[kForm][n];
+    for (int64_t v = 0; v < kVectors; v++) re[v] = load(here + v * kLanes), im[v] = load(here + kPixels + v * kLanes);
+    for (int64_t n = 0; n < count; n++) {
+      // The window of this pulse: a_0, a_1, a_2 of (2) at up to 16 cells, each part of each coefficient in a register.
+      const int64_t q = batch.order[kVariant][n];
       const float* window = batch.row[q] + batch.window[q][group];
-      const Stretch<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
-      const Stretch<kWide> re2(kDegree == 2 ? window + 4 * width : window), im2(kDegree == 2 ? window + 5 * width : window);
-      Lanes u[kVectors];  // all places before the first look-up, so that no vector waits for its own
-      Whole index[kVectors];
+      const WindowCells<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
+      const WindowCells<kWide> re2(kDegree == 2 ? window + 4 * width : window);
+      const WindowCells<kWide> im2(kDegree == 2 ? window + 5 * width : window);
+      // Path t of each pixel by (5b); its cell i = round(t) lies in the low bits of t + 1.5 2^23, and u = t - i is the
+      // place in the cell. All paths come before the first look-up, so that no vector waits for its own.
+      Lanes u[kVectors];
+      IntLanes index[kVectors];
 #pragma GCC unroll 4
-      for (int v = 0; v < kVectors; v++) {
-        const Lanes t = place_pixels<kTerrain, kForm>(patch, batch, q, group + v / kParts, v % kParts * kLanes);
-        const Lanes moved = t + kMagic;
-        u[v] = t - (moved - kMagic), index[v] = (Whole)moved;
+      for (int64_t v = 0; v < kVectors; v++) {
+        const Lanes t = pixel_paths<kTerrain, kVariant>(patch, batch, q, group + v / kParts, v % kParts * kLanes);
+        const Lanes rounded = t + kRounder;
+        u[v] = t - (rounded - kRounder), index[v] = (IntLanes)rounded;
       }
 #pragma GCC unroll 4
-      for (int v = 0; v < kVectors; v++) {
+      for (int64_t v = 0; v < kVectors; v++) {
+        // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, with the carrier of the cell's middle folded in.
         Lanes vr = re1[index[v]], vi = im1[index[v]], cosine, sine;
         if constexpr (kDegree == 2) vr += u[v] * re2[index[v]], vi += u[v] * im2[index[v]];
         vr = re0[index[v]] + u[v] * vr, vi = im0[index[v]] + u[v] * vi;
-        if constexpr (kForm == kWeighted) {
-          const int b = group + v / kParts, part = v % kParts * kLanes;
+        if constexpr (kVariant == kWeighted) {
+          // (7): the gain of both antennas at the pixel.
+          const int64_t b = group + v / kParts, part = v % kParts * kLanes;
           Lanes weight = load(kLaneX + part) * batch.weight_x[q][b] + load(kLaneY + part) * batch.weight_y[q][b] +
                          batch.weight[q][b];
           if constexpr (kTerrain) weight += load(patch.rise + b * 16 + part) * batch.weight_h[q];
           vr *= weight, vi *= weight;
         }
+        // What is left of the carrier inside the cell, exp(j omega u), and the sum over pulses, (1).
         phase(u[v], cosine, sine);
         re[v] += vr * cosine, im[v] += vr * sine;
         re[v] -= vi * sine, im[v] += vi * cosine;
       }
     }
-    for (int v = 0; v < kVectors; v++) store(here + v * kLanes, re[v]), store(here + kPixels + v * kLanes, im[v]);
+    for (int64_t v = 0; v < kVectors; v++) store(here + v * kLanes, re[v]), store(here + kPixels + v * kLanes, im[v]);
   }
 }
 

@@ -1,120 +1,137 @@
 // Weight of antennas whose beams turn with the pulses: at eleven nodes of a patch, then as polynomials of its blocks;
-// pixel by pixel where that would not do. docs/theory/engine.md says how well.
+// pixel by pixel where that would not do. docs/theory/engine.md, "Antennas", says how well; equation numbers are its.
 #pragma once
 #include "batch.hpp"
 #include "exact.hpp"
 
 namespace {
 
-constexpr int kNodes = 11;  // 3 x 3 over the plane of a patch, row by row; with heights, its middle lowered and raised
-enum Sight { kRough, kSmooth, kDark };
+constexpr int64_t kPlaneNodes = 9;  // 3 x 3 over the plane of a patch, row by row
+constexpr int64_t kNodes = 11;      // with heights, its middle lowered and raised as well
 
-// Antenna's axes and what it sees of a patch, eight pulses at once.
-struct View {
-  alignas(64) float gain[kNodes][kBatch];                               // of all antennas so far
-  alignas(64) float low[2][kBatch], high[2][kBatch];                    // angles of this one: azimuth, elevation
-  alignas(64) float ahead[kBatch];                                      // how far at most it lies before the antenna
-  alignas(64) int32_t dark[kBatch], smooth[kBatch];
+// How a pulse's weight over a patch is taken: pixel by pixel, as polynomials of its blocks, or not at all.
+enum Weighing { kPixelwise, kSmooth, kDark };
+
+// Gains at the nodes of a patch and what they tell of it, eight pulses at once.
+struct NodeGains {
+  alignas(64) float gain[kNodes][kBatch];             // of all antennas so far
+  alignas(64) float low[2][kBatch], high[2][kBatch];  // smallest and largest place in this one's azimuth, elevation cut
+  alignas(64) float ahead[kBatch];                    // how far at most the patch lies before this antenna
+  alignas(64) int32_t dark[kBatch], smooth[kBatch];   // no gain anywhere in the patch; inside both cuts everywhere
 };
 
-// atan2 to 1e-7 rad, without a branch.
+// From antennas to a patch along their axes, in cells: its origin, and the steps from node to node.
+struct BeamFrame {
+  alignas(64) float origin[3][kBatch], step_x[3][kBatch], step_y[3][kBatch], up[3][kBatch];
+};
+
+// atan2 to 1e-7 rad, without a branch: an odd polynomial of the smaller ratio, then the octants.
 inline float angle(float y, float x) {
   const float a = magnitude(x), b = magnitude(y);
   const float z = (a < b ? a : b) / ((a < b ? b : a) + 1e-30f), s = z * z;
-  float turn = z * (0.99999934f + s * (-0.33329861f + s * (0.19946566f + s * (-0.13908629f +
-               s * (0.09642196f + s * (-0.05591232f + s * (0.02186295f + s * -0.00405457f)))))));
+  const float high = -0.13908629f + s * (0.09642196f + s * (-0.05591232f + s * (0.02186295f + s * -0.00405457f)));
+  float turn = z * (0.99999934f + s * (-0.33329861f + s * (0.19946566f + s * high)));
   turn = b > a ? 1.57079633f - turn : turn;
   turn = x < 0 ? 3.14159265f - turn : turn;
   return y < 0 ? -turn : turn;
 }
 
-// Gain at `place` samples from the first of a pattern, linear between samples and zero beyond.
-inline float look_up(const BeamJob& beam, int which, float place) {
-  const int64_t last = beam.count[which] - 1;
+// Place in the azimuth (0) or elevation (1) cut of a pattern, in samples from its first.
+inline float place_of(const BeamJob& beam, int64_t cut, float radians) {
+  return (radians - float(beam.first_rad[cut])) * float(beam.samples_per_rad[cut]);
+}
+
+// The same for the direction (v0, v1, v2) along the antenna's axes: azimuth = atan2(v1, v0), elevation above it.
+inline float azimuth_place(const BeamJob& beam, float v0, float v1) { return place_of(beam, 0, angle(v1, v0)); }
+inline float elevation_place(const BeamJob& beam, float v0, float v1, float v2) {
+  return place_of(beam, 1, angle(v2, __builtin_sqrtf(v0 * v0 + v1 * v1)));
+}
+
+inline double last_rad(const BeamJob& beam, int64_t cut) {
+  return beam.first_rad[cut] + double(beam.count[cut] - 1) / beam.samples_per_rad[cut];
+}
+
+// Gain at a place of a cut, linear between samples and zero beyond.
+inline float look_up(const BeamJob& beam, int64_t cut, float place) {
+  const int64_t last = beam.count[cut] - 1;
   const bool inside = place >= 0 && place <= float(last);
   const float held = inside ? place : 0;
-  const int32_t at = int32_t(held) < int32_t(last) ? int32_t(held) : int32_t(last) - 1;
-  const float *gain = beam.gain[which] + at, part = held - float(at);
+  const int32_t at = int32_t(held) < int32_t(last) ? int32_t(held) : int32_t(last) - 1;  // AVX2 converts no 64 bits
+  const float *gain = beam.gain[cut] + at, part = held - float(at);
   return inside ? gain[0] + part * (gain[1] - gain[0]) : 0;
 }
 
-inline float sample(const BeamJob& beam, int which, float radians) {
-  return (radians - float(beam.first_rad[which])) * float(beam.samples_per_rad[which]);
-}
-
-// From antennas to a patch along their axes, in cells: its origin, and the steps from node to node.
-struct Facing {
-  alignas(64) float along[3][kBatch], step_x[3][kBatch], step_y[3][kBatch], up[3][kBatch];
-};
-
-inline void face(const BeamJob& beam, const double* antenna, const ApertureJob& job, const Patch& patch, int64_t pulse,
-                 Facing& to) {
+inline void turn_to_axes(const BeamJob& beam, const double* antenna, const ApertureJob& job, const Patch& patch,
+                         int64_t pulse, BeamFrame& to) {
   const int64_t n = job.padded;
-  const float half_x = apertura::half(patch.columns), half_y = apertura::half(patch.rows);
-  for (int axis = 0; axis < 3; axis++) {
+  const float half_x = apertura::half_span(patch.columns), half_y = apertura::half_span(patch.rows);
+  for (int64_t axis = 0; axis < 3; axis++) {
     const double *x = beam.axes + 3 * axis * n + pulse, *y = x + n, *z = y + n;
-    for (int q = 0; q < kBatch; q++) {
+    for (int64_t q = 0; q < kBatch; q++) {
       const double wx = patch.origin[0] - antenna[pulse + q], wy = patch.origin[1] - antenna[n + pulse + q],
                    wz = patch.origin[2] - antenna[2 * n + pulse + q];
-      to.along[axis][q] = float((wx * x[q] + wy * y[q] + wz * z[q]) * job.cells_per_metre);
+      to.origin[axis][q] = float((wx * x[q] + wy * y[q] + wz * z[q]) * job.cells_per_metre);
       to.step_x[axis][q] = half_x * float(patch.step_x[0] * x[q] + patch.step_x[1] * y[q] + patch.step_x[2] * z[q]);
       to.step_y[axis][q] = half_y * float(patch.step_y[0] * x[q] + patch.step_y[1] * y[q] + patch.step_y[2] * z[q]);
-      to.up[axis][q] = patch.tallest * float(patch.up[0] * x[q] + patch.up[1] * y[q] + patch.up[2] * z[q]);
+      to.up[axis][q] = patch.height_max * float(patch.up[0] * x[q] + patch.up[1] * y[q] + patch.up[2] * z[q]);
     }
   }
 }
 
-// Marks pulses whose patch lies outside the narrowest cone about the boresight that holds the pattern: no angle is taken.
-inline void pass_over(const BeamJob& beam, const Facing& to, int32_t* dark) {
+// Marks pulses whose patch lies outside the narrowest cone about the boresight that holds the pattern, before any angle
+// is taken.
+inline void mark_outside_cone(const BeamJob& beam, const BeamFrame& to, int32_t* dark) {
   float edge[2];
-  for (int which = 0; which < 2; which++) {
-    const double first = beam.first_rad[which], last = first + double(beam.count[which] - 1) / beam.samples_per_rad[which];
-    edge[which] = __builtin_cosf(float(last < -first ? -first : last));
+  for (int64_t cut = 0; cut < 2; cut++) {
+    const double first = beam.first_rad[cut], last = last_rad(beam, cut);
+    edge[cut] = __builtin_cosf(float(last < -first ? -first : last));
   }
   const float widest = edge[0] < 0 ? edge[0] : edge[0] * (edge[1] < 0 ? 0 : edge[1]);
-  const auto length = [](const float (*v)[kBatch], int q) {
+  const auto length = [](const float (*v)[kBatch], int64_t q) {
     return __builtin_sqrtf(v[0][q] * v[0][q] + v[1][q] * v[1][q] + v[2][q] * v[2][q]);
   };
-  for (int q = 0; q < kBatch; q++) {
-    const float far = length(to.along, q), reach = length(to.step_x, q) + length(to.step_y, q) + length(to.up, q);
-    dark[q] |= to.along[0][q] + reach < widest * (widest < 0 ? far + reach : far - reach) - 1e-3f * far;
+  for (int64_t q = 0; q < kBatch; q++) {
+    // The patch lies in a ball of radius `reach`; its most favourable point has boresight + reach along the boresight.
+    const float far = length(to.origin, q), reach = length(to.step_x, q) + length(to.step_y, q) + length(to.up, q);
+    dark[q] |= to.origin[0][q] + reach < widest * (widest < 0 ? far + reach : far - reach) - 1e-3f * far;
   }
 }
 
-// Gains at the nodes of a patch, and the angles they span.
-inline void view(const BeamJob& beam, const Patch& patch, const Facing& to, View& out) {
-  for (int node = 0; node < (patch.terrain ? kNodes : 9); node++) {
-    const float x = node < 9 ? float(node % 3 - 1) : 0, y = node < 9 ? float(node / 3 - 1) : 0;
-    const float h = node < 9 ? 0 : float(2 * node - 19);
+// Multiplies (6) of one antenna into the gains at the nodes, and notes which part of its cuts they span.
+inline void sample_nodes(const BeamJob& beam, const Patch& patch, const BeamFrame& to, NodeGains& out) {
+  for (int64_t node = 0; node < (patch.terrain ? kNodes : kPlaneNodes); node++) {
+    // Node (x, y) of the plane in half widths of the patch, or the middle lowered (h = -1) and raised (1).
+    const bool plane = node < kPlaneNodes;
+    const float x = plane ? float(node % 3 - 1) : 0, y = plane ? float(node / 3 - 1) : 0;
+    const float h = plane ? 0 : float(2 * (node - kPlaneNodes) - 1);
     alignas(64) float place[2][kBatch];
-    for (int q = 0; q < kBatch; q++) {
+    for (int64_t q = 0; q < kBatch; q++) {
       float v[3];
-      for (int axis = 0; axis < 3; axis++)
-        v[axis] = to.along[axis][q] + x * to.step_x[axis][q] + y * to.step_y[axis][q] + h * to.up[axis][q];
+      for (int64_t axis = 0; axis < 3; axis++)
+        v[axis] = to.origin[axis][q] + x * to.step_x[axis][q] + y * to.step_y[axis][q] + h * to.up[axis][q];
       out.ahead[q] = node && !(v[0] > out.ahead[q]) ? out.ahead[q] : v[0];
-      place[0][q] = sample(beam, 0, angle(v[1], v[0]));
-      place[1][q] = sample(beam, 1, angle(v[2], __builtin_sqrtf(v[0] * v[0] + v[1] * v[1])));
+      place[0][q] = azimuth_place(beam, v[0], v[1]);
+      place[1][q] = elevation_place(beam, v[0], v[1], v[2]);
     }
-    for (int which = 0; which < 2; which++)
-      for (int q = 0; q < kBatch; q++) {
-        const float at = place[which][q];
-        out.gain[node][q] *= look_up(beam, which, at);
-        out.low[which][q] = node && !(at < out.low[which][q]) ? out.low[which][q] : at;  // a NaN at the origin stays
-        out.high[which][q] = node && !(at > out.high[which][q]) ? out.high[which][q] : at;
+    for (int64_t cut = 0; cut < 2; cut++)
+      for (int64_t q = 0; q < kBatch; q++) {
+        const float at = place[cut][q];
+        out.gain[node][q] *= look_up(beam, cut, at);
+        out.low[cut][q] = node && !(at < out.low[cut][q]) ? out.low[cut][q] : at;  // a NaN at the origin stays
+        out.high[cut][q] = node && !(at > out.high[cut][q]) ? out.high[cut][q] : at;
       }
   }
 }
 
 // Whether all of a patch lies inside or outside the pattern.
-inline void judge(const BeamJob& beam, const Facing& to, View& out) {
-  const bool forward = beam.first_rad[0] >= -1.5708 &&
-                       beam.first_rad[0] + double(beam.count[0] - 1) / beam.samples_per_rad[0] <= 1.5708;
-  for (int q = 0; q < kBatch; q++) out.dark[q] |= forward && out.ahead[q] + magnitude(to.up[0][q]) < -1e-3f;
-  for (int which = 0; which < 2; which++) {
-    const float last = float(beam.count[which] - 1), radian = float(beam.samples_per_rad[which]);
-    for (int q = 0; q < kBatch; q++) {
+inline void compare_with_cuts(const BeamJob& beam, const BeamFrame& to, NodeGains& out) {
+  const bool forward = beam.first_rad[0] >= -1.5708 && last_rad(beam, 0) <= 1.5708;
+  for (int64_t q = 0; q < kBatch; q++) out.dark[q] |= forward && out.ahead[q] + magnitude(to.up[0][q]) < -1e-3f;
+  for (int64_t cut = 0; cut < 2; cut++) {
+    const float last = float(beam.count[cut] - 1), radian = float(beam.samples_per_rad[cut]);
+    for (int64_t q = 0; q < kBatch; q++) {
       // Between nodes an angle exceeds theirs by less than half of what they span.
-      const float low = out.low[which][q], high = out.high[which][q], beyond = 1e-3f + 0.5f * (high - low);
+      const float low = out.low[cut][q], high = out.high[cut][q], beyond = 1e-3f + 0.5f * (high - low);
       const bool near = high - low <= radian;  // not around the pole or the cut at half a turn
       out.dark[q] |= near && (high + beyond < 0 || low - beyond > last);
       out.smooth[q] &= near && low - beyond >= 0 && high + beyond <= last;
@@ -122,103 +139,109 @@ inline void judge(const BeamJob& beam, const Facing& to, View& out) {
   }
 }
 
-// The biquadratic through the gains of one pulse at the nodes: value and slope in each block. Returns whether it holds.
-inline bool spread(const Patch& patch, const float* g, float peak, int q, Batch& batch) {
-  float level[3], slope[3], bow[3], change = 0, bend = 0;
-  const auto span = [&](float a, float b, float c) {
+// The biquadratic through the gains `g` of one pulse at the nodes: (7), value and slope in each block. Returns whether
+// it holds. d_x, d_y are first differences per half width of the patch, d_xx, d_yy halves of second differences, d_xy
+// and d_xyy those along columns of d_x.
+inline bool fit_weights(const Patch& patch, const float* g, float peak, int64_t q, Batch& batch) {
+  float middle[3], d_x[3], d_xx[3], change = 0, curvature = 0;
+  const auto compare = [&](float a, float b, float c) {
     const float first = magnitude(c - a), second = magnitude(a - 2 * b + c);
-    change = first <= change ? change : first, bend = second <= bend ? bend : second;
+    change = first <= change ? change : first, curvature = second <= curvature ? curvature : second;
   };
-  for (int i = 0; i < 3; i++) {
-    span(g[3 * i], g[3 * i + 1], g[3 * i + 2]), span(g[i], g[3 + i], g[6 + i]);
-    level[i] = g[3 * i + 1], slope[i] = 0.5f * (g[3 * i + 2] - g[3 * i]);
-    bow[i] = 0.5f * (g[3 * i] + g[3 * i + 2]) - g[3 * i + 1];
+  // Along each row of nodes: value in its middle, slope and curvature.
+  for (int64_t i = 0; i < 3; i++) {
+    compare(g[3 * i], g[3 * i + 1], g[3 * i + 2]), compare(g[i], g[3 + i], g[6 + i]);
+    middle[i] = g[3 * i + 1], d_x[i] = 0.5f * (g[3 * i + 2] - g[3 * i]);
+    d_xx[i] = 0.5f * (g[3 * i] + g[3 * i + 2]) - g[3 * i + 1];
   }
-  if (patch.terrain) span(g[9], g[4], g[10]);
-  if (!(change <= 0.12f * peak && bend <= 0.025f * peak)) return false;
-  const float per_x = 1 / apertura::half(patch.columns), per_y = 1 / apertura::half(patch.rows);
-  const float rise = patch.terrain ? 0.5f * (g[10] - g[9]) / patch.tallest : 0;
-  batch.weight_h[q] = rise;
-  for (int b = 0; b < kBlocks; b += kLanes) {
+  if (patch.terrain) compare(g[9], g[4], g[10]);
+  if (!(change <= apertura::kWeightChange * peak && curvature <= apertura::kWeightCurvature * peak)) return false;
+  const float per_x = 1 / apertura::half_span(patch.columns), per_y = 1 / apertura::half_span(patch.rows);
+  const float slope_h = patch.terrain ? 0.5f * (g[10] - g[9]) / patch.height_max : 0;
+  batch.weight_h[q] = slope_h;
+  for (int64_t b = 0; b < kBlocks; b += kLanes) {
+    // The rows' parabolas at the column of each block: three values, three slopes along x.
     const Lanes x = load(patch.along_x + b) * per_x, y = load(patch.along_y + b) * per_y;
-    Lanes value[3], turn[3];
-    for (int i = 0; i < 3; i++) value[i] = level[i] + x * (slope[i] + x * bow[i]), turn[i] = slope[i] + 2 * x * bow[i];
-    const Lanes fall = 0.5f * (value[2] - value[0]), sag = 0.5f * (value[0] + value[2]) - value[1];
-    const Lanes swing = 0.5f * (turn[2] - turn[0]), dip = 0.5f * (turn[0] + turn[2]) - turn[1];
-    store(batch.weight[q] + b, value[1] + y * (fall + y * sag) + rise * load(patch.height + b));
-    store(batch.weight_x[q] + b, per_x * (turn[1] + y * (swing + y * dip)));
-    store(batch.weight_y[q] + b, per_y * (fall + 2 * y * sag));
+    Lanes value[3], slope[3];
+    for (int64_t i = 0; i < 3; i++)
+      value[i] = middle[i] + x * (d_x[i] + x * d_xx[i]), slope[i] = d_x[i] + 2 * x * d_xx[i];
+    // Then the parabola through the three along y.
+    const Lanes d_y = 0.5f * (value[2] - value[0]), d_yy = 0.5f * (value[0] + value[2]) - value[1];
+    const Lanes d_xy = 0.5f * (slope[2] - slope[0]), d_xyy = 0.5f * (slope[0] + slope[2]) - slope[1];
+    store(batch.weight[q] + b, value[1] + y * (d_y + y * d_yy) + slope_h * load(patch.height + b));
+    store(batch.weight_x[q] + b, per_x * (slope[1] + y * (d_xy + y * d_xyy)));
+    store(batch.weight_y[q] + b, per_y * (d_y + 2 * y * d_yy));
   }
   return true;
 }
 
-// Weights of eight pulses over the blocks of a patch, and how each may be taken.
-inline void weigh(const ApertureJob& job, const Patch& patch, int64_t pulse, Batch& batch, Sight* sight) {
-  View seen;
-  Facing to[2];
+// Weights of eight pulses over the blocks of a patch, and how each is taken.
+inline void weigh_patch(const ApertureJob& job, const Patch& patch, int64_t pulse, Batch& batch, Weighing* weighing) {
+  NodeGains nodes;
+  BeamFrame to[2];
   float peak = 1;
-  int lit = 0;
-  for (int q = 0; q < kBatch; q++) seen.dark[q] = 0, seen.smooth[q] = 1;
-  for (int leg = 0; leg < 2; leg++)
+  bool lit = false;
+  for (int64_t q = 0; q < kBatch; q++) nodes.dark[q] = 0, nodes.smooth[q] = 1;
+  for (int64_t leg = 0; leg < 2; leg++)
     if (const BeamJob* beam = job.beam[leg]) {
-      face(*beam, leg ? job.receiver : job.transmitter, job, patch, pulse, to[leg]);
-      pass_over(*beam, to[leg], seen.dark);
+      turn_to_axes(*beam, leg ? job.receiver : job.transmitter, job, patch, pulse, to[leg]);
+      mark_outside_cone(*beam, to[leg], nodes.dark);
     }
-  for (int q = 0; q < kBatch; q++) sight[q] = kDark, lit |= patch.crooked || !seen.dark[q];
+  for (int64_t q = 0; q < kBatch; q++) weighing[q] = kDark, lit |= patch.irregular || !nodes.dark[q];
   if (!lit) return;
-  for (int node = 0; node < kNodes; node++)
-    for (int q = 0; q < kBatch; q++) seen.gain[node][q] = 1;
-  for (int leg = 0; leg < 2; leg++)
+  for (int64_t node = 0; node < kNodes; node++)
+    for (int64_t q = 0; q < kBatch; q++) nodes.gain[node][q] = 1;
+  for (int64_t leg = 0; leg < 2; leg++)
     if (const BeamJob* beam = job.beam[leg]) {
-      view(*beam, patch, to[leg], seen);
-      judge(*beam, to[leg], seen);
+      sample_nodes(*beam, patch, to[leg], nodes);
+      compare_with_cuts(*beam, to[leg], nodes);
       peak *= float(beam->peak);
     }
-  for (int q = 0; q < kBatch; q++) {
+  for (int64_t q = 0; q < kBatch; q++) {
     float g[kNodes];
-    for (int node = 0; node < kNodes; node++) g[node] = seen.gain[node][q];
-    if (patch.crooked || !seen.dark[q])
-      sight[q] = seen.smooth[q] && spread(patch, g, peak, q, batch) ? kSmooth : kRough;
+    for (int64_t node = 0; node < kNodes; node++) g[node] = nodes.gain[node][q];
+    if (patch.irregular || !nodes.dark[q])
+      weighing[q] = nodes.smooth[q] && fit_weights(patch, g, peak, q, batch) ? kSmooth : kPixelwise;
   }
 }
 
-// Weight of one pulse at each pixel of a patch.
-inline void weigh_exactly(const ApertureJob& job, const Positions& at, int64_t pulse, float* weight) {
+// (6) of one pulse at each pixel of a patch.
+inline void weigh_pixels(const ApertureJob& job, const Positions& at, int64_t pulse, float* weight) {
   const int64_t n = job.padded;
-  for (int slot = 0; slot < kPixels; slot++) weight[slot] = 1;
-  for (int leg = 0; leg < 2; leg++) {
+  for (int64_t slot = 0; slot < kPixels; slot++) weight[slot] = 1;
+  for (int64_t leg = 0; leg < 2; leg++) {
     const BeamJob* beam = job.beam[leg];
     if (!beam) continue;
     const double *antenna = (leg ? job.receiver : job.transmitter) + pulse, *axes = beam->axes + pulse;
-    for (int slot = 0; slot < kPixels; slot++) {
+    for (int64_t slot = 0; slot < kPixels; slot++) {
       const double wx = at.x[slot] - antenna[0], wy = at.y[slot] - antenna[n], wz = at.z[slot] - antenna[2 * n];
       float v[3];
-      for (int axis = 0; axis < 3; axis++)
+      for (int64_t axis = 0; axis < 3; axis++)
         v[axis] = float(wx * axes[3 * axis * n] + wy * axes[(3 * axis + 1) * n] + wz * axes[(3 * axis + 2) * n]);
-      weight[slot] *= look_up(*beam, 0, sample(*beam, 0, angle(v[1], v[0])));
-      weight[slot] *= look_up(*beam, 1, sample(*beam, 1, angle(v[2], __builtin_sqrtf(v[0] * v[0] + v[1] * v[1]))));
+      weight[slot] *= look_up(*beam, 0, azimuth_place(*beam, v[0], v[1]));
+      weight[slot] *= look_up(*beam, 1, elevation_place(*beam, v[0], v[1], v[2]));
     }
   }
 }
 
-// Sorts eight pulses into forms.
+// Sorts eight pulses by the variant they take.
 template <bool kTerrain>
-inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int pulses, Batch& batch) {
-  Aim aim;
-  Sight sight[kBatch];
-  weigh(job, patch, pulse, batch, sight);
+inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, Batch& batch) {
+  OriginPaths origin;
+  Weighing weighing[kBatch];
+  weigh_patch(job, patch, pulse, batch, weighing);
   bool lit = false;
-  for (int q = 0; q < pulses; q++) lit |= sight[q] != kDark;
-  if (lit) aim_at<kTerrain>(job, patch, pulse, aim);
-  for (int form = 0; form < kForms; form++) batch.count[form] = 0;
-  for (int q = 0; q < pulses; q++) {
-    Form form = kExact;
-    if (sight[q] == kDark)
-      form = kSkip;
-    else if (sight[q] == kSmooth && aim.holds[q])
-      form = place<kTerrain, true>(job, patch, aim, pulse, q, batch);
-    if (form == kOwn) form = kWeighted;
-    batch.order[form][batch.count[form]++] = q;
+  for (int64_t q = 0; q < pulses; q++) lit |= weighing[q] != kDark;
+  if (lit) find_origin_paths<kTerrain>(job, patch, pulse, origin);
+  for (int64_t variant = 0; variant < kVariants; variant++) batch.count[variant] = 0;
+  for (int64_t q = 0; q < pulses; q++) {
+    Variant variant = kExactPath;
+    if (weighing[q] == kDark)
+      variant = kSkipped;
+    else if (weighing[q] == kSmooth && origin.holds[q])
+      variant = expand_paths<kTerrain, true>(job, patch, origin, pulse, q, batch);
+    if (variant == kOwnCurvature) variant = kWeighted;
+    batch.order[variant][batch.count[variant]++] = q;
   }
 }
 

@@ -1,44 +1,60 @@
-// What Python hands over, mirrored field by field in src/apertura/focus/engines/binding.py.
+// What Python hands over. `focus/engines/native_binding.py` mirrors these structs field by field and compares the two
+// layouts when it loads the library (contract.cpp lists them).
 #pragma once
 #include <cstdint>
 
+#include "bounds.hpp"
+
 // The beam of one antenna: gain over azimuth times gain over elevation, about axes that may turn with each pulse.
 struct BeamJob {
-  const double* axes;         // (3 axes, 3, padded): unit vectors of boresight, growing azimuth, growing elevation
-  const float* gain[2];       // over azimuth and over elevation
-  int64_t count[2];           // samples of each, at least 2
+  const double* axes;    // (3 axes, 3, padded): unit vectors of boresight, growing azimuth, growing elevation
+  const float* gain[2];  // over azimuth and over elevation
+  int64_t count[2];      // samples of each, at least 2
   double first_rad[2], samples_per_rad[2];
-  double peak;                // largest |gain| of the product
+  double peak;  // largest |gain| of the product
 };
 
 // A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".
 struct ApertureJob {
   const float* cells;         // (pulse, 2 (degree + 1), width): re, im of each polynomial coefficient
-  const double* transmitter;  // (3, padded): pulses padded to a multiple of 8 by repeating the last
+  const double* transmitter;  // (3, padded): pulses padded to a multiple of kBatch by repeating the last
   const double* receiver;     // (3, padded)
   const double* first_path;   // (padded): total path of the middle of cell 0
   const double* pixels;       // (rows, columns, 3)
   float* image;               // (rows, columns, 2): re, im
-  int64_t* counts;            // pulses x patches handled by: shared curvature, own curvature, exact, skipped
+  int64_t* counts;            // pulses x patches that took: shared curvature, own curvature, exact path, none
   int64_t pulses, padded, width, rows, columns;
   double cells_per_metre;
-  double radians_per_cell;    // carrier phase over one cell
-  double tolerance_rad;       // largest phase error of the geometry that the fast forms may make
-  int32_t degree;             // of the polynomials: 1 or 2
-  int32_t phase_form;         // index into phase.hpp
-  int32_t wide_sum;           // 1: sums over pulses in float64
-  float phase[9];             // cosine (4), sine (4), half turns per cell
-  const BeamJob* beam[2];     // of transmitter and receiver; null: the same in all directions
+  double radians_per_cell;      // carrier phase over one cell
+  double tolerance_rad;         // largest phase error of the geometry that the series may make
+  int32_t degree;               // of the polynomials: 1 or 2
+  int32_t phase_polynomial;     // index into phase.hpp
+  int32_t wide_sum;             // 1: sums over pulses in float64
+  float phase_coefficients[9];  // cosine (4), sine (4), half turns per cell
+  const BeamJob* beam[2];       // of transmitter and receiver; null: the same in all directions
 };
 
 // Range profiles to be turned into tables.
 struct TableJob {
-  const float* samples;    // (pulse, length, 2)
-  const float* taps;       // (up, degree + 1, 16): real filters, see tables.py
-  const int32_t* lead;     // (up): sample at which the first tap of phase 0 lies
-  const float* carrier;    // (up, 2, steps): re, im of exp(j carrier) at each cell relative to cell `margin`
-  const float* turn;       // (pulse, 2): exp(j carrier) of cell `margin`
-  float* cells;            // (pulse, 2 (degree + 1), width), zero on entry
+  const float* samples;  // (pulse, length, 2)
+  const float* taps;     // (up, degree + 1, kTaps): real filters, see native_tables.py
+  const int32_t* lead;   // (up): sample at which the first tap of position 0 lies
+  const float* carrier;  // (up, 2, steps): re, im of exp(j carrier) at each cell relative to cell `margin`
+  const float* turn;     // (pulse, 2): exp(j carrier) of cell `margin`
+  float* cells;          // (pulse, 2 (degree + 1), width), zero on entry
   int64_t pulses, length, width, up, down, steps, margin, used;
   int32_t degree;
 };
+
+// Static: compiled for several instruction sets, whose copies the linker must never merge.
+namespace apertura {
+
+// Samples of one of the `down` streams into which a pulse is split, with the zeros around them.
+static inline int64_t stream_length(const TableJob& job) { return job.steps + 3 * kTaps; }
+
+// Floats of scratch that a TableJob needs: the streams, and the cells of one pulse before they are interleaved.
+static inline int64_t scratch_length(const TableJob& job) {
+  return 2 * job.down * stream_length(job) + job.up * 2 * (job.degree + 1) * job.steps;
+}
+
+}  // namespace apertura

@@ -1,4 +1,4 @@
-// Compiled once per instruction set; APERTURA_FORM names the copy.
+// Compiled once per instruction set; APERTURA_ISA names the copy.
 #include "beam.hpp"
 #include "expand.hpp"
 
@@ -7,7 +7,7 @@
 
 namespace {
 
-template <class Phase, int kDegree, bool kTerrain>
+template <class Phase, int64_t kDegree, bool kTerrain>
 void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
   Batch batch;
   Positions at;
@@ -15,31 +15,31 @@ void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_
   const bool weighted = job.beam[0] || job.beam[1];
   bool gathered = false;
   for (int64_t pulse = begin; pulse < end; pulse += kBatch) {
-    const int pulses = int(end - pulse < kBatch ? end - pulse : kBatch);
+    const int64_t pulses = end - pulse < kBatch ? end - pulse : kBatch;
     if (weighted) {
       sort_weighted<kTerrain>(job, patch, pulse, pulses, batch);
-      add_form<Phase, kDegree, kTerrain, kWeighted>(job, patch, batch, sum);
+      add_pulses<Phase, kDegree, kTerrain, kWeighted>(job, patch, batch, sum);
     } else {
       sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
-      if constexpr (kLanes != 4) add_form<Phase, kDegree, kTerrain, kShared>(job, patch, batch, sum);
-      if constexpr (kLanes != 4 && kTerrain) add_form<Phase, kDegree, true, kShallow>(job, patch, batch, sum);
-      add_form<Phase, kDegree, kTerrain, kSharedWide>(job, patch, batch, sum);
-      add_form<Phase, kDegree, kTerrain, kOwn>(job, patch, batch, sum);
+      if constexpr (kLanes != 4) add_pulses<Phase, kDegree, kTerrain, kSharedCurvature>(job, patch, batch, sum);
+      if constexpr (kLanes != 4 && kTerrain) add_pulses<Phase, kDegree, true, kLinearHeights>(job, patch, batch, sum);
+      add_pulses<Phase, kDegree, kTerrain, kWideWindow>(job, patch, batch, sum);
+      add_pulses<Phase, kDegree, kTerrain, kOwnCurvature>(job, patch, batch, sum);
     }
-    if (batch.count[kExact] && !gathered) gather(job, patch, at), gathered = true;
-    for (int n = 0; n < batch.count[kExact]; n++) {
-      const int64_t one = pulse + batch.order[kExact][n];
-      if (weighted) weigh_exactly(job, at, one, weight);
+    if (batch.count[kExactPath] && !gathered) gather(job, patch, at), gathered = true;
+    for (int64_t n = 0; n < batch.count[kExactPath]; n++) {
+      const int64_t one = pulse + batch.order[kExactPath][n];
+      if (weighted) weigh_pixels(job, at, one, weight);
       add_exact<Phase, kDegree>(job, patch, at, one, weighted ? weight : nullptr, sum);
     }
-    job.counts[0] += batch.count[kShared] + batch.count[kShallow] + batch.count[kSharedWide];
-    job.counts[1] += batch.count[kOwn] + batch.count[kWeighted];
-    job.counts[2] += batch.count[kExact];
-    job.counts[3] += batch.count[kSkip];
+    job.counts[0] += batch.count[kSharedCurvature] + batch.count[kLinearHeights] + batch.count[kWideWindow];
+    job.counts[1] += batch.count[kOwnCurvature] + batch.count[kWeighted];
+    job.counts[2] += batch.count[kExactPath];
+    job.counts[3] += batch.count[kSkipped];
   }
 }
 
-template <class Phase, int kDegree>
+template <class Phase, int64_t kDegree>
 void add(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
   if (patch.terrain)
     add_patch<Phase, kDegree, true>(job, patch, begin, end, sum);
@@ -55,9 +55,9 @@ void add(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end,
 }  // namespace
 
 // Adds pulses begin..end of the job to `sum`: (2, 256) float, re then im, block by block.
-extern "C" void APERTURA_JOIN(apertura_add_, APERTURA_FORM)(const ApertureJob* job, const apertura::Patch* patch,
-                                                            int64_t begin, int64_t end, float* sum) {
-  switch (job->phase_form) {
+extern "C" void APERTURA_JOIN(apertura_add_, APERTURA_ISA)(const ApertureJob* job, const apertura::Patch* patch,
+                                                           int64_t begin, int64_t end, float* sum) {
+  switch (job->phase_polynomial) {
     case 0: return add<Phase0>(*job, *patch, begin, end, sum);
     case 1: return add<Phase1>(*job, *patch, begin, end, sum);
     case 2: return add<Phase2>(*job, *patch, begin, end, sum);
@@ -65,6 +65,6 @@ extern "C" void APERTURA_JOIN(apertura_add_, APERTURA_FORM)(const ApertureJob* j
   }
 }
 
-extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_FORM)(const TableJob* job, float* scratch) {
+extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_ISA)(const TableJob* job, float* scratch) {
   expand(*job, scratch);
 }

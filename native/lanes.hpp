@@ -7,26 +7,29 @@
 #include <immintrin.h>
 #endif
 
+#include "bounds.hpp"
+
 namespace {
 
+using apertura::kWindow;
+
 #if defined(__AVX512F__)
-constexpr int kLanes = 16;
+constexpr int64_t kLanes = 16;
 #elif defined(__AVX2__)
-constexpr int kLanes = 8;
+constexpr int64_t kLanes = 8;
 #else
-constexpr int kLanes = 4;
+constexpr int64_t kLanes = 4;
 #endif
 
 typedef float Lanes __attribute__((vector_size(4 * kLanes), may_alias));
-typedef int32_t Whole __attribute__((vector_size(4 * kLanes), may_alias));
-typedef float LanesAnywhere __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
+typedef int32_t IntLanes __attribute__((vector_size(4 * kLanes), may_alias));
+typedef float UnalignedLanes __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
 
-constexpr int kWindow = 16;                     // cells one look-up can reach
-constexpr float kNarrow = kLanes == 8 ? 8 : 16;  // cells a single register permute can reach
-constexpr float kMagic = 12582912.0f;           // 1.5 * 2^23: adding it rounds to the nearest integer
+constexpr float kNarrow = kLanes == 8 ? kWindow / 2 : kWindow;  // cells a single register permute can reach
+constexpr float kRounder = 12582912.0f;                         // 1.5 * 2^23: adding it rounds to the nearest integer
 
-inline Lanes load(const float* from) { return *reinterpret_cast<const LanesAnywhere*>(from); }
-inline void store(float* to, Lanes value) { *reinterpret_cast<LanesAnywhere*>(to) = value; }
+inline Lanes load(const float* from) { return *reinterpret_cast<const UnalignedLanes*>(from); }
+inline void store(float* to, Lanes value) { *reinterpret_cast<UnalignedLanes*>(to) = value; }
 inline Lanes splat(float value) {
 #if defined(__AVX512F__)
   return (Lanes)_mm512_set1_ps(value);
@@ -37,31 +40,33 @@ inline Lanes splat(float value) {
 #endif
 }
 
-inline Lanes magnitude(Lanes value) { return (Lanes)((Whole)value & 0x7fffffff); }
+inline float magnitude(float value) { return __builtin_fabsf(value); }
+inline Lanes magnitude(Lanes value) { return (Lanes)((IntLanes)value & 0x7fffffff); }
 inline Lanes floor(Lanes value) {
 #if defined(__AVX512F__)
   return (Lanes)_mm512_roundscale_ps((__m512)value, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
 #elif defined(__AVX2__)
   return (Lanes)_mm256_floor_ps((__m256)value);
 #else
-  for (int lane = 0; lane < kLanes; lane++) value[lane] = __builtin_floorf(value[lane]);
+  for (int64_t lane = 0; lane < kLanes; lane++) value[lane] = __builtin_floorf(value[lane]);
   return value;
 #endif
 }
-// A truth per lane, from comparisons that a NaN never passes.
+
+// One truth per lane, from comparisons that a NaN never passes.
 #if defined(__AVX512F__)
-typedef __mmask16 Truth;
-constexpr Truth kTrue = 0xffff;
-inline Truth at_most(Lanes a, Lanes b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
-inline bool all(Truth truth) { return truth == kTrue; }
+typedef __mmask16 LaneMask;
+constexpr LaneMask kAllLanes = 0xffff;
+inline LaneMask at_most(Lanes a, Lanes b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
+inline bool all(LaneMask mask) { return mask == kAllLanes; }
 #else
-typedef Whole Truth;
-constexpr Truth kTrue = ~Whole{};
-inline Truth at_most(Lanes a, Lanes b) { return a <= b; }
+typedef IntLanes LaneMask;
+constexpr LaneMask kAllLanes = ~IntLanes{};
+inline LaneMask at_most(Lanes a, Lanes b) { return a <= b; }
 #if defined(__AVX2__)
-inline bool all(Truth truth) { return _mm256_movemask_ps((__m256)truth) == 0xff; }
+inline bool all(LaneMask mask) { return _mm256_movemask_ps((__m256)mask) == 0xff; }
 #else
-inline bool all(Truth truth) { return truth[0] & truth[1] & truth[2] & truth[3]; }
+inline bool all(LaneMask mask) { return mask[0] & mask[1] & mask[2] & mask[3]; }
 #endif
 #endif
 
@@ -80,18 +85,18 @@ inline Lanes least_of_four(Lanes value) {
 #endif
 }
 
-// A stretch of table to look up in, held in registers: 16 cells, or only 8 where that is what one register holds and
-// !kWide. Only the low bits of an index count, so no lane can read beside it.
+// One coefficient of the cells of a look-up window, held in registers: 16 cells, or only 8 where that is what one
+// register holds and !kWide. Only the low bits of an index count, so no lane can read beside it.
 template <bool kWide>
-struct Stretch {
+struct WindowCells {
 #if defined(__AVX512F__)
   __m512 cells;
-  explicit Stretch(const float* from) : cells(_mm512_loadu_ps(from)) {}
-  Lanes operator[](Whole index) const { return (Lanes)_mm512_permutexvar_ps((__m512i)index, cells); }
+  explicit WindowCells(const float* from) : cells(_mm512_loadu_ps(from)) {}
+  Lanes operator[](IntLanes index) const { return (Lanes)_mm512_permutexvar_ps((__m512i)index, cells); }
 #elif defined(__AVX2__)
   __m256 low, high;
-  explicit Stretch(const float* from) : low(_mm256_loadu_ps(from)), high(kWide ? _mm256_loadu_ps(from + 8) : low) {}
-  Lanes operator[](Whole index) const {
+  explicit WindowCells(const float* from) : low(_mm256_loadu_ps(from)), high(kWide ? _mm256_loadu_ps(from + 8) : low) {}
+  Lanes operator[](IntLanes index) const {
     const __m256 first = _mm256_permutevar8x32_ps(low, (__m256i)index);
     if constexpr (!kWide) return (Lanes)first;
     const __m256 second = _mm256_permutevar8x32_ps(high, (__m256i)index);
@@ -99,9 +104,9 @@ struct Stretch {
   }
 #else
   const float* cells;
-  explicit Stretch(const float* from) : cells(from) {}
-  Lanes operator[](Whole index) const {
-    const Whole i = index & (kWindow - 1);
+  explicit WindowCells(const float* from) : cells(from) {}
+  Lanes operator[](IntLanes index) const {
+    const IntLanes i = index & int32_t(kWindow - 1);
     return Lanes{cells[i[0]], cells[i[1]], cells[i[2]], cells[i[3]]};
   }
 #endif

@@ -2,37 +2,49 @@
 #pragma once
 #include "job.hpp"
 
+// Functions are static: kernel.cpp is compiled for several instruction sets, and the linker must never merge the
+// copies.
 namespace apertura {
 
-constexpr int kSide = 16;    // pixels along a patch
-constexpr int kBlocks = 16;  // blocks of 4 x 4 pixels in it
-constexpr int kPixels = kSide * kSide;
+constexpr int64_t kBlocks = 16;  // of 4 x 4 pixels in a patch
+constexpr int64_t kPixels = kPatchSide * kPatchSide;
 
 // First row and column of a block in its patch: four blocks are a group of 8 x 8 pixels, four groups a patch.
-constexpr int top(int block) { return block / 8 * 8 + block / 2 % 2 * 4; }
-constexpr int left(int block) { return block / 4 % 2 * 8 + block % 2 * 4; }
+static constexpr int64_t block_row(int64_t block) { return block / 8 * 8 + block / 2 % 2 * kBlockSide; }
+static constexpr int64_t block_column(int64_t block) { return block / 4 % 2 * 8 + block % 2 * kBlockSide; }
+
+// Row and column in its patch of a pixel that is stored block by block.
+static constexpr int64_t pixel_row(int64_t slot) { return block_row(slot / 16) + slot % 16 / kBlockSide; }
+static constexpr int64_t pixel_column(int64_t slot) { return block_column(slot / 16) + slot % kBlockSide; }
 
 // Half of what `count` pixels span, in pixels.
-constexpr float half(int count) { return count > 1 ? 0.5f * float(count - 1) : 0.5f; }
+static constexpr float half_span(int64_t count) { return count > 1 ? 0.5f * float(count - 1) : 0.5f; }
 
-// Lengths in cells but for `origin`. Lanes are counted row by row of a block.
+// Lengths in cells but for `origin`. Pixel (i, j) lies at origin + j step_x + i step_y + height up, i and j counted
+// from the patch's middle; pixels are stored block by block, and row by row in a block.
 struct alignas(64) Patch {
   float along_x[kBlocks], along_y[kBlocks], height[kBlocks];  // centre of each block: pixels, pixels, cells
-  float square[kBlocks];                                      // squared distance of that centre from the origin
-  float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];       // its products with step_x, step_y and up
-  float rise[kPixels];                                        // height of each pixel above its block's, block by block
+  float square[kBlocks];                                      // |d|^2: squared distance of that centre from the origin
+  float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];       // d . step_x, d . step_y and d . up
+  float rise[kPixels];                                        // h': height of each pixel above its block's
   double origin[3], step_x[3], step_y[3], up[3];
-  float xx, xy, yy, xh, yh;                                   // products of step_x, step_y and up
-  float reach, inner, roughest, tallest;                      // largest centre distance, pixel offset in a block, |rise|,
-                                                              // height above the plane
-  int64_t row, column;                                        // of the first pixel
-  int rows, columns;                                          // pixels present
-  bool present[kBlocks];                                      // which blocks hold any
-  bool terrain;                                               // heights matter
-  bool crooked;                                               // no plane with heights describes it: exact only
+  float xx, xy, yy, xh, yh;        // products of step_x, step_y and up
+  float block_reach, pixel_reach;  // D and delta: largest |d|, largest distance of a pixel from its block's centre
+  float rise_max, height_max;      // largest |rise|, and largest height above or below the plane
+  int64_t row, column;             // of the first pixel
+  int64_t rows, columns;           // pixels present
+  bool present[kBlocks];           // which blocks hold any
+  bool terrain;                    // heights matter
+  bool irregular;                  // no plane with heights describes it: exact paths only
 };
 
-// `bend_cells`: largest distance from the description that still counts as described.
-void fit(const ApertureJob& job, int64_t row, int64_t column, double bend_cells, Patch& patch);
+// Whether a pixel that is stored block by block is one of the patch.
+static inline bool holds(const Patch& patch, int64_t slot) {
+  return pixel_row(slot) < patch.rows && pixel_column(slot) < patch.columns;
+}
+
+// Describes the patch whose first pixel is at `row`, `column`; `deviation_cells` is the largest distance of a pixel
+// from that description that still counts as described.
+void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_cells, Patch& patch);
 
 }  // namespace apertura

@@ -1,127 +1,144 @@
 // Total path of a patch for eight pulses at once: float64 at its origin, series in float32 from there.
-// docs/theory/engine.md derives the series. Plain loops: the compiler vectorises them for each instruction set.
+// docs/theory/engine.md, "Paths", derives the series; its equation numbers stand here in brackets. Plain loops: the
+// compiler vectorises them for each instruction set.
 #pragma once
 #include "lanes.hpp"
 #include "patch.hpp"
 
 namespace {
 
+using apertura::kBatch;
 using apertura::kBlocks;
 using apertura::kPixels;
-using apertura::kSide;
 using apertura::Patch;
 
-constexpr int kBatch = 8;  // pulses
-
-inline float magnitude(float value) { return __builtin_fabsf(value); }
-
-// From one antenna to the origin of a patch.
+// From one antenna to the origin of a patch: w = origin - antenna, R = |w|, in cells.
 struct Leg {
-  alignas(64) float x[kBatch], y[kBatch], h[kBatch];  // direction cosines with step_x, step_y, up: cells per pixel
-  alignas(64) float inverse[kBatch];                  // 1 / distance, per cell
+  alignas(64) float x[kBatch], y[kBatch], h[kBatch];  // w . step_x / R, w . step_y / R, w . up / R: derivatives of R
+  alignas(64) float inverse[kBatch];                  // 1 / R
 };
 
-// Both legs to the origin of a patch: total path, and its second derivatives, by which all blocks may bend alike.
-struct Aim {
+// Both legs to the origin of a patch, for eight pulses: total path, its second-order coefficients (of x^2, xy, y^2, xh,
+// yh and h^2, so xx is half of the second derivative and xy all of it), and which series hold in this patch.
+struct OriginPaths {
   Leg leg[2];
-  alignas(64) double path[kBatch];                    // in cells of the table
-  alignas(64) double start[kBatch];                   // its whole part
-  alignas(64) float rest[kBatch];                     // and what is left
+  alignas(64) double path[kBatch];     // in cells of the table
+  alignas(64) double whole[kBatch];    // its whole part
+  alignas(64) float fraction[kBatch];  // and what is left
   alignas(64) float xx[kBatch], xy[kBatch], yy[kBatch], xh[kBatch], yh[kBatch], hh[kBatch];
-  alignas(64) float margin[kBatch];                   // bound of the curvature inside a block
-  alignas(64) float first[kBatch], last[kBatch];      // of the table's windows, from `start`
-  alignas(64) float shared[kBatch];                   // largest error in cells if the patch shares one curvature
-  alignas(64) float own[kBatch];                      // and if each block has its own
-  alignas(64) int32_t shallow[kBatch];                // heights inside a block need no curvature
-  alignas(64) int32_t holds[kBatch];                  // 2: shared curvature will do, 1: own curvature, 0: neither
+  alignas(64) float curvature_bound[kBatch];                    // of the second-order terms inside a block, both sides
+  alignas(64) float first_window[kBatch], last_window[kBatch];  // first cells that a window may have, from `whole`
+  alignas(64) float shared_error[kBatch];                       // largest, in cells, if all blocks share one curvature
+  alignas(64) float own_error[kBatch];                          // and if each block has its own
+  alignas(64) int32_t linear_heights[kBatch];                   // 1: heights inside a block need no second order
+  alignas(64) int32_t holds[kBatch];                            // 2: shared curvature, 1: own curvature, 0: neither
 };
 
+// Adds one leg to the path and second-order coefficients at the origin, and to the errors of the series about it.
 template <bool kTerrain>
-inline void aim_leg(const double* antenna, const ApertureJob& job, const Patch& patch, Leg& leg, Aim& aim) {
+inline void add_origin_leg(const double* antenna, const ApertureJob& job, const Patch& patch, Leg& leg,
+                           OriginPaths& out) {
   const double scale = job.cells_per_metre;
   const double *ax = antenna, *ay = antenna + job.padded, *az = antenna + 2 * job.padded;
   const Patch& p = patch;
-  for (int q = 0; q < kBatch; q++) {
+  for (int64_t q = 0; q < kBatch; q++) {
+    // w in float64: coordinates may be those of the Earth's centre. R adds to the path.
     const double wx = (p.origin[0] - ax[q]) * scale, wy = (p.origin[1] - ay[q]) * scale,
                  wz = (p.origin[2] - az[q]) * scale;
     const double distance = __builtin_sqrt(wx * wx + wy * wy + wz * wz), inverse = 1.0 / distance;
+    // Derivatives of R along rows, columns and height: w . q / R, (5) at d = 0. From here on float32 holds.
     leg.x[q] = float((wx * p.step_x[0] + wy * p.step_x[1] + wz * p.step_x[2]) * inverse);
     leg.y[q] = float((wx * p.step_y[0] + wy * p.step_y[1] + wz * p.step_y[2]) * inverse);
     if constexpr (kTerrain) leg.h[q] = float((wx * p.up[0] + wy * p.up[1] + wz * p.up[2]) * inverse);
     leg.inverse[q] = float(inverse);
-    aim.path[q] += distance;
+    out.path[q] += distance;
   }
-  const float reach = p.reach, inner = p.inner;
-  const float fifth = reach * reach * reach * reach * (0.14f * reach + inner);
-  const float third = 0.19f * inner * inner * inner, mixed = 0.58f * reach * inner * inner;
-  const float fourth = 0.75f * reach * reach * inner * inner;
-  for (int q = 0; q < kBatch; q++) {
-    const float inverse = leg.inverse[q], half = 0.5f * inverse, x = leg.x[q], y = leg.y[q], squared = inverse * inverse;
-    aim.xx[q] += (p.xx - x * x) * half;
-    aim.xy[q] += (p.xy - x * y) * inverse;
-    aim.yy[q] += (p.yy - y * y) * half;
+  // Errors of the series (engine.md, "Neglected per leg"), without their powers of 1/R.
+  const float reach = p.block_reach, inner = p.pixel_reach;
+  const float fifth = reach * reach * reach * reach * (apertura::kFifthOrder * reach + inner);
+  const float third = apertura::kThirdOrder * inner * inner * inner;
+  const float shared = apertura::kSharedCurvatureError * reach * inner * inner;
+  const float own = apertura::kOwnCurvatureError * reach * reach * inner * inner;
+  for (int64_t q = 0; q < kBatch; q++) {
+    const float inverse = leg.inverse[q], half = 0.5f * inverse, x = leg.x[q], y = leg.y[q];
+    const float squared = inverse * inverse;
+    // (5a) at the origin: the curvature that all blocks may share.
+    out.xx[q] += (p.xx - x * x) * half;
+    out.xy[q] += (p.xy - x * y) * inverse;
+    out.yy[q] += (p.yy - y * y) * half;
     if constexpr (kTerrain) {
       const float h = leg.h[q];
-      aim.xh[q] += (p.xh - x * h) * inverse;
-      aim.yh[q] += (p.yh - y * h) * inverse;
-      aim.hh[q] += (1 - h * h) * half;
+      out.xh[q] += (p.xh - x * h) * inverse;
+      out.yh[q] += (p.yh - y * h) * inverse;
+      out.hh[q] += (1 - h * h) * half;
     }
     const float base = squared * (third + squared * fifth);
-    aim.shared[q] += base + squared * mixed;
-    aim.own[q] += base + squared * inverse * fourth * 0.1f;
+    out.shared_error[q] += base + squared * shared;
+    out.own_error[q] += base + squared * inverse * own;
   }
 }
 
+// Paths of eight pulses to the origin of a patch, from the first cell of their tables.
 template <bool kTerrain>
-inline void aim_at(const ApertureJob& job, const Patch& patch, int64_t pulse, Aim& aim) {
-  for (int q = 0; q < kBatch; q++) {
-    aim.path[q] = -job.first_path[pulse + q] * job.cells_per_metre;
-    aim.xx[q] = aim.xy[q] = aim.yy[q] = aim.xh[q] = aim.yh[q] = aim.hh[q] = aim.shared[q] = aim.own[q] = 0;
+inline void find_origin_paths(const ApertureJob& job, const Patch& patch, int64_t pulse, OriginPaths& out) {
+  for (int64_t q = 0; q < kBatch; q++) {
+    out.path[q] = -job.first_path[pulse + q] * job.cells_per_metre;
+    out.xx[q] = out.xy[q] = out.yy[q] = out.xh[q] = out.yh[q] = out.hh[q] = out.shared_error[q] = out.own_error[q] = 0;
   }
-  aim_leg<kTerrain>(job.transmitter + pulse, job, patch, aim.leg[0], aim);
-  aim_leg<kTerrain>(job.receiver + pulse, job, patch, aim.leg[1], aim);
+  add_origin_leg<kTerrain>(job.transmitter + pulse, job, patch, out.leg[0], out);
+  add_origin_leg<kTerrain>(job.receiver + pulse, job, patch, out.leg[1], out);
   const double last = double(job.width) - kWindow;
-  const float tolerance = patch.crooked ? -1.0f : float(job.tolerance_rad / job.radians_per_cell);
-  for (int q = 0; q < kBatch; q++) {
-    aim.start[q] = __builtin_floor(aim.path[q]);
-    aim.rest[q] = float(aim.path[q] - aim.start[q]);
-    aim.first[q] = float(-aim.start[q]);
-    aim.last[q] = float(last - aim.start[q]);
-    aim.holds[q] = (int(aim.shared[q] <= tolerance) + int(aim.own[q] <= tolerance)) *
-                   int(magnitude(aim.first[q]) < 1e7f);
-    // Curvature inside a block is small beside its slope: twice the value at the origin bounds it where fast forms hold.
-    aim.margin[q] = 1e-3f + 4.5f * (magnitude(aim.xx[q]) + magnitude(aim.xy[q]) + magnitude(aim.yy[q]));
+  const float tolerance = patch.irregular ? -1.0f : float(job.tolerance_rad / job.radians_per_cell);
+  for (int64_t q = 0; q < kBatch; q++) {
+    // Whole cells are counted in float64, the rest is small enough for float32.
+    out.whole[q] = __builtin_floor(out.path[q]);
+    out.fraction[q] = float(out.path[q] - out.whole[q]);
+    out.first_window[q] = float(-out.whole[q]);
+    out.last_window[q] = float(last - out.whole[q]);
+    // Which series keeps the tolerance; beyond 1e7 cells float32 no longer counts them.
+    out.holds[q] = (int32_t(out.shared_error[q] <= tolerance) + int32_t(out.own_error[q] <= tolerance)) *
+                   int32_t(magnitude(out.first_window[q]) < 1e7f);
+    // Curvature inside a block is small beside its slope: twice the value at the origin bounds it where a series holds.
+    out.curvature_bound[q] =
+        1e-3f + apertura::kCurvatureSpan * (magnitude(out.xx[q]) + magnitude(out.xy[q]) + magnitude(out.yy[q]));
     if constexpr (kTerrain) {
-      const float curved = patch.roughest * (1.5f * (magnitude(aim.xh[q]) + magnitude(aim.yh[q])) +
-                                             patch.roughest * aim.hh[q]);
-      aim.margin[q] += 2 * curved;
-      aim.shallow[q] = aim.shared[q] + curved <= tolerance;
+      const float of_heights =
+          patch.rise_max * (1.5f * (magnitude(out.xh[q]) + magnitude(out.yh[q])) + patch.rise_max * out.hh[q]);
+      out.curvature_bound[q] += 2 * of_heights;
+      out.linear_heights[q] = out.shared_error[q] + of_heights <= tolerance;
     }
   }
 }
 
-// Path and derivatives at the centres of a few blocks.
-struct Slope {
+// Path and derivatives at the centres of a few blocks, a block in each lane; second-order ones as in OriginPaths.
+struct BlockPaths {
   Lanes path{}, x{}, y{}, h{}, xx{}, xy{}, yy{}, xh{}, yh{}, hh{};
 };
 
 // Adds one leg for the blocks from `b`: Legendre series of |w + d|, path to fourth order, gradient to third.
-template <bool kTerrain, bool kOwnCurvature>
-inline void add_leg(const Patch& p, const Leg& leg, int q, int b, Slope& out) {
+template <bool kTerrain, bool kCurvature>
+inline void add_block_leg(const Patch& p, const Leg& leg, int64_t q, int64_t b, BlockPaths& out) {
   const float inverse = leg.inverse[q];
+  // alpha = d . w / R, the part of the block's offset d along the line of sight.
   Lanes alpha = leg.x[q] * load(p.along_x + b) + leg.y[q] * load(p.along_y + b);
   if constexpr (kTerrain) alpha += leg.h[q] * load(p.height + b);
-  const Lanes e = alpha * inverse, kappa = load(p.square + b) * inverse - alpha * e, k = kappa * inverse;
-  const Lanes turn = 1.0f + e * (e - 1.0f);
-  out.path += alpha + 0.5f * kappa * (turn - 0.25f * k);
-  const Lanes nearer = turn - 0.5f * k + e * (1.5f * k - e * e);  // distance of the origin over that of the block
-  const Lanes x = (load(p.dot_x + b) * inverse + leg.x[q]) * nearer;
-  const Lanes y = (load(p.dot_y + b) * inverse + leg.y[q]) * nearer;
+  // e = alpha / R and kappa = (|d|^2 - alpha^2) / R^2: the parts along and across the line of sight, against R.
+  const Lanes e = alpha * inverse, kappa_range = load(p.square + b) * inverse - alpha * e;
+  const Lanes kappa = kappa_range * inverse;
+  // (3): |w + d| - R = alpha + kappa R (1 - e + e^2 - kappa / 4) / 2.
+  const Lanes along = 1.0f + e * (e - 1.0f);
+  out.path += alpha + 0.5f * kappa_range * (along - 0.25f * kappa);
+  // (4): R / |w + d| = 1 - e + e^2 - kappa / 2 + e (3 kappa / 2 - e^2).
+  const Lanes ratio = along - 0.5f * kappa + e * (1.5f * kappa - e * e);
+  // (5): the derivatives along rows, columns and height at the block's centre.
+  const Lanes x = (load(p.dot_x + b) * inverse + leg.x[q]) * ratio;
+  const Lanes y = (load(p.dot_y + b) * inverse + leg.y[q]) * ratio;
   out.x += x, out.y += y;
   Lanes h{};
-  if constexpr (kTerrain) h = (load(p.dot_h + b) * inverse + leg.h[q]) * nearer, out.h += h;
-  if constexpr (!kOwnCurvature) return;
-  const Lanes half = 0.5f * inverse * nearer;
+  if constexpr (kTerrain) h = (load(p.dot_h + b) * inverse + leg.h[q]) * ratio, out.h += h;
+  if constexpr (!kCurvature) return;
+  // (5a): the second-order coefficients there, with 1 / |w + d| = ratio / R.
+  const Lanes half = 0.5f * inverse * ratio;
   out.xx += (p.xx - x * x) * half, out.xy += (p.xy - x * y) * 2 * half, out.yy += (p.yy - y * y) * half;
   if constexpr (!kTerrain) return;
   out.xh += (p.xh - x * h) * 2 * half, out.yh += (p.yh - y * h) * 2 * half, out.hh += (1 - h * h) * half;

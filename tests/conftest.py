@@ -4,13 +4,10 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from apertura.campaign import Campaign
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.plan import grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
+from apertura.simulation import ImageGrid, preset, simulate
 from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
@@ -33,9 +30,8 @@ def copy_writable(source: Path, target: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def _tiny(tmp_path_factory):
-    generator = np.random.default_rng(7)
-    plan = replace(tandem(generator, pulses=40), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
-    return write_campaign(tmp_path_factory.mktemp("tiny") / "campaign", plan, generator)
+    plan = replace(preset("demo", pulses=40), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    return simulate(tmp_path_factory.mktemp("tiny") / "campaign", plan, seed=7)
 
 
 @pytest.fixture

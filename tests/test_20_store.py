@@ -14,7 +14,7 @@ import zarr
 
 from apertura.contracts import STAGES, check, stamp
 from apertura.errors import CampaignError, ContractError
-from apertura.store import finish, manifest_of, open_stage, save_stage, sharing, tiles_missing, writing
+from apertura.store import finish, manifest_of, open_stage, resume, save_stage, sharing, writing
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -83,11 +83,11 @@ WINDOWS = [(slice(r, r + 32), slice(c, min(c + 32, 48))) for r in (0, 32) for c 
 
 def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
-        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == WINDOWS
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
         zarr.open_array(wip / "image", mode="r+")[WINDOWS[1]] = 0
     with writing(tmp_path / "image.zarr") as wip:
-        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == [WINDOWS[0], *WINDOWS[2:]]
-        assert tiles_missing(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
+        assert resume(wip, empty_image(), "image", WINDOWS) == [WINDOWS[0], *WINDOWS[2:]]
+        assert resume(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
 
 
 def test_jobs_share_the_work_and_who_finishes_waits_for_them(tmp_path):
@@ -113,7 +113,7 @@ def test_other_work_that_came_between_is_not_written_into(tmp_path, monkeypatch)
 
     def slow(lock, kind):
         if kind == fcntl.LOCK_SH:  # the lock is let go for a moment: another step begins other work
-            tiles_missing(folder.with_name("image.zarr.wip"), empty_image(code="1"), "image", WINDOWS)
+            resume(folder.with_name("image.zarr.wip"), empty_image(code="1"), "image", WINDOWS)
         real(lock, kind)
 
     monkeypatch.setattr(fcntl, "flock", slow)
@@ -123,7 +123,7 @@ def test_other_work_that_came_between_is_not_written_into(tmp_path, monkeypatch)
 
 def finished_image(folder):
     with writing(folder) as wip:
-        tiles_missing(wip, empty_image(), "image", WINDOWS)
+        resume(wip, empty_image(), "image", WINDOWS)
         zarr.open_array(wip / "image", mode="r+")[:] = 1
         finish(wip, folder)
 
@@ -132,19 +132,19 @@ def test_a_sealed_stage_whose_record_snakemake_removed_is_not_computed_again(tmp
     finished_image(tmp_path / "image.zarr")
     manifest_of(tmp_path / "image.zarr").unlink()
     with writing(tmp_path / "image.zarr") as wip:
-        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == []
+        assert resume(wip, empty_image(), "image", WINDOWS) == []
 
 
 def test_a_damaged_stage_is_computed_again(tmp_path):
     finished_image(tmp_path / "image.zarr")
     (tmp_path / "image.zarr" / "image" / "c" / "0" / "0").write_bytes(b"x")
     with writing(tmp_path / "image.zarr") as wip:
-        assert tiles_missing(wip, empty_image(), "image", WINDOWS) == WINDOWS
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
 
 
 def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
-        tiles_missing(wip, empty_image(), "image", WINDOWS)
+        resume(wip, empty_image(), "image", WINDOWS)
         zarr.open_array(wip / "image", mode="r+")[:] = 1
         (wip / "image" / "c" / "0" / "0.123.partial").write_bytes(b"half")
         finish(wip, tmp_path / "image.zarr")

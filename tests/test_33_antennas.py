@@ -1,17 +1,20 @@
-"""Patterns, axes and footprints of antennas, and what the planner makes of them."""
+"""Patterns, axes and weights of antennas, and what the planner makes of them."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_33_planner import COSTS, compiled, draw, job, net, plan, track
+from campaigns import draw
+from test_33_planner import compiled, mono, net, plan, track
 
 from apertura.antenna.beam import Beam, Beams
-from apertura.antenna.illumination import Footprint, footprint, illuminate
+from apertura.antenna.illumination import illuminate
 from apertura.antenna.pattern import antenna_axes, gaussian_cut, sampled_cut
-from apertura.focus.engines import ENGINES, native, reference
+from apertura.focus.engines import load_engine, native, reference
+from apertura.focus.engines.native_prediction import pixel_seconds
+from apertura.focus.engines.native_weights import NO_BEAMS, PatchWeights, patch_weights
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import body_axes
-from apertura.planning.cost import seconds
 from apertura.planning.planner import make_plan
 from apertura.quality.measures import numerical_error
 
@@ -58,7 +61,7 @@ def test_a_sampled_cut_keeps_its_main_lobe_alone():
 def test_pulses_that_see_a_place_are_counted():
     tx, places = track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
     beams = Beams(side((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
-    found = illuminate(beams, tx, tx, places)
+    found = illuminate(beams, mono(tx), places)
     half_m = np.hypot(20, 10) * np.tan(np.radians(4 * np.sqrt(20 / 12.0412)))
     expected = [2 * half_m / 6 * 3000, (half_m + 1) / 6 * 3000, 0]
     np.testing.assert_allclose(found.seen, expected, atol=12)
@@ -67,17 +70,15 @@ def test_pulses_that_see_a_place_are_counted():
 
 def jobs(beams, *, shape=(200, 200)):
     tx = track()
-    lit = None if beams is None else illuminate(beams, tx, tx, net().reshape(-1, 3))
+    lit = None if beams is None else illuminate(beams, mono(tx), net().reshape(-1, 3))
     return {"beams": beams, "illumination": lit, "shape": shape}
 
 
 def test_pulses_in_the_dark_cost_less_than_without_beams_and_lit_ones_more():
-    load = replace(job().load, cells=1, tiles=0, pixels=10**6)
-    lit, half, dark = (
-        sum(seconds(COSTS, "native", load, footprint=Footprint(1 - share, 0.0, share, 0.0, 2))) for share in (0, 0.5, 1)
-    )
+    shared = (1.0, 0.0, 0.0)
+    lit, half, dark = (pixel_seconds(shared, 2, PatchWeights(1 - share, 0.0, share, 0.0, 2)) for share in (0, 0.5, 1))
     assert half == pytest.approx((lit + dark) / 2)
-    assert 2 * dark < sum(seconds(COSTS, "native", load)) < lit / 2.5
+    assert 2 * dark < pixel_seconds(shared, 2, NO_BEAMS) < lit / 2.5
 
 
 @compiled
@@ -101,8 +102,8 @@ def test_the_ways_native_weighs_are_foreseen(width_deg):
     native.form(native.prepare(scene.profiles(places)), places, beams=beams, counts=counts)
     middle = places[8::16, 8::16]
     steps = np.stack([(places[8::16, 9::16] - middle).reshape(-1, 3), (places[9::16, 8::16] - middle).reshape(-1, 3)])
-    found = footprint(beams, scene.tx, scene.rx, steps, middle.reshape(-1, 3))
-    np.testing.assert_allclose([found.smooth, found.rough, found.dark], counts[1:] / counts.sum(), atol=0.1)
+    found = patch_weights(beams, Aperture(scene.tx, scene.rx), steps, middle.reshape(-1, 3))
+    np.testing.assert_allclose([found.smooth, found.pixelwise, found.dark], counts[1:] / counts.sum(), atol=0.1)
 
 
 @compiled
@@ -130,16 +131,18 @@ def aimed(position_m, middle_m, width_deg):
 @pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
 def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):
     drawn = draw(np.random.default_rng(seed), pixels=64, pulses=90)
-    tx, rx = drawn.job.tx_position_m, drawn.job.rx_position_m
-    middle = drawn.job.place_m[len(drawn.job.place_m) // 2]
-    across_deg = np.degrees(64 * drawn.grid.spacing_m / np.linalg.norm(middle - tx[45]))
-    beams = Beams(*(aimed(position, middle, min(60.0, widths * across_deg)) for position in (tx, rx)))
-    lit = illuminate(beams, tx, rx, drawn.job.place_m)
-    found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db, costs=COSTS)
-    engine = ENGINES[found.engine]
-    history = {"echo": drawn.spectra, "profile": found.history(drawn.profiles)}[engine.reads]
-    places = drawn.grid.positions()
-    image = engine.form(engine.prepare(history, **found.options), places, beams=beams, **found.form_options)
+    aperture = drawn.job.aperture
+    middle = drawn.job.points_m[len(drawn.job.points_m) // 2]
+    across_deg = np.degrees(64 * drawn.grid.spacing_m / np.linalg.norm(middle - aperture.tx_m[45]))
+    beams = Beams(*(aimed(position, middle, min(60.0, widths * across_deg)) for position in aperture.legs))
+    lit = illuminate(beams, aperture, drawn.job.points_m)
+    found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db)
+    engine = load_engine(found.engine)
+    inputs = {"phase_history": drawn.history, "profiles": found.inputs(drawn.profiles)}[engine.READS]
+    places = drawn.grid.positions(0.0)
+    image = engine.form(
+        engine.prepare(inputs, **found.setting.options), places, beams=beams, **found.setting.form_options
+    )
     some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
-    exact = reference.form(drawn.spectra, places[some], beams=beams)
+    exact = reference.form(drawn.history, places[some], beams=beams)
     assert numerical_error(image[some].astype(np.complex64), exact).rms_db <= drawn.accuracy_db

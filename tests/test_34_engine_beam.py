@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_34_engine_native import AXES, Scene, _runs, decibels, ecef, fly, grid, scatter
+from test_34_engine_native import AXES, Scene, decibels, ecef, fly, grid, scatter
 
 from apertura.antenna.beam import Beam, Beams
-from apertura.focus.engines import native, numba, reference
-from apertura.focus.inputs import Spectra
+from apertura.focus.engines import native, native_binding, numba, reference
+from apertura.focus.inputs import PhaseHistory
+from apertura.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -42,13 +43,13 @@ def hard(soft: Beam, half_deg: float) -> Beam:
 def exact(scene: Scene, pixels: NDArray[np.float64], beams: Beams) -> NDArray[np.complex128]:
     frequency = scene.carrier_hz + scene.offset_hz
     silent = np.zeros(len(scene.tx))
-    spectra = Spectra(scene.transfer, frequency, np.ones(frequency.size), silent, scene.tx, scene.rx)
+    spectra = PhaseHistory(scene.transfer, frequency, np.ones(frequency.size), silent, Aperture(scene.tx, scene.rx))
     return reference.form(spectra, ecef(pixels), beams=beams)
 
 
 @pytest.fixture(params=native.INSTRUCTION_SETS)
 def isa(request, monkeypatch):
-    if not _runs(request.param):
+    if not native_binding.runs(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
     return request.param
@@ -100,7 +101,7 @@ def test_pulses_that_look_away_are_as_good_as_dropped(isa, plain):
     axes[: len(axes) // 2] *= np.array([-1, -1, 1])[:, None]
     kept, counts = slice(len(axes) // 2, None), np.zeros(4, np.int64)
     image = native.form(native.prepare(profiles), ecef(pixels), beams=Beams(replace(lit, axes=axes)), counts=counts)
-    few = native.prepare(profiles.of_pulses(kept))
+    few = native.prepare(profiles[kept])
     fewer = native.form(few, ecef(pixels), beams=Beams(replace(lit, axes=lit.axes[kept])))
     assert decibels(image - fewer, fewer) <= -110
     assert counts[3] == counts.sum() / 2  # they cost nothing
@@ -112,7 +113,7 @@ def test_pixels_outside_the_beam_of_all_pulses_are_zero(isa, plain):
     tables, places = native.prepare(profiles), ecef(pixels)
     counts = np.zeros(4, np.int64)
     image, truth = native.form(tables, places, beams=beams, counts=counts), exact(scene, pixels, beams)
-    lit = beams.weight(scene.tx, scene.rx, places.reshape(-1, 3)).any(0).reshape(image.shape)
+    lit = beams.weight(Aperture(scene.tx, scene.rx), places.reshape(-1, 3)).any(0).reshape(image.shape)
     assert 0.1 < lit.mean() < 0.9
     assert np.array_equal(image != 0, lit)
     assert counts[3] > 0  # where all of a patch is dark the pulse costs nothing

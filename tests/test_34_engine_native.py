@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import binding, native
+from apertura.errors import CampaignError
+from apertura.focus.engines import native, native_binding
+from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -58,7 +61,7 @@ class Scene:
         at = start[:, None] + step_m * np.arange(length)
         turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
         samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
-        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, self.tx, self.rx)
+        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
 
     def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
         delay = self.path_m(places) / C
@@ -113,13 +116,9 @@ def decibels(difference: NDArray[np.complexfloating], truth: NDArray[np.complexf
     return 10 * np.log10(np.sum(np.abs(difference) ** 2) / np.sum(np.abs(truth) ** 2) + 1e-30)
 
 
-def _runs(name: str) -> bool:
-    return native.available() and binding._library().apertura_form(name.encode()) is not None
-
-
 @pytest.fixture(params=native.INSTRUCTION_SETS)
 def isa(request, monkeypatch):
-    if not _runs(request.param):
+    if not native_binding.runs(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
     return request.param
@@ -151,7 +150,7 @@ def test_a_monostatic_image_agrees_with_the_double_sum(isa):
 def test_instruction_sets_agree_with_each_other(plain, monkeypatch):
     _, pixels, profiles = plain
     images = []
-    for name in filter(_runs, native.INSTRUCTION_SETS):
+    for name in filter(native_binding.runs, native.INSTRUCTION_SETS):
         monkeypatch.setenv("APERTURA_ISA", name)
         images.append(native.form(native.prepare(profiles), ecef(pixels)))
     assert all(decibels(image - images[0], images[0]) <= -95 for image in images[1:])
@@ -303,7 +302,7 @@ def test_near_ranges_take_more_exact_paths(isa, range_m, way):
 
 def test_swapping_transmitter_and_receiver_gives_the_same_image(isa, plain):
     _, pixels, profiles = plain
-    swapped = replace(profiles, tx_position_m=profiles.rx_position_m, rx_position_m=profiles.tx_position_m)
+    swapped = replace(profiles, aperture=Aperture(*reversed(profiles.aperture.legs)))
     image, other = (native.form(native.prepare(p), ecef(pixels)) for p in (profiles, swapped))
     assert decibels(image - other, image) <= -100
 
@@ -315,9 +314,7 @@ def test_a_constant_height_equals_a_lowered_track(isa):
     lowered = [antenna - 1.5 * AXES[:, 2] for antenna in (scene.tx, scene.rx)]
     profiles = scene.profiles(ecef(raised))
     image = native.form(native.prepare(profiles), ecef(raised))
-    other = native.form(
-        native.prepare(replace(profiles, tx_position_m=lowered[0], rx_position_m=lowered[1])), ecef(pixels)
-    )
+    other = native.form(native.prepare(replace(profiles, aperture=Aperture(*lowered))), ecef(pixels))
     assert decibels(image - other, image) <= -70
 
 
@@ -338,7 +335,7 @@ def test_a_raised_target_focuses_where_geometry_predicts(isa):
 def test_blocks_of_pulses_add_up(isa, plain):
     _, pixels, profiles = plain
     whole = native.form(native.prepare(profiles), ecef(pixels))
-    blocks = (profiles.of_pulses(slice(0, 33)), profiles.of_pulses(slice(33, None)))
+    blocks = (profiles[slice(0, 33)], profiles[slice(33, None)])
     parts = [native.form(native.prepare(block), ecef(pixels)) for block in blocks]
     assert decibels(sum(parts) - whole, whole) <= -110
 
@@ -395,7 +392,7 @@ def test_bad_input_is_refused(plain):
     with pytest.raises(ValueError, match="degree=3"):
         native.prepare(profiles, degree=3)
     with pytest.raises(ValueError, match="holds no pulse"):
-        native.prepare(profiles.of_pulses(slice(0, 0)))
+        native.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         native.prepare(replace(profiles, start_m=profiles.start_m * np.nan))
     with pytest.raises(ValueError, match="oversampling"):
@@ -407,19 +404,57 @@ def test_bad_input_is_refused(plain):
 
 
 def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setattr(binding, "_library_path", lambda: None)
-    binding._library.cache_clear()
-    try:
-        assert not native.available()
-        with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
-            native.instruction_set()
-    finally:
-        binding._library.cache_clear()
+    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    assert not native.available()
+    with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
+        native.instruction_set()
+
+
+def test_python_predicts_with_the_constants_of_the_kernel():
+    assert native_binding.kernel_constants() == pytest.approx(asdict(KERNEL), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "named"),
+    [
+        ("pulses, padded, width, rows", "pulses, padded, rows, width", "ApertureJob.width"),
+        ("int32_t wide_sum; ", "int64_t wide_sum; ", "ApertureJob.wide_sum"),
+        ("double peak; ", "double peak, sum; ", "BeamJob"),
+    ],
+)
+def test_a_library_of_another_layout_is_refused_by_the_name_of_the_field(was, becomes, named, tmp_path, monkeypatch):
+    compiler = shutil.which("g++")
+    if not compiler:
+        pytest.skip("g++ is needed")
+    shutil.copytree(Path(__file__).parents[1] / "native", tmp_path, dirs_exist_ok=True)
+    job, contract = tmp_path / "job.hpp", tmp_path / "contract.cpp"
+    assert was in job.read_text()
+    job.write_text(job.read_text().replace(was, becomes))
+    library = tmp_path / f"{named}.so"
+    exports = 'extern "C" __attribute__((visibility("default"))) const char* apertura_isa(const char*) { return 0; }\n'
+    contract.write_text(contract.read_text() + exports)
+    subprocess.run([compiler, "-std=c++17", "-shared", "-fPIC", contract, "-o", library], check=True)
+    monkeypatch.setenv("APERTURA_KERNEL", str(library))
+    with pytest.raises(CampaignError, match=rf"{named} at .*; expected {named} at byte \d+, \d+ bytes") as refused:
+        native.instruction_set()
+    assert str(library) in str(refused.value)
+
+
+def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
+    compiler = shutil.which("g++")
+    if not compiler:
+        pytest.skip("g++ is needed")
+    library, source = tmp_path / "old.so", tmp_path / "old.cpp"
+    source.write_text('extern "C" const char* apertura_form(const char* name) { return name; }\n')
+    subprocess.run([compiler, "-shared", "-fPIC", source, "-o", library], check=True)
+    monkeypatch.setenv("APERTURA_KERNEL", str(library))
+    with pytest.raises(CampaignError, match=r"BeamJob\.axes at no place; expected .* byte 0, 8 bytes"):
+        native.instruction_set()
 
 
 def test_no_environment_variable_means_the_best(monkeypatch):
     monkeypatch.delenv("APERTURA_ISA", raising=False)
-    assert native.instruction_set() == next(filter(_runs, native.INSTRUCTION_SETS))
+    assert native.instruction_set() == next(filter(native_binding.runs, native.INSTRUCTION_SETS))
     assert "APERTURA_ISA" not in os.environ
 
 

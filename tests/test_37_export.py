@@ -1,11 +1,10 @@
-"""Rasters and quicklooks: exact places, whole files, and overviews that tell the truth."""
+"""Rasters and quicklooks: exact places, complete files, and overviews that tell the truth."""
 
 import hashlib
 import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,13 @@ import rasterio
 import zarr
 from rasterio import Affine
 
-from apertura.atomic import whole
 from apertura.errors import CampaignError, ContractError
-from apertura.export import EXPORTS, LAYERS
+from apertura.export import exports_in
 from apertura.export.cog import READ, write_power, write_slc
 from apertura.export.db import write_db
 from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
 from apertura.export.map_layout import DPI, LEFT, TOP
-from apertura.export.quicklook import _below_peak, shrink, write_quicklook
+from apertura.export.quicklook import below_peak, shrink, write_quicklook
 from apertura.geometry.geodesy import local_crs
 
 UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
@@ -32,7 +30,9 @@ TAGS = {
     "APERTURA_VERSION": "0.1.0",
     "APERTURA_ERROR_DB": "-61.2",
 }
-RASTERS = {name: write for name, write in EXPORTS.items() if name.endswith(".tif")}
+IMAGES = {export.file: export.write for export in exports_in("pair")}
+LAYERS = {export.file: export.write for export in exports_in("layers")}
+RASTERS = {name: write for name, write in IMAGES.items() if name.endswith(".tif")}
 
 
 def speckle(*shape: int) -> np.ndarray:
@@ -141,11 +141,11 @@ import sys
 from pathlib import Path
 import numpy as np
 from rasterio import Affine
-from apertura.export import EXPORTS
+from apertura.export import exports_in
 folder, image = Path(sys.argv[1]), np.load(sys.argv[2])
-for name, write in EXPORTS.items():
-    tags = {"B": "2", "A": "1"}
-    write(folder / name, image, transform=Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1), crs="EPSG:32632", tags=tags)
+for export in exports_in("pair"):
+    path, tags = folder / export.file, {"B": "2", "A": "1"}
+    export.write(path, image, transform=Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1), crs="EPSG:32632", tags=tags)
 """
 
 
@@ -160,7 +160,7 @@ def test_the_same_image_gives_the_same_bytes_in_any_process_and_from_any_store(t
         check=True,
         env=os.environ | {"TZ": "Asia/Tokyo", "GDAL_NUM_THREADS": "2"},
     )
-    for name, write in EXPORTS.items():
+    for name, write in IMAGES.items():
         write(tmp_path / name, tiled, **UTM, tags={"A": "1", "B": "2"})
         here, there = (hashlib.sha256((folder / name).read_bytes()) for folder in (tmp_path, tmp_path / "there"))
         assert here.hexdigest() == there.hexdigest(), name
@@ -181,10 +181,10 @@ class Blocks:
         return (np.add.outer(np.array(rows) * 1j, columns) + 1).astype(np.complex64)
 
 
-@pytest.mark.parametrize("name", EXPORTS)
+@pytest.mark.parametrize("name", IMAGES)
 def test_an_image_is_never_held_whole(tmp_path, name):
     image = Blocks(READ + 300, READ + 500)
-    EXPORTS[name](tmp_path / name, image, **UTM, tags={})
+    IMAGES[name](tmp_path / name, image, **UTM, tags={})
     assert 0 < image.largest <= READ**2
     if name == "slc.tif":
         with rasterio.open(tmp_path / name) as raster:
@@ -198,7 +198,7 @@ import os, signal, sys
 from pathlib import Path
 import numpy as np
 from rasterio import Affine
-from apertura.export import EXPORTS
+from apertura.export import exports_in
 class Deadly:
     shape, reads = (2100, 2100), 0
     def __getitem__(self, key):
@@ -207,7 +207,8 @@ class Deadly:
             os.kill(os.getpid(), signal.SIGKILL)
         return np.ones((2100, 2100), np.complex64)[key]
 path = Path(sys.argv[1])
-EXPORTS[path.name](path, Deadly(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:32632", tags={})
+export = next(export for export in exports_in("pair") if export.file == path.name)
+export.write(path, Deadly(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:32632", tags={})
 """
 
 
@@ -219,7 +220,7 @@ def test_a_killed_writer_leaves_no_half_file_and_the_next_one_clears_its_work(tm
     assert killed.returncode == -signal.SIGKILL
     assert path.read_bytes() == b"of the last run"
     assert (tmp_path / f".{name}.wip").is_dir()
-    EXPORTS[name](path, speckle(8, 8), **UTM, tags={})
+    IMAGES[name](path, speckle(8, 8), **UTM, tags={})
     assert [left.name for left in tmp_path.iterdir()] == [name]
 
 
@@ -233,25 +234,6 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, 2**20))
     arguments = [sys.executable, "-c", limited + BY_ANOTHER_PROCESS, tmp_path, tmp_path / "image.npy"]
     assert subprocess.run(arguments, check=False, capture_output=True).returncode != 0
     assert [left.name for left in tmp_path.iterdir()] == ["image.npy"]
-
-
-def test_a_second_writer_of_the_same_file_waits(tmp_path):
-    path = tmp_path / "note.txt"
-
-    def write_second():
-        with whole(path) as draft:
-            draft.write_text("second")
-
-    second = threading.Thread(target=write_second)
-    with whole(path) as draft:
-        second.start()
-        draft.write_text("first")
-        second.join(timeout=0.2)
-        assert second.is_alive()
-        assert draft.read_text() == "first"
-    second.join()
-    assert path.read_text() == "second"
-    assert [left.name for left in tmp_path.iterdir()] == ["note.txt"]
 
 
 def test_what_is_no_image_on_a_north_up_grid_is_refused_before_anything_is_written(tmp_path):
@@ -306,9 +288,9 @@ def test_shrinking_loses_no_pixel(at):
 def test_a_glitch_does_not_blacken_the_quicklook():
     y, x = np.mgrid[:100, :100]
     target = np.sinc((x - 30) / 2.0) ** 2 * np.sinc((y - 40) / 2.0) ** 2
-    assert _below_peak(target)[1] == 0
+    assert below_peak(target)[1] == 0
     target[80, 80] = 1e5
-    decibel, top = _below_peak(target)
+    decibel, top = below_peak(target)
     assert top == -50
     assert decibel.max() == 0
 

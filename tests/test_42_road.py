@@ -11,12 +11,13 @@ from conftest import run_steps
 from apertura.campaign import Campaign
 from apertura.echo.compression import compress, range_step, window_weights
 from apertura.echo.sidelink import METHODS
-from apertura.focus.engines import ENGINES, reference
-from apertura.focus.inputs import Profiles, Spectra
+from apertura.focus.engines import load_engine, reference
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.geometry.aperture import Aperture
+from apertura.load.scene import open_scene
 from apertura.quality.measures import numerical_error
-from apertura.quality.point_targets import Patch, find_peak, ground_position
+from apertura.quality.point_targets import Patch, find_peak
 from apertura.steps import echo
-from apertura.steps.scene import scene_grid
 from apertura.steps.verify import verify
 from apertura.store import open_stage
 
@@ -49,11 +50,10 @@ def test_coherent_fusion_is_narrower_than_either_pair(finished_sample):
 def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
     """What lets the pairs add coherently; the sample's own model agrees within 0.06 rad."""
     cube = open_stage(finished_sample.stage("cube"), "cube").image.values[0]
-    grid = scene_grid(finished_sample)
+    grid = open_scene(finished_sample).grid
     truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]
     for target in truth:
-        row = (grid.north_m - target["y"]) / grid.spacing_m - 0.5
-        column = (target["x"] - grid.west_m) / grid.spacing_m - 0.5
+        row, column = map(float, grid.pixel_of(target["x"], target["y"]))
         mono, bistatic = (Patch(image, round(row), round(column)).at(row, column) for image in cube)
         assert abs(np.angle(mono * np.conj(bistatic))) < 0.1
 
@@ -61,7 +61,8 @@ def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
 def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, monkeypatch):
     """Both phase histories scaled to equal RMS; the peak drops by at least 15 dB."""
     pair = ("f01", "uav1-uav2")
-    grid = scene_grid(finished_sample)
+    scene = open_scene(finished_sample)
+    grid, ground = scene.grid, scene.terrain
     with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
     uncorrected: list[xr.Dataset] = []
     monkeypatch.setitem(METHODS, "divide", lambda radar, *_: radar)
@@ -72,7 +73,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
         transfer = dataset.transfer.values / np.sqrt((np.abs(dataset.transfer.values) ** 2).mean())
         places = dataset.tx_position.values, dataset.rx_position.values
         frequency = dataset.frequency.values
-        start = np.linalg.norm(places[0] - grid.positions()[0, 0], axis=-1) * 2 - 40
+        start = np.linalg.norm(places[0] - ground.positions(grid)[0, 0], axis=-1) * 2 - 40
         profiles = Profiles(
             compress(
                 transfer,
@@ -86,10 +87,10 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
             range_step(frequency, oversampling=2)[0],
             frequency[512],
             2.0,
-            *places,
+            Aperture(*places),
         )
-        engine = ENGINES["numba"]
-        peaks.append(np.abs(engine.form(engine.prepare(profiles), grid.positions())).max())
+        engine = load_engine("numba")
+        peaks.append(np.abs(engine.form(engine.prepare(profiles), ground.positions(grid))).max())
     assert 20 * np.log10(peaks[0] / peaks[1]) > 15
 
 
@@ -113,7 +114,8 @@ def test_gotcha_trihedrals_are_found_within_30_cm(shared, tmp_path):
         row, column = int((50.0 - y) / 0.2), int((x + 40.0) / 0.2)
         window = np.abs(image[row - 8 : row + 9, column - 8 : column + 9])
         down, right = np.unravel_index(window.argmax(), window.shape)
-        found = ground_position(scene_grid(campaign), find_peak(image, row - 8 + down, column - 8 + right))
+        peak = find_peak(image, row - 8 + down, column - 8 + right)
+        found = open_scene(campaign).grid.map_at(peak.row, peak.column)
         assert np.hypot(found[0] - x, found[1] - y) < 0.3
 
 
@@ -121,16 +123,19 @@ def test_gotcha_trihedrals_are_found_within_30_cm(shared, tmp_path):
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_the_table_engine_meets_its_error(finished_sample, window, pair):
     dataset = open_stage(finished_sample.stage("echo", "f01", pair), "echo")
-    grid = scene_grid(finished_sample)
+    scene = open_scene(finished_sample)
+    grid, ground = scene.grid, scene.terrain
     frequency, weight = dataset.frequency.values, window_weights(window, 1024)
     places = dataset.tx_position.values, dataset.rx_position.values
     zeros = np.zeros(len(places[0]))
-    spectra = Spectra(dataset.transfer.values, frequency, weight, zeros, *places)
+    spectra = PhaseHistory(dataset.transfer.values, frequency, weight, zeros, Aperture(*places))
     start = np.full(len(zeros), 5.0)
     samples = compress(spectra.transfer, frequency, weight=weight, reference_delay_s=zeros, start_m=start, count=500)
-    profiles = Profiles(samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, *places)
-    pixels = grid.positions_at(*random_pixels(grid.shape, 256, seed=3))
-    engine = ENGINES["numba"]
+    profiles = Profiles(
+        samples, start, range_step(frequency, oversampling=2)[0], frequency[512], 2.0, Aperture(*places)
+    )
+    pixels = ground.positions_at(grid, *random_pixels(grid.shape, 256, seed=3))
+    engine = load_engine("numba")
     computed = engine.form(engine.prepare(profiles), pixels[None])[0]
     assert numerical_error(computed, reference.form(spectra, pixels)).rms_db < -50
 
@@ -142,11 +147,12 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     dataset = open_stage(finished_tiny.stage("echo", *pair), "echo")
     formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
     frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
-    spectra = Spectra(
-        dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), *places
+    spectra = PhaseHistory(
+        dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), Aperture(*places)
     )
     rows, columns = random_pixels(formed.shape, 200, seed=99)
-    exact = reference.form(spectra, scene_grid(finished_tiny).positions_at(rows, columns))
+    scene = open_scene(finished_tiny)
+    exact = reference.form(spectra, scene.terrain.positions_at(scene.grid, rows, columns))
     found = numerical_error(formed[rows, columns], exact).rms_db
     assert said["numerical_error_db"] == pytest.approx(found, abs=3)
 

@@ -9,7 +9,7 @@ import pytest
 from conftest import copy_writable
 
 from apertura.campaign import Campaign
-from apertura.steps.plan import plan_pair
+from apertura.steps.plan import expected_plan
 from apertura.study.chart.pareto import Point, with_front, write_points
 from apertura.study.chart.speed_accuracy import speed_accuracy
 
@@ -36,7 +36,7 @@ def test_the_planners_choice_and_the_reference_are_there_however_short_the_time(
     planned = [row for row in rows if row["planned"] == "True"]
     assert len(planned) == 1
     assert float(planned[0]["error_db"]) <= -60
-    plan = plan_pair(Campaign.load(charted[0][0].parents[2]), "f01", "uav1-uav2")
+    plan = expected_plan(Campaign.load(charted[0][0].parents[2]), "f01", "uav1-uav2")
     assert planned[0]["setting"] == plan.setting.line  # the image's own
     exact = next(row for row in rows if row["engine"] == "reference")
     assert float(exact["error_db"]) < -130

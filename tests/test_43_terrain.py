@@ -14,21 +14,20 @@ from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.focus.engines import ENGINES
+from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
-from apertura.load import pair as outlook
-from apertura.load.ground import Ground, on_the_ground
-from apertura.load.inputs import profiles_of, spectra_of
-from apertura.load.pair import outlook_of
+from apertura.imaging.stages import phase_history_of, profiles_of
+from apertura.load import pair as pairs
+from apertura.load.ground import Ground
+from apertura.load.pair import open_pair
+from apertura.load.plan import job_of, plan_pair
+from apertura.load.scene import expected_scene, open_scene, settled_scene
 from apertura.scene.grid import SceneGrid
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.plan import grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
-from apertura.simulation.scene import PointTarget, Scene
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.simulation.presets import DEMO_ORIGIN
+from apertura.simulation.scene import PointTarget
 from apertura.steps import profile, scene, terrain
-from apertura.steps.plan import job_of, plan_known, plan_pair
-from apertura.steps.scene import scene_grid
-from apertura.steps.terrain import Heights, expected_heights
+from apertura.steps.plan import expected_plan
 from apertura.steps.verify import verify
 from apertura.store import open_stage
 
@@ -68,13 +67,11 @@ def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=None,
 @pytest.fixture(scope="module")
 def hillside(tmp_path_factory):
     """The tiny campaign with three targets on a plane tilted by 20°, imaged with its DEM."""
-    generator = np.random.default_rng(7)
-    plan = replace(tandem(generator, pulses=60), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
+    plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     right = np.array([ALONG[1], -ALONG[0]])  # apart in range, so that a short aperture does not mix them
     places = [across * right + along * ALONG for across, along in ((0.0, 0.0), (2.0, 0.8), (-2.0, -0.6))]
     targets = tuple(PointTarget((x, y, SLOPE * float(UPHILL @ (x, y)))) for x, y in places)
-    plan = replace(plan, scene=Scene(DEMO_ORIGIN, targets))
-    root = write_campaign(tmp_path_factory.mktemp("hillside") / "campaign", plan, generator)
+    root = simulate(tmp_path_factory.mktemp("hillside") / "campaign", plan, targets=targets, seed=7)
     write_plane(root)
     edit_scene(root, dem="dem.tif", dem_datum="ellipsoid")
     return run_steps(root)
@@ -101,18 +98,19 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
     assert report["terrain"]["dem"] == "dem.tif"
     assert report["terrain"]["datum"] == "ellipsoid"
     assert report["numerical_error_db"] < -50
-    grid = scene_grid(hillside)
-    assert report["terrain"]["lowest_m"] < grid.height_m < report["terrain"]["highest_m"]
+    assert report["terrain"]["lowest_m"] < settled_scene(hillside).level.height_m < report["terrain"]["highest_m"]
     digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
-    for name in ("f01/uav1-uav2/slc.tif", "f01/fused/coherent_db.tif", "layers/mask.tif"):
+    apart = {"f01/uav1-uav2/slc.tif": None, "f01/fused/coherent_db.tif": "uav1-uav2", "layers/mask.tif": "terrain"}
+    for name, stage in apart.items():
         with rasterio.open(hillside.results / name) as raster:
             assert json.loads(raster.tags()["APERTURA_INPUTS"])["dem"] == digest
             runspec = json.loads(raster.tags()["APERTURA_RUNSPEC"])
+            runspec = runspec[stage] if stage else runspec
             assert (runspec["dem"], runspec["dem_datum"]) == ("dem.tif", "ellipsoid")
 
 
 def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
-    grid = scene_grid(hillside)
+    grid = settled_scene(hillside).grid
     heights = open_stage(hillside.stage("terrain"), "terrain").height.values
     values = {}
     for name in ("incidence", "bistatic_angle", "mask"):
@@ -151,7 +149,7 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
     campaign = edit_scene(tiny, height_m=572.0, height_datum="egm96", geoid="egm96_15.gtx")
     path = scene.scene(campaign)
     settled = json.loads(path.read_text())
-    assert settled["grid"]["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
+    assert settled["height_m"] - 572.0 == pytest.approx(UNDULATION_M, abs=0.01)
     assert settled["inputs"] == {"geoid": hashlib.sha256((tiny / "egm96_15.gtx").read_bytes()).hexdigest()}
 
 
@@ -162,23 +160,23 @@ def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
     if not made:
         (root / "results" / "terrain.manifest.json").unlink()
     campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
-    seen, profiles = outlook_of(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
-    grid = scene_grid(campaign)
-    heights = expected_heights(campaign, grid)
-    assert job_of(seen, grid, heights, tile_px=256, threads=1).signal.samples == profiles.sizes["range"]
-    assert job_of(seen, grid, Heights((), None), tile_px=256, threads=1).signal.samples != profiles.sizes["range"]
-    plan = plan_pair(campaign, *pair)
-    tables = ENGINES[plan.engine].prepare(plan.history(profiles_of(profiles)), **plan.options)
+    seen, profiles = open_pair(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
+    hill = expected_scene(campaign, seen.flown)
+    level = replace(hill, terrain=hill.level)
+    assert job_of(campaign, seen, hill).signal.samples == profiles.sizes["range"]
+    assert job_of(campaign, seen, level).signal.samples != profiles.sizes["range"]
+    plan = expected_plan(campaign, *pair)
+    tables = load_engine(plan.engine).prepare(plan.inputs(profiles_of(profiles)), **plan.setting.options)
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
 
 
 def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
     echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
-    held = spectra_of(echo, "hann").transfer
-    monkeypatch.setattr(outlook, "open_stage", None)
-    found = outlook.outlook_of(hillside, "f01", "uav1-uav2", echo=echo)
-    assert np.shares_memory(found.spectra.transfer, held)
-    plan_known(hillside, "f01", "uav1-uav2", found, scene_grid(hillside), terrain.open_heights(hillside))
+    held = phase_history_of(echo, "hann").transfer
+    monkeypatch.setattr(pairs, "open_stage", None)
+    opened = pairs.open_pair(hillside, "f01", "uav1-uav2", echo=echo)
+    assert np.shares_memory(opened.history.transfer, held)
+    plan_pair(hillside, opened, open_scene(hillside))
 
 
 # Bad input
@@ -208,7 +206,7 @@ def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
 def test_a_void_in_the_scene_is_counted_and_placed(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    planned = complaint(lambda: plan_pair(campaign, *PAIR))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before anything ran
     message = complaint(lambda: ground(campaign))
     assert planned == message
     assert "of 3600 pixels" in message
@@ -234,29 +232,27 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
     write_plane(tiny, keep=slice(16, 25))
     for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
         campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
-        seen = outlook_of(campaign, *PAIR)
-        grid = outlook.campaign_grid(campaign, seen)
-        assert grid.height_m == pytest.approx(620.0, abs=0.1)
-        assert not np.isfinite(
-            Ground.of(campaign.settings.scene, tiny, crs=grid.crs).terrain.heights(under(grid, seen))
-        )
+        seen = open_pair(campaign, *PAIR)
+        expected = expected_scene(campaign, seen.flown)
+        assert expected.level.height_m == pytest.approx(620.0, abs=0.1)
+        assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
     campaign = edit_scene(tiny, bounds_m="auto")
-    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert "under the track, where scene.bounds_m: auto starts from" in message
     assert "% of the scene" not in message
 
 
 def under(grid, seen):
     """A pixel below the middle of the track."""
-    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate([seen.tx, seen.rx]), axis=0))
-    return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1), 0.0)
+    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate(seen.aperture.legs), axis=0))
+    return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1))
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, "auto"])
 def test_plan_and_run_say_alike_which_half_of_the_scene_a_dem_misses(tiny, spacing_m):
     write_plane(tiny, keep=(slice(None), slice(20, None)))
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
-    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    message = complaint(lambda: expected_plan(campaign, *PAIR))
     share, rest = message.split(": ", 1)[1].split(" % of the scene lies outside the DEM, ")
     assert rest.startswith("to the west: ")
     (west, _, east, _), (start, *_) = campaign.settings.scene.bounds_m, rasterio.open(tiny / "dem.tif").bounds
@@ -269,15 +265,15 @@ def test_a_scene_much_longer_than_wide_lies_at_the_mean_of_its_dem(tiny):
     write_plane(tiny, slope=0.0, height_m=623.0)
     middle = Campaign.load(tiny).settings.scene.bounds_m
     asked = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
-    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100), 0.0)
-    assert on_the_ground(strip, Ground.of(asked, tiny, crs=strip.crs))[0].height_m == 623.0
+    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100))
+    assert Ground.of(asked, tiny, crs=strip.crs).level(strip).height_m == 623.0
 
 
 def test_a_void_undeclared_is_no_height_on_earth(tiny):
     """-9999 without nodata is refused as it stands, wherever the DEM is first read."""
     write_plane(tiny, void=-9999.0)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    for work in (lambda: plan_pair(campaign, *PAIR), lambda: ground(campaign)):
+    for work in (lambda: expected_plan(campaign, *PAIR), lambda: ground(campaign)):
         message = complaint(work)
         assert "dem.tif: 1 of the " in message
         assert "no height on Earth, most often -9999 m" in message
@@ -288,12 +284,12 @@ def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     """620 m are 2034 ft: but from beside a DEM a radar may look up, so it is no error."""
     write_plane(tiny, height_m=620.0 / 0.3048)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    message = complaint(lambda: plan_pair(campaign, *PAIR))  # no echo comes from so far
+    message = complaint(lambda: expected_plan(campaign, *PAIR))  # no echo comes from so far
     assert "unit and datum of scene.dem" in message
     write_plane(tiny, height_m=680.0)
-    assert "below the lowest ground of the scene" in plan_pair(campaign, *PAIR).flags["platform_below_scene"]
+    assert "below the lowest ground of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
     campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
-    message = complaint(lambda: plan_pair(campaign, *PAIR))
+    message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert "config/config.yaml: scene.height_m: " in message
     assert "the ground has 2034.00 m" in message
 
@@ -307,7 +303,7 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     write_plane(root, slope=-1.5 * SLOPE)
     shutil.rmtree(root / "results")
     campaign = edit_scene(root, bounds_m=bounds)
-    planned = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))  # before anything ran
+    planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is in or below the ground" in planned
     shutil.copytree(hillside.results / "f01", root / "results" / "f01")

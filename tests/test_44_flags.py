@@ -8,23 +8,17 @@ import pytest
 from test_41_bad_input import complaint, edit_config, ingest_all
 
 from apertura.campaign import Campaign
-from apertura.simulation.campaign import write_campaign
+from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag
-from apertura.simulation.plan import grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
 from apertura.steps import echo, image, profile, scene
 from apertura.store import open_stage
 
 
 def flown(folder, node="uav2", *, pulses=40, **impairments):
     """A tandem flight whose one node has other impairments; its echo stages made."""
-    generator = np.random.default_rng(11)
-    plan = replace(tandem(generator, pulses=pulses), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
-    nodes = tuple(
-        replace(each, impairments=replace(each.impairments, **impairments)) if each.name == node else each
-        for each in plan.nodes
-    )
-    campaign = Campaign.load(write_campaign(folder / "campaign", replace(plan, nodes=nodes), generator))
+    plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    changed = {node: replace(plan.nodes[node].impairments, **impairments)}
+    campaign = Campaign.load(simulate(folder / "campaign", plan, impairments=changed, seed=11))
     ingest_all(campaign)
     return campaign
 

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import copy_writable
-from test_35_simulate_campaign import small_simulation
+from test_35_simulation_campaign import small_simulation
 from test_41_bad_input import complaint, edit_data
 
 from apertura.campaign import Campaign
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.frame import Framing
-from apertura.simulation.impairments import Impairments
+from apertura.simulation import Framing, Impairments, simulate
 from apertura.steps import ingest
 from apertura.store import open_stage
 
@@ -29,7 +27,7 @@ def flown(tmp_path_factory):
             pulses=12,
         )
         root = tmp_path_factory.mktemp("trigger") / str(continuous)
-        roots[continuous] = Campaign.load(write_campaign(root, plan, np.random.default_rng(4)))
+        roots[continuous] = Campaign.load(simulate(root, plan, seed=4))
         ingest.ingest(roots[continuous], "f01", "b")
     return roots
 

@@ -9,9 +9,7 @@ import yaml
 from test_41_bad_input import complaint, edit_config
 
 from apertura.campaign import Campaign
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.plan import grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
+from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.scene import PointTarget
 from apertura.steps import calibration, echo, ingest
 from apertura.store import open_stage
@@ -21,16 +19,16 @@ PAIRS = ("uav1-uav1", "uav1-uav2")
 
 def flown(folder, *, reflector=True):
     """Nodes whose config states offsets off by decimetres; one flight over a reflector, one over the scene."""
-    generator = np.random.default_rng(21)
-    plan = replace(tandem(generator, pulses=60), grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.0, spacing_m=0.1))
-    nodes = tuple(replace(node, stated_path_offset_m={"radar": 1.0, "sidelink": 0.5}) for node in plan.nodes)
+    plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    stated = {"radar": 1.0, "sidelink": 0.5}
+    nodes = {name: replace(node, stated_path_offset_m=stated) for name, node in plan.nodes.items()}
     if not reflector:
-        quiet = replace(plan.nodes[0].impairments, radar_snr_db=-60.0)
-        nodes = (replace(nodes[0], impairments=quiet), *nodes[1:])
+        quiet = replace(plan.nodes["uav1"].impairments, radar_snr_db=-60.0)
+        nodes["uav1"] = replace(nodes["uav1"], impairments=quiet)
     target = PointTarget((0.0, 0.0, 0.0), 5.0)
     over = replace(plan.flights[0], name="c01", kind="calibration", targets=(target,))
     later = replace(plan.flights[0], start_utc="2025-05-14T10:00:00")
-    root = write_campaign(folder / "campaign", replace(plan, nodes=nodes, flights=(over, later)), generator)
+    root = simulate(folder / "campaign", replace(plan, nodes=nodes, flights=(over, later)), seed=21)
     truth = json.loads((root / "truth.json").read_text())["targets"][0]
     place = [truth["x"], truth["y"], truth["height_m"]]
     edit_config(root, lambda document: document.update(calibration={"flight": "c01", "reflector_m": place}))

@@ -1,6 +1,7 @@
 """Every file a user gets is valid, lies where the config says and says where it comes from."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,16 +9,34 @@ import rasterio
 import xarray as xr
 from rio_cogeo.cogeo import cog_validate
 
-RASTERS = [
-    *(f"{pair}/{product}.tif" for pair in ("uav1-uav1", "uav1-uav2") for product in ("slc", "power", "db")),
-    *(f"fused/coherent_{product}.tif" for product in ("slc", "power", "db")),
-    *(f"fused/noncoherent_{product}.tif" for product in ("power", "db")),
+from apertura.export import product_files
+from apertura.provenance import sha256_file
+
+PAIRS = ("uav1-uav1", "uav1-uav2")
+PRODUCTS = list(product_files({"f01": PAIRS}))
+RASTERS = [name for name in PRODUCTS if name.startswith("f01") and name.endswith(".tif")]
+RECORDED = [
+    *(f"raw/f01/uav1.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.csv")),
+    *(f"raw/f01/uav2.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.pos")),
 ]
+
+
+def tags_of(campaign, name):
+    with rasterio.open(campaign.results / name) as raster:
+        return raster.tags()
+
+
+def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
+    results = finished_tiny.results
+    files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in {".tif", ".png"}}
+    reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
+    assert len(RASTERS) == 11
+    assert files | reports == set(PRODUCTS)
 
 
 @pytest.mark.parametrize("name", RASTERS)
 def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
-    path = finished_tiny.results / "f01" / name
+    path = finished_tiny.results / name
     valid, errors, warnings = cog_validate(str(path), strict=True, quiet=True)
     assert valid, (errors, warnings)
     with rasterio.open(path) as raster:
@@ -29,17 +48,42 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
 
 @pytest.mark.parametrize("name", RASTERS)
 def test_a_raster_says_where_it_comes_from(finished_tiny, name):
-    with rasterio.open(finished_tiny.results / "f01" / name) as raster:
-        tags = raster.tags()
-    runspec, inputs = json.loads(tags["APERTURA_RUNSPEC"]), json.loads(tags["APERTURA_INPUTS"])
-    assert runspec["waveform"]["carrier_hz"] == 1.2e9
-    assert "window" in runspec
-    assert {"raw/codes.npy", "raw/f01/uav1.sigmf-data", "raw/f01/uav1.track.csv"} <= set(inputs)
-    assert all(len(digest) == 64 for digest in [*inputs.values(), tags["APERTURA_CODE_SHA256"]])
-    assert float(tags["APERTURA_ERROR_DB"]) < -60
-    assert float(tags["APERTURA_PEAK_ERROR_DB"]) < -50
-    assert json.loads(tags["APERTURA_MODELS"])
+    tags, pair = tags_of(finished_tiny, name), name.split("/")[1]
+    spec = json.loads(tags["APERTURA_RUNSPEC"])
+    for runspec in spec.values() if pair == "fused" else [spec]:
+        assert runspec["waveform"]["carrier_hz"] == 1.2e9
+        assert runspec["window"] == "hann"
+    inputs = json.loads(tags["APERTURA_INPUTS"])
+    assert set(inputs) == {"raw/codes.npy", *(RECORDED if pair != "uav1-uav1" else RECORDED[:3])}
+    for role, digest in inputs.items():
+        assert digest == sha256_file(finished_tiny.root / role)
+    assert re.fullmatch("[0-9a-f]{64}", tags["APERTURA_CODE_SHA256"])
+
+
+@pytest.mark.parametrize("name", RASTERS)
+def test_a_raster_says_how_exact_it_is(finished_tiny, name):
+    tags = tags_of(finished_tiny, name)
+    report = json.loads((finished_tiny.results / name).with_name("image.json").read_text())
+    for tag, key in (("ERROR_DB", "numerical_error_db"), ("ERROR_STD_DB", "numerical_error_std_db")):
+        assert float(tags[f"APERTURA_{tag}"]) == report[key]
+    assert -160 < float(tags["APERTURA_ERROR_DB"]) < -60
+    assert -160 < float(tags["APERTURA_PEAK_ERROR_DB"]) < -50
+    assert json.loads(tags["APERTURA_MODELS"]) == report["models"]
     assert "APERTURA_REDONE" not in tags
+
+
+def test_a_fused_raster_keeps_the_settings_of_its_pairs_apart(finished_tiny):
+    apart = json.loads(tags_of(finished_tiny, "f01/fused/coherent_db.tif")["APERTURA_RUNSPEC"])
+    for pair in PAIRS:
+        assert apart[pair] == json.loads(tags_of(finished_tiny, f"f01/{pair}/db.tif")["APERTURA_RUNSPEC"])
+    assert set(apart) == set(PAIRS)
+    assert apart["uav1-uav1"] != apart["uav1-uav2"]
+
+
+def test_a_title_says_what_was_added_up(finished_tiny):
+    for name, words in (("coherent", "coherent sum"), ("noncoherent", "non-coherent sum")):
+        title = tags_of(finished_tiny, f"f01/fused/{name}_db.tif")["TIFFTAG_IMAGEDESCRIPTION"]
+        assert title.split(" · ")[1:] == ["flight f01", f"{words} of uav1-uav1 + uav1-uav2"]
 
 
 def test_power_and_db_are_the_slc_squared(finished_tiny):

@@ -11,15 +11,20 @@ from test_41_bad_input import complaint, edit_config
 
 from apertura.campaign import Campaign
 from apertura.quality.point_targets import cut_through, find_peak
-from apertura.simulation.antenna import Antenna
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.flight import Straight
-from apertura.simulation.impairments import Impairments
-from apertura.simulation.plan import Flight, Node, grid_around
-from apertura.simulation.presets import DEMO_ORIGIN, tandem
-from apertura.simulation.scene import PointTarget, Scene
+from apertura.simulation import (
+    GaussianBeam,
+    ImageGrid,
+    Impairments,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    preset,
+    simulate,
+)
+from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.steps import echo, image, ingest, profile, scene
-from apertura.steps.plan import plan_pair
+from apertura.steps.plan import expected_plan
 from apertura.store import open_stage
 
 PULSES, STEP_M, BACK_M, UP_M = 80, 0.1, 11.5, 4.8
@@ -31,23 +36,22 @@ BEAM = {"boresight_deg": [90.0, -DEPRESSION_DEG], "beamwidth_deg": [15.0, 60.0]}
 
 def fly(folder, antennas, snr_db):
     """Straight along azimuth 40°, the one target abeam of the middle."""
-    generator = np.random.default_rng(5)
-    plan = tandem(generator, pulses=PULSES)
+    plan = preset("demo", pulses=PULSES)
     speed = STEP_M * plan.waveform.prf_hz
     start = -RIGHT * BACK_M - AHEAD * STEP_M * (PULSES - 1) / 2 + [0, 0, UP_M]
     plan = replace(
         plan,
-        scene=Scene(DEMO_ORIGIN, (PointTarget((0, 0, 0)),)),
-        nodes=(Node("uav1", impairments=Impairments(radar_snr_db=snr_db), antennas=antennas),),
-        flights=(Flight("f01", "uav1", {"uav1": Straight(tuple(start), tuple(AHEAD * speed))}, PULSES),),
-        grid=grid_around(DEMO_ORIGIN, "EPSG:32632", 3.2, spacing_m=0.05),
+        targets=(PointTarget((0, 0, 0)),),
+        nodes={"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=snr_db), antennas=antennas)},
+        flights=(SimulatedFlight("f01", "uav1", {"uav1": Straight(tuple(start), tuple(AHEAD * speed))}, PULSES),),
+        scene=ImageGrid("EPSG:32632", half_width_m=3.2, spacing_m=0.05),
     )
-    return write_campaign(folder / "campaign", plan, generator)
+    return simulate(folder / "campaign", plan, seed=5)
 
 
 @pytest.fixture(scope="module")
 def _beamed(tmp_path_factory):
-    looking = Antenna((90.0, -DEPRESSION_DEG), (15.0, 60.0))
+    looking = GaussianBeam((90.0, -DEPRESSION_DEG), (15.0, 60.0))
     return fly(tmp_path_factory.mktemp("beams"), {"radar_tx": looking, "radar_rx": looking}, -10.0)
 
 
@@ -180,7 +184,7 @@ def test_the_beam_turns_with_the_yaw_that_was_logged(beamed):
     turned = [",".join([*line.split(",")[:-1], str(float(line.split(",")[-1]) - 180)]) for line in lines]
     log.write_text("\n".join([head, *turned]) + "\n")
     campaign = stated(beamed, BEAM)
-    message = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))
+    message = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))
     slant = np.radians(DEPRESSION_DEG)
     towards = np.array([STEP_M * (PULSES - 1) / 2, BACK_M, UP_M])
     off_deg = np.degrees(np.arccos(towards @ [0, -np.cos(slant), np.sin(slant)] / np.linalg.norm(towards)))
@@ -189,7 +193,7 @@ def test_the_beam_turns_with_the_yaw_that_was_logged(beamed):
 
 def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beamed):
     campaign = stated(beamed, BEAM | {"boresight_deg": [-90.0, -DEPRESSION_DEG]})
-    before = complaint(lambda: plan_pair(campaign, "f01", "uav1-uav1"))
+    before = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))
     for part in ("uav1's radar_tx", "uav1's radar_rx", "right is +90", "yaw (clockwise from north)", "pattern ends at"):
         assert part in before
     assert complaint(lambda: imaged(campaign)) == before
@@ -231,11 +235,10 @@ def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     np.testing.assert_allclose(east_north_up, [AHEAD, RIGHT, [0, 0, -1]], atol=1e-4)
 
 
-@pytest.mark.parametrize("override", [{"pulse_thinning": 4}, {"midpoint": True}])
-def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(beamed, override):
-    message = complaint(lambda: plan_pair(stated(beamed, BEAM, **override), "f01", "uav1-uav1"))
-    assert f"processing.{next(iter(override))}" in message
-    reasons = plan_pair(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
-    assert "weigh every pulse" in reasons["pulse_thinning"]
+def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(beamed):
+    message = complaint(lambda: expected_plan(stated(beamed, BEAM, presum=4), "f01", "uav1-uav1"))
+    assert "config/config.yaml: processing.presum" in message
+    reasons = expected_plan(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
+    assert "weigh every pulse" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: of 80 pulses")
-    assert "antenna" not in plan_pair(stated(beamed, None), "f01", "uav1-uav1").reasons
+    assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons

@@ -1,45 +1,97 @@
-"""Files that are whole or absent: written in a folder beside, then renamed."""
+"""Files and folders that are complete or absent: written beside, brought to the disk, then renamed."""
 
 import fcntl
+import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """Yield where to write a draft; it becomes `path` when the body ends without an error.
+def replacement(path: Path) -> Iterator[Path]:
+    """Yield where to write a file or folder; it becomes `path` when the body ends without an error.
 
-    The folder of the draft, ``.<name>.wip``, may hold whatever else the body needs on disk. A second
-    writer of the same file waits; a kernel lock that dies with its process sees to it. What a killed
-    writer left behind is cleared by the next one.
+    The work folder, ``.<name>.wip``, may hold whatever else the body needs on disk. A second writer of the same path
+    waits: a kernel lock, which dies with its process, keeps it out. What a killed writer left is cleared by the next.
+
+    Parameters
+    ----------
+    path
+        File, or folder that is absent or empty; folders above it are made.
 
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     with whole(Path(folder) / "note.txt") as draft:
-    ...         _ = draft.write_text("all of it")
+    ...     with replacement(Path(folder) / "note.txt") as temporary:
+    ...         _ = temporary.write_text("all of it")
     ...     [path.name for path in Path(folder).iterdir()]
     ['note.txt']
     """
-    workshop = path.with_name(f".{path.name}.wip")
-    with _locked(workshop):
+    work = path.with_name(f".{path.name}.wip")
+    temporary = work / path.name
+    with _locked(work):
         try:
-            _clear(workshop)
-            yield workshop / path.name
-            (workshop / path.name).replace(path)
+            _clear(work)
+            yield temporary
+            rename(temporary, path)
         finally:
-            _clear(workshop)
+            _clear(work)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, UTF-8, newlines as they are.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_text(Path(folder) / "new" / "note.txt", "all of it")
+    ...     (Path(folder) / "new" / "note.txt").read_text()
+    'all of it'
+    """
+    with replacement(path) as temporary:
+        temporary.write_bytes(text.encode())
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON file; the same document gives the same bytes.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite: JSON has no NaN.
+    """
+    write_text(path, json.dumps(document, indent=1, sort_keys=True, allow_nan=False, default=_plain) + "\n")
+
+
+def rename(source: Path, target: Path) -> None:
+    """Bring a file or folder to the disk and give it its name: after a power failure `target` is complete or absent."""
+    for path in (source, *source.rglob("*")):
+        _synchronise(path)
+    source.replace(target)
+    _synchronise(target.parent)
+
+
+def _synchronise(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager
-def _locked(workshop: Path) -> Iterator[None]:
-    """Hold ``workshop/lock``; on leaving, remove both."""
-    name = workshop / "lock"
+def _locked(work: Path) -> Iterator[None]:
+    """Hold ``work/.lock``; on leaving, remove both."""
+    name = work / ".lock"
+    work.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        workshop.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            work.mkdir()
         try:
             lock = name.open("a")
         except FileNotFoundError:  # the writer before us has just removed the folder
@@ -52,8 +104,8 @@ def _locked(workshop: Path) -> Iterator[None]:
                 yield
             finally:
                 name.unlink()
-                if not any(workshop.iterdir()):  # else the next writer has made its own lock
-                    workshop.rmdir()
+                with suppress(OSError):  # the next writer has made its own lock, or is done already
+                    work.rmdir()
             return
 
 
@@ -64,7 +116,15 @@ def _is_at(descriptor: int, name: Path) -> bool:
         return False
 
 
-def _clear(workshop: Path) -> None:
-    for left_over in workshop.iterdir():
-        if left_over.name != "lock":
-            left_over.unlink()
+def _clear(work: Path) -> None:
+    for path in work.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != ".lock":
+            path.unlink()
+
+
+def _plain(value: object) -> object:
+    if hasattr(value, "tolist"):  # a number or array of numpy
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not JSON")

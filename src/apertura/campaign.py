@@ -6,10 +6,7 @@ from typing import Any
 
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS
-from apertura.settings import Antenna, OfdmWaveform, Settings, read_settings
-from apertura.settings.flights import FLIGHTS, Flight, read_flights
-
-CONFIG = Path("config/config.yaml")
+from apertura.settings import CONFIG, FLIGHTS, Antenna, Flight, OfdmWaveform, Settings, read_flights, read_settings
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,7 @@ class Campaign:
                 raise CampaignError(
                     "no such file",
                     where=path,
-                    expected=f"the file of config/config.yaml: {key}",
+                    expected=f"the file of {CONFIG}: {key}",
                     remedy=f"Copy it there, or correct {key}.",
                 )
         waveform = self.settings.waveform
@@ -128,7 +125,7 @@ class Campaign:
             raise CampaignError(
                 "no such file",
                 where=self.root / waveform.codes,
-                expected="the transmitted code symbols, as config/config.yaml: waveform.codes",
+                expected=f"the transmitted code symbols, as {CONFIG}: waveform.codes",
                 remedy="Copy the file there.",
             )
 

@@ -1,35 +1,73 @@
-"""The command line: one subcommand per step, and whole campaigns."""
+"""The command line: one subcommand per step, and campaigns from end to end.
+
+Commands import what they run when they run: help and mistakes in the command line cost nothing.
+"""
 
 import os
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from apertura import __version__
-from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.study.commands import app as study
+
+if TYPE_CHECKING:
+    from apertura.campaign import Campaign
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="SAR images from campaign folders.")
 step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
 
+CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
+Cores = Annotated[int, typer.Option(help="cores to use")]
 Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
 HERE = Path()
+ALL_CORES = os.cpu_count() or 1
+PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Options that are not known go to snakemake."""
+
+
+def _opened(campaign: Path) -> "Campaign":
+    from apertura.campaign import Campaign
+
+    return Campaign.load(campaign)
+
+
+def _run(function: str, campaign: Path, *arguments: str, **options: object) -> None:
+    """Run ``module:function`` on a campaign and print the paths that it wrote."""
+    written = pkgutil.resolve_name(function)(_opened(campaign), *arguments, **options)
+    print(*([written] if isinstance(written, Path) else written), sep="\n")
 
 
 def main() -> None:
-    """Run the command line; what a person has to mend is said in one message, without a traceback."""
+    """Run the command line; what a person has to correct is said in one message, without a traceback."""
     try:
         app()
     except CampaignError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
 
 
 @app.command()
@@ -38,19 +76,15 @@ def version() -> None:
     print(__version__)
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-def run(
-    context: typer.Context,
-    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
-    cores: Annotated[int, typer.Option(help="cores to use")] = os.cpu_count() or 1,
-) -> None:
+@app.command(context_settings=PASS_ON)
+def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
     raise SystemExit(_snakemake(campaign, cores, *context.args))
 
 
 def _snakemake(campaign: Path, cores: int, *arguments: str) -> int:
     """Run the workflow; return its exit status."""
-    Campaign.load(campaign).check_files()
+    _opened(campaign).check_files()
     root = _workflow_folder()
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
     command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *arguments]
@@ -66,36 +100,20 @@ def _workflow_folder() -> Path:
 
 
 @app.command()
-def plan(campaign: Annotated[Path, typer.Argument(help="campaign folder")], threads: Threads = 1) -> None:
+def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
     """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
     from apertura.steps.plan import print_plan
 
-    print_plan(Campaign.load(campaign), threads=threads)
+    print_plan(_opened(campaign), threads=threads)
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-def chart(
-    context: typer.Context,
-    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
-    cores: Annotated[int, typer.Option(help="cores to use")] = os.cpu_count() or 1,
-) -> None:
+@app.command(context_settings=PASS_ON)
+def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
     """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
     status = _snakemake(campaign, cores, *context.args, "speed_accuracy")
     if status == 0:
         print(*(campaign / f"results/study/speed_accuracy.{suffix}" for suffix in ("png", "html", "csv")), sep="\n")
     raise SystemExit(status)
-
-
-@app.command("calibrate-cost")
-def calibrate_cost() -> None:
-    """Measure what imaging costs on this machine, for the planner; takes less than a minute."""
-    from apertura.planning.calibration import measure_costs
-    from apertura.planning.machine import write_costs
-
-    costs = measure_costs()
-    for name, seconds in sorted(costs.seconds.items()):
-        print(f"{name:<24}{1e9 * seconds:>12.3g} ns")
-    print(write_costs(costs), "(a campaign that ran keeps its own: delete its results/costs.json to plan anew)")
 
 
 @app.command()
@@ -105,7 +123,7 @@ def verify(
     """Compare where point targets are found with where they were put, and print the products' paths."""
     from apertura.steps.verify import print_findings
 
-    print_findings(Campaign.load(campaign), paths=paths)
+    print_findings(_opened(campaign), paths=paths)
 
 
 @app.command()
@@ -124,118 +142,92 @@ def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> N
 
 @app.command()
 def simulate(
-    directory: Annotated[Path, typer.Argument(help="campaign folder to make")],
+    paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
+    preset: Annotated[str | None, typer.Option(help="demo (the default), paper, swarm or continuous")] = None,
     seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
+    print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
 ) -> None:
-    """Write a small tandem flight as a campaign folder of raw IQ, with truth.json."""
-    import numpy as np
+    """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""
+    from apertura import simulation
 
-    from apertura.simulation.presets import tandem_demo
-
-    print(tandem_demo(directory, np.random.default_rng(seed)))
+    if print_spec is not None:
+        print(simulation.specification_text(simulation.preset(print_spec)), end="")
+        return
+    paths = paths or []
+    if len(paths) + (preset is not None) not in {1, 2} or not paths:
+        given = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
+        raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+    chosen = paths[0] if len(paths) > 1 else simulation.preset(preset or "demo")
+    print(simulation.simulate(paths[-1], chosen, seed=seed))
 
 
 @step.command()
 def ingest(flight: str, node: str, campaign: Directory = HERE) -> None:
     """Read a node's recording and flight log into raw.zarr and track.zarr."""
-    from apertura.steps import ingest as steps
-
-    print(*steps.ingest(Campaign.load(campaign), flight, node), sep="\n")
+    _run("apertura.steps.ingest:ingest", campaign, flight, node)
 
 
 @step.command()
 def echo(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Turn recordings of a pair into calibrated transfer functions, echo.zarr."""
-    from apertura.steps import echo as steps
-
-    print(steps.echo(Campaign.load(campaign), flight, pair))
+    _run("apertura.steps.echo:echo", campaign, flight, pair)
 
 
 @step.command()
 def calibrate(flight: str, campaign: Directory = HERE) -> None:
     """Estimate the path offsets of a calibration flight's pairs, calibration.json."""
-    from apertura.steps import calibration as steps
-
-    print(steps.calibrate(Campaign.load(campaign), flight))
+    _run("apertura.steps.calibration:calibrate", campaign, flight)
 
 
 @step.command()
 def scene(campaign: Directory = HERE) -> None:
     """Settle the campaign's grid, scene.json."""
-    from apertura.steps import scene as steps
-
-    print(steps.scene(Campaign.load(campaign)))
-
-
-@step.command()
-def costs(campaign: Directory = HERE) -> None:
-    """Keep what imaging costs on this machine as the campaign's, costs.json."""
-    from apertura.steps import costs as steps
-
-    print(steps.costs(Campaign.load(campaign)))
+    _run("apertura.steps.scene:scene", campaign)
 
 
 @step.command()
 def terrain(campaign: Directory = HERE) -> None:
     """Bring the DEM onto the campaign's grid, terrain.zarr."""
-    from apertura.steps import terrain as steps
-
-    print(steps.terrain(Campaign.load(campaign)))
+    _run("apertura.steps.terrain:terrain", campaign)
 
 
 @step.command()
 def layers(campaign: Directory = HERE, threads: Threads = 1) -> None:
     """Write incidence, bistatic angle and the mask of shadow and layover as GeoTIFFs."""
-    from apertura.steps import layers as steps
-
-    print(*steps.layers(Campaign.load(campaign), threads=threads), sep="\n")
+    _run("apertura.steps.layers:layers", campaign, threads=threads)
 
 
 @step.command()
 def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Compress a pair in range over the scene, profile.zarr."""
-    from apertura.steps import profile as steps
-
-    print(steps.profile(Campaign.load(campaign), flight, pair))
+    _run("apertura.steps.profile:profile", campaign, flight, pair)
 
 
 @step.command()
 def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
     """Focus a pair's image, image.zarr and image.json."""
-    from apertura.steps import image as steps
-
-    print(steps.image(Campaign.load(campaign), flight, pair, threads=threads))
+    _run("apertura.steps.image:image", campaign, flight, pair, threads=threads)
 
 
 @step.command()
 def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
     """Form one job's share of a pair's tiles, '2-of-8'; step image finishes them."""
-    from apertura.steps import image as steps
-
-    print(steps.tiles(Campaign.load(campaign), flight, pair, share, threads=threads))
+    _run("apertura.steps.image:tiles", campaign, flight, pair, share, threads=threads)
 
 
 @step.command("chart")
 def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
     """Time and measure every engine and setting on a pair, for at most so many seconds."""
-    from apertura.study.chart.speed_accuracy import speed_accuracy
-
-    print(*speed_accuracy(Campaign.load(campaign), flight, pair, seconds=seconds), sep="\n")
+    _run("apertura.study.chart.speed_accuracy:speed_accuracy", campaign, flight, pair, seconds=seconds)
 
 
 @step.command()
 def cube(campaign: Directory = HERE) -> None:
     """Stack and add up every image, cube.zarr."""
-    from apertura.steps import cube as steps
-
-    print(steps.cube(Campaign.load(campaign)))
+    _run("apertura.steps.cube:cube", campaign)
 
 
 @step.command()
 def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
-    from apertura.steps import export as steps
-
-    loaded = Campaign.load(campaign)
-    written = steps.export_fused(loaded, flight) if pair == "fused" else steps.export(loaded, flight, pair)
-    print(*written, sep="\n")
+    _run("apertura.steps.export:export", campaign, flight, pair)

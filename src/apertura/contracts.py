@@ -5,16 +5,18 @@ at echo. Two functions serve every step: `check` refuses a dataset that breaks i
 `stamp` writes where it came from.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from apertura import __version__
 from apertura.errors import ContractError
+from apertura.provenance import canonical_json
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
@@ -122,7 +124,7 @@ STAGES: Mapping[str, Stage] = {
 }
 
 
-def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     """Return `dataset` unchanged if it keeps the contract of `stage`.
 
     Parameters
@@ -139,6 +141,7 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
     Examples
     --------
+    >>> import xarray as xr
     >>> check(xr.Dataset(), "image")
     Traceback (most recent call last):
     ...
@@ -161,13 +164,13 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
 
 def stamp(
-    dataset: xr.Dataset,
+    dataset: "xr.Dataset",
     stage: str,
     *,
     runspec: Mapping[str, Any],
     inputs: Mapping[str, str],
     code_sha256: str,
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Check `dataset` and write units and provenance into its attributes.
 
     Parameters
@@ -209,14 +212,3 @@ def stamp(
         "code_sha256": code_sha256,
     }
     return stamped
-
-
-def canonical_json(value: object) -> str:
-    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
-
-    Examples
-    --------
-    >>> canonical_json({"b": 1, "a": [1.5, None]})
-    '{"a":[1.5,null],"b":1}'
-    """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -1,16 +1,120 @@
-"""Where a product comes from: hashes of files, of folders and of the code that ran."""
+"""Where a product comes from: settings, inputs and code, its own and those of the stages before it."""
 
-import ast
 import functools
 import hashlib
+import importlib.util
+import json
 import re
 import sysconfig
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
-_PACKAGE = Path(__file__).parent
-_ROW = re.compile(r"apertura(\.\w+)+:\w+")
-"""A table's row that names a function which is imported when it is used: "apertura.ingest.rtklib:read_rtklib_pos"."""
+from apertura import __version__
+
+PACKAGE = Path(__file__).parent
+
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
+_NAME = re.compile(r"[\w.]+")
+_TYPING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTILINE)  # never run
+_ROW = re.compile(r"[\"'](apertura(?:\.\w+)+):\w+[\"']")  # a row that names a function, imported when it is used
+
+
+class Stage(Protocol):
+    """What `apertura.contracts.stamp` has stamped: its attributes say where it comes from."""
+
+    @property
+    def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a stage or a file comes from.
+
+    Attributes
+    ----------
+    runspec
+        Every setting that mattered to it and to the stages before it.
+    inputs
+        Role → sha256 of each file read from outside the results.
+    code_sha256
+        Chain of the code hashes of the stages before it and its own.
+    """
+
+    runspec: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    code_sha256: str
+
+    @classmethod
+    def of(
+        cls,
+        modules: Sequence[str],
+        parents: Sequence[Stage] | Mapping[str, Stage] = (),
+        *,
+        settings: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
+    ) -> "Provenance":
+        """Return what is inherited from `parents`, with what comes new.
+
+        Parameters
+        ----------
+        modules
+            Dotted names; their import closure is the code that ran.
+        parents
+            Stages of one line, whose settings agree; or name → stage of several lines, such as the pairs of a flight,
+            whose settings are kept apart under their names.
+        settings, inputs
+            What of the config mattered, and role → sha256 of files read, now.
+
+        Raises
+        ------
+        ValueError
+            If two parents give one role different hashes.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> attributes = {"runspec": '{"window":"hann"}', "inputs": {"codes": "1f"}, "code_sha256": "0"}
+        >>> parent = SimpleNamespace(attrs=attributes)
+        >>> Provenance.of(["apertura.errors"], [parent], settings={"engine": "native"}).runspec
+        {'window': 'hann', 'engine': 'native'}
+        >>> Provenance.of(["apertura.errors"], {"a-a": parent, "a-b": parent}).runspec
+        {'a-a': {'window': 'hann'}, 'a-b': {'window': 'hann'}}
+        """
+        stages = list(parents.values() if isinstance(parents, Mapping) else parents)
+        specs = [json.loads(stage.attrs["runspec"]) for stage in stages]
+        runspec: dict[str, Any] = {}
+        if isinstance(parents, Mapping):
+            runspec = dict(zip(parents, specs, strict=True))
+        else:
+            for spec in specs:
+                runspec |= spec
+        return cls(
+            runspec | dict(settings or {}),
+            merged(*(stage.attrs["inputs"] for stage in stages), inputs or {}),
+            chained_sha256(code_sha256(*modules), (stage.attrs["code_sha256"] for stage in stages)),
+        )
+
+    def tags(self) -> dict[str, str]:
+        """Return the tags of a file, name → text."""
+        return {
+            "APERTURA_RUNSPEC": canonical_json(self.runspec),
+            "APERTURA_INPUTS": canonical_json(self.inputs),
+            "APERTURA_CODE_SHA256": self.code_sha256,
+            "APERTURA_VERSION": __version__,
+        }
+
+
+def canonical_json(value: object) -> str:
+    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
+
+    Examples
+    --------
+    >>> canonical_json({"b": 1, "a": [1.5, None]})
+    '{"a":[1.5,null],"b":1}'
+    """
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def sha256_file(path: Path) -> str:
@@ -31,17 +135,20 @@ def sha256_tree(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): sha256_file(path) for path in files}
 
 
-def code_sha256(*modules: str) -> str:
+def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     """Return the hash of the source of `modules` and of every apertura module they import, however deep.
 
-    Modules that a table's row names as a string, "apertura.ingest.rtklib:read_rtklib_pos", count as imported.
     A stage's hash therefore changes when, and only when, code it can run has changed. Compiled code counts by
-    what it was built from: each ``*.sha256`` that was installed beside one of the modules.
+    what it was built from: each ``*.sha256`` that was installed beside one of the modules. Modules that the row of a
+    table names as a string, ``module:function``, count as imported.
 
     Parameters
     ----------
     *modules
-        Dotted names such as ``apertura.steps.echo``.
+        Dotted names such as ``apertura.steps.echo``. Of a module of another package its own file counts, and what it
+        imports of apertura.
+    package
+        Folder of apertura's sources.
 
     Examples
     --------
@@ -49,10 +156,10 @@ def code_sha256(*modules: str) -> str:
     True
     """
     digest = hashlib.sha256()
-    closure = _closure(modules)
+    closure = import_closure(modules, package=package)
     for name, path in sorted(closure.items()):
         digest.update(f"{name}\0{sha256_file(path)}\n".encode())
-    for path in _compiled(closure):
+    for path in _compiled(closure, package):
         digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
     return digest.hexdigest()
 
@@ -78,45 +185,55 @@ def merged(*sources: Mapping[str, str]) -> dict[str, str]:
     return dict(sorted(union.items()))
 
 
-def _closure(modules: Iterable[str]) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
+    """Return dotted name → source of `modules` and of every apertura module they import; as `code_sha256`."""
+    closure: dict[str, Path] = {}
     waiting = list(modules)
+    outside = {name for name in waiting if not _is_ours(name)}
     while waiting:
         name = waiting.pop()
-        path = _source(name)
-        if path is None or name in found:
+        path = _source(name, package) if _is_ours(name) else _source_outside(name) if name in outside else None
+        if path is None or name in closure:
             continue
-        found[name] = path
-        waiting += _imports(path)
-    return found
+        closure[name] = path
+        waiting += _imports(path.read_text(encoding="utf-8"))
+    return closure
 
 
-def _compiled(closure: Mapping[str, Path]) -> list[Path]:
-    """Return what compiled code beside the modules was built from; an editable install keeps it elsewhere."""
-    found: dict[str, Path] = {}
-    for package in sorted({name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}):
-        relative = Path(*package.split(".")[1:])
-        for folder in (_PACKAGE / relative, Path(sysconfig.get_path("platlib"), _PACKAGE.name, relative)):
-            for path in sorted(folder.glob("*.sha256")):
-                found.setdefault(path.name, path)
-    return [found[name] for name in sorted(found)]
+def _is_ours(name: str) -> bool:
+    return name.split(".", maxsplit=1)[0] == PACKAGE.name
 
 
-def _source(name: str) -> Path | None:
-    if name.split(".", maxsplit=1)[0] != _PACKAGE.name:
+def _source(name: str, package: Path) -> Path | None:
+    parts = name.split(".")[1:]
+    if not parts:  # the package itself only hands out public names
         return None
-    base = _PACKAGE.joinpath(*name.split(".")[1:])
+    base = package.joinpath(*parts)
     return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
 
 
+def _source_outside(name: str) -> Path | None:
+    spec = importlib.util.find_spec(name)
+    return Path(spec.origin) if spec is not None and spec.origin else None
+
+
 @functools.cache
-def _imports(path: Path) -> tuple[str, ...]:
+def _imports(source: str) -> tuple[str, ...]:
+    """Return the dotted names that a source may import; a parser would take ten times as long."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and _ROW.fullmatch(node.value):
-            names.append(node.value.partition(":")[0])
-    return tuple(names)
+    for module, members, modules in _IMPORT.findall(_TYPING.sub("", source)):
+        names += [module, *(f"{module}.{member}" for member in _NAME.findall(members))] if module else []
+        names += _NAME.findall(modules)
+    return tuple(name for name in [*names, *_ROW.findall(source)] if _is_ours(name))
+
+
+def _compiled(closure: Mapping[str, Path], package: Path) -> list[Path]:
+    """Return what compiled code beside the modules was built from; an editable install keeps it elsewhere."""
+    digests: dict[str, Path] = {}
+    folders = {name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}
+    for folder in sorted(filter(_is_ours, folders)):
+        relative = Path(*folder.split(".")[1:])
+        for place in (package / relative, Path(sysconfig.get_path("platlib"), PACKAGE.name, relative)):
+            for path in sorted(place.glob("*.sha256")):
+                digests.setdefault(path.name, path)
+    return [digests[name] for name in sorted(digests)]

@@ -1,15 +1,20 @@
+# A row of `apertura.export.EXPORTS` is all that a product needs: the outputs follow from it.
 rule export:
     input:
         "results/{flight}/{pair}/image.manifest.json",
         "results/scene.json",
     output:
-        multiext("results/{flight}/{pair}/", "slc.tif", "power.tif", "db.tif"),
-        report(
-            "results/{flight}/{pair}/quicklook.png",
-            caption="../report/quicklook.rst",
-            category="{flight}",
-            labels={"image": "{pair}"},
-        ),
+        [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("pair") if not export.pictured],
+        [
+            report(
+                f"results/{{flight}}/{{pair}}/{export.file}",
+                caption="../report/quicklook.rst",
+                category="{flight}",
+                labels={"image": "{pair}"},
+            )
+            for export in exports_in("pair")
+            if export.pictured
+        ],
     log:
         "results/logs/{flight}/{pair}.export.log",
     benchmark:
@@ -20,9 +25,9 @@ rule export:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.steps.export"),
+        code=code_sha256("apertura.steps.export", *export_modules("pair")),
     message:
-        "{wildcards.flight}: writing the GeoTIFFs of {wildcards.pair}"
+        "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
         "apertura step export {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
@@ -35,14 +40,17 @@ rule export_fused:
             campaign.manifest("image", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
         ],
     output:
-        multiext("results/{flight}/fused/coherent_", "slc.tif", "power.tif", "db.tif"),
-        multiext("results/{flight}/fused/noncoherent_", "power.tif", "db.tif"),
-        report(
-            "results/{flight}/fused/quicklook.png",
-            caption="../report/quicklook.rst",
-            category="{flight}",
-            labels={"image": "fused"},
-        ),
+        [f"results/{{flight}}/fused/{export.file}" for export in exports_in("fused") if not export.pictured],
+        [
+            report(
+                f"results/{{flight}}/fused/{export.file}",
+                caption="../report/quicklook.rst",
+                category="{flight}",
+                labels={"image": "fused"},
+            )
+            for export in exports_in("fused")
+            if export.pictured
+        ],
         "results/{flight}/fused/image.json",
     log:
         "results/logs/{flight}/fused.export.log",
@@ -54,7 +62,7 @@ rule export_fused:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.steps.export"),
+        code=code_sha256("apertura.steps.export", *export_modules("fused")),
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:

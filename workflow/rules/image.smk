@@ -27,26 +27,6 @@ rule scene:
         "apertura step scene > {log} 2>&1"
 
 
-rule costs:
-    output:
-        "results/costs.json",
-    log:
-        "results/logs/costs.log",
-    benchmark:
-        "results/benchmarks/costs.tsv"
-    conda:
-        "../../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura.planning.machine"),
-    message:
-        "keeping what imaging costs here, so that all jobs plan alike"
-    shell:
-        "apertura step costs > {log} 2>&1"
-
-
 rule terrain:
     input:
         "results/scene.json",
@@ -77,7 +57,7 @@ rule layers:
         "results/scene.json",
         campaign.terrain_sources(),
     output:
-        multiext("results/layers/", "incidence.tif", "bistatic_angle.tif", "mask.tif"),
+        [f"results/layers/{export.file}" for export in exports_in("layers")],
     log:
         "results/logs/layers.log",
     benchmark:
@@ -88,7 +68,7 @@ rule layers:
     resources:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
-        code=code_sha256("apertura.steps.layers"),
+        code=code_sha256("apertura.steps.layers", *export_modules("layers")),
     message:
         "drawing how the scene is seen"
     shell:
@@ -100,7 +80,6 @@ rule tiles:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
-        "results/costs.json",
         campaign.terrain_sources(),
         lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
     output:
@@ -116,7 +95,7 @@ rule tiles:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image"),
+        code=code_sha256("apertura.steps.image", *ENGINES.values()),
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -129,7 +108,6 @@ rule image:
         "results/{flight}/{pair}/echo.manifest.json",
         "results/{flight}/{pair}/profile.manifest.json",
         "results/scene.json",
-        "results/costs.json",
         campaign.terrain_sources(),
         lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
         [
@@ -151,7 +129,7 @@ rule image:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image"),
+        code=code_sha256("apertura.steps.image", *ENGINES.values()),
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:

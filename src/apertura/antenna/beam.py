@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.geometry.aperture import Aperture
+
 
 @dataclass(frozen=True)
 class Beam:
@@ -59,9 +61,11 @@ class Beam:
             if not (step > 0 and np.allclose(np.diff(angle), step, rtol=1e-6, atol=1e-9) and np.isfinite(gain).all()):
                 raise ValueError(f"{name}: angles must grow in equal steps, gains be finite")
 
-    def gain(
-        self, position_m: NDArray[np.float64], pixels: NDArray[np.float64], *, pulses: slice = slice(None)
-    ) -> NDArray[np.float64]:
+    def __getitem__(self, pulses: slice) -> "Beam":
+        """Return the beam over some pulses."""
+        return replace(self, axes=self.axes[pulses])
+
+    def gain(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gain of each pulse towards each pixel.
 
         Parameters
@@ -70,27 +74,30 @@ class Beam:
             (pulse, 3) float64, phase centres of this antenna, in the frame of the pixels.
         pixels
             (pixel, 3) float64, metres.
-        pulses
-            Which pulses; all by default.
 
         Returns
         -------
         ndarray
             (pulse, pixel) float64.
+
+        Raises
+        ------
+        ValueError
+            If there is not one set of axes for each pulse.
         """
-        angles = self.angles(position_m, pixels, pulses=pulses)
+        angles = self.angles(position_m, pixels)
         gains = [
             np.interp(angle, samples, values, left=0, right=0)
             for angle, (_, samples, values) in zip(angles, self._patterns(), strict=True)
         ]
         return np.asarray(gains[0] * gains[1])
 
-    def angles(
-        self, position_m: NDArray[np.float64], pixels: NDArray[np.float64], *, pulses: slice = slice(None)
-    ) -> NDArray[np.float64]:
-        """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; parameters as `gain`."""
-        away = pixels - position_m[pulses, None]
-        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes[pulses]), -1, 0)
+    def angles(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; else as `gain`."""
+        if len(self.axes) != len(position_m):
+            raise ValueError(f"{len(self.axes)=}: must be one for each of {len(position_m)} pulses")
+        away = pixels - position_m[:, None]
+        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes), -1, 0)
         return np.stack([np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))])
 
     def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
@@ -111,38 +118,21 @@ class Beams:
 
     Examples
     --------
-    >>> Beams().weight(np.zeros((2, 3)), np.zeros((2, 3)), np.ones((4, 3))).shape
+    >>> Beams().weight(Aperture(np.zeros((2, 3)), np.zeros((2, 3))), np.ones((4, 3))).shape
     (2, 4)
     """
 
     transmit: Beam | None = None
     receive: Beam | None = None
 
-    def at(self, pulses: slice) -> "Beams":
-        """Return those of some pulses."""
-        some = (beam and replace(beam, axes=beam.axes[pulses]) for beam in (self.transmit, self.receive))
-        return Beams(*some)
+    def __getitem__(self, pulses: slice) -> "Beams":
+        """Return the beams over some pulses."""
+        return Beams(*(beam and beam[pulses] for beam in (self.transmit, self.receive)))
 
-    def weight(
-        self,
-        tx_position_m: NDArray[np.float64],
-        rx_position_m: NDArray[np.float64],
-        pixels: NDArray[np.float64],
-        *,
-        pulses: slice = slice(None),
-    ) -> NDArray[np.float64]:
-        """Return (pulse, pixel) float64, the product of both gains; parameters as `Beam.gain`.
-
-        Raises
-        ------
-        ValueError
-            If a beam has not one set of axes for each pulse.
-        """
-        total = np.ones((len(tx_position_m[pulses]), len(pixels)))
-        for beam, position_m in ((self.transmit, tx_position_m), (self.receive, rx_position_m)):
-            if beam is None:
-                continue
-            if len(beam.axes) != len(position_m):
-                raise ValueError(f"{len(beam.axes)=}: must be one for each of {len(position_m)} pulses")
-            total *= beam.gain(position_m, pixels, pulses=pulses)
+    def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (pulse, pixel) float64, the product of both gains; else as `Beam.gain`."""
+        total = np.ones((len(aperture), len(pixels)))
+        for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
+            if beam is not None:
+                total *= beam.gain(position_m, pixels)
         return total

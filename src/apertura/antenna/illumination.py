@@ -1,20 +1,15 @@
-"""What beams make of a scene: how many pulses see each place, and how the compiled engine may weigh its patches."""
+"""What beams make of a scene: how many pulses see each place."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
-from apertura.errors import CampaignError
-from apertura.planning.models import Decision
+from apertura.geometry.aperture import Aperture
 
 _PULSES = 1024
 _AT_ONCE = 64
-_HALF_PATCH = 7.5  # pixels
-_CHANGE, _BEND = 0.12, 0.025  # native/beam.hpp, `spread`
 
 
 @dataclass(frozen=True)
@@ -56,126 +51,36 @@ class Illumination:
         return f"{line}; {100 * self.unseen:.0f} % of places are seen by none" if self.unseen else line
 
 
-def illuminate(
-    beams: Beams, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64]
-) -> Illumination:
+def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -> Illumination:
     """Return how many pulses see each place.
 
     Parameters
     ----------
     beams
         Of every pulse.
-    tx_m, rx_m
-        (pulse, 3) float64, metres. Of more than 1024, evenly spread ones stand for all.
+    aperture
+        Of more than 1024 pulses, evenly spread ones stand for all.
     place_m
         (place, 3) float64, metres.
     """
-    some = slice(None, None, -(-len(tx_m) // _PULSES))
-    few, tx_m, rx_m, pulses = beams.at(some), tx_m[some], rx_m[some], len(tx_m)
+    some = slice(None, None, -(-len(aperture) // _PULSES))
+    few, beams = aperture[some], beams[some]
     seen = np.zeros(len(place_m), np.int64)
-    for first in range(0, len(tx_m), _AT_ONCE):
+    for first in range(0, len(few), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
-        seen += (few.weight(tx_m, rx_m, place_m, pulses=part) != 0).sum(axis=0)
-    return Illumination(np.rint(seen * (pulses / len(tx_m))).astype(np.int64), pulses)
+        seen += (beams[part].weight(few[part], place_m) != 0).sum(axis=0)
+    return Illumination(np.rint(seen * (len(aperture) / len(few))).astype(np.int64), len(aperture))
 
 
 def decide_antennas(
-    beams: Beams | None, illumination: Illumination | None, asked: Mapping[str, Any]
-) -> tuple[list[Decision], dict[str, str]]:
-    """Return the decision `antenna` and the flag `beam_misses`; neither without beams.
-
-    Parameters
-    ----------
-    beams, illumination
-        Of the job.
-    asked
-        Choice → value that a person asks for.
-
-    Raises
-    ------
-    CampaignError
-        If a choice that beams forbid is asked for: virtual pulses and midpoints have no antenna of their own.
-    """
+    beams: Beams | None, illumination: Illumination | None
+) -> tuple[list[tuple[str, str]], dict[str, str]]:
+    """Return which antennas have beams and what they see, in one line, and the flag `beam_misses`; neither without."""
     if beams is None or illumination is None:
         return [], {}
-    for name, allowed in (("pulse_thinning", 1), ("midpoint", False)):
-        if asked.get(name, allowed) != allowed:
-            raise CampaignError(
-                f"{name} is {asked[name]}, and the antennas have beams",
-                where=f"config/config.yaml: processing.{name}",
-                expected=f"{allowed} or auto: every pulse is weighed by the antennas that sent and received it",
-                remedy=f"Leave {name} to the planner, or set the nodes' antennas to null.",
-            )
     looking = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
     misses = f"{100 * illumination.unseen:.1f} % of the scene is seen by no pulse: its pixels are zero"
     return (
-        [Decision("antenna", ", ".join(looking), illumination.line)],
+        [(", ".join(looking), illumination.line)],
         {"beam_misses": misses} if illumination.unseen else {},
-    )
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """What beams make of patches × pulses for the compiled engine.
-
-    Attributes
-    ----------
-    smooth, rough, dark
-        Parts that are weighed by a polynomial, pixel by pixel, and not at all; they sum to 1.
-    error
-        RMS error of the polynomials, relative to the RMS of the weights.
-    antennas
-        How many beams there are.
-    """
-
-    smooth: float = 1.0
-    rough: float = 0.0
-    dark: float = 0.0
-    error: float = 0.0
-    antennas: int = 0
-
-
-NO_BEAMS = Footprint()
-
-
-def footprint(
-    beams: Beams,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    steps_m: NDArray[np.float64],
-    place_m: NDArray[np.float64],
-) -> Footprint:
-    """Return what beams make of patches of 16 × 16 pixels about places of the scene.
-
-    Parameters
-    ----------
-    beams
-        One set of axes for each of the pulses given.
-    tx_m, rx_m
-        (pulse, 3) float64, metres.
-    steps_m
-        (2, place, 3) float64, metres: from pixel to pixel along columns and rows.
-    place_m
-        (place, 3) float64, metres.
-
-    Notes
-    -----
-    Source: docs/theory/engine.md, "Antennas".
-    """
-    across = _HALF_PATCH * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
-    nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
-    gain = beams.weight(tx_m, rx_m, nodes.reshape(-1, 3)).reshape(len(tx_m), 3, 3, len(place_m))
-    bends = [np.abs(np.diff(gain, 2, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
-    changes = [np.abs(np.diff(gain.take([0, 2], axis), axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
-    dark, whole = (gain == 0).all(axis=(1, 2)), (gain != 0).all(axis=(1, 2))
-    smooth = whole & (np.maximum(*changes) <= _CHANGE) & (np.maximum(*bends) <= _BEND)
-    held = np.where(smooth, np.hypot(*bends), 0.0)
-    error = np.hypot((3 / 16) ** 2 / 2 * held, 1.4 / (9 * np.sqrt(3)) * held**1.5)
-    strength = float((gain**2).mean())
-    return Footprint(
-        float(smooth.mean()),
-        float((~smooth & ~dark).mean()),
-        float(dark.mean()),
-        float(np.sqrt((error**2).mean() / strength)) if strength else 0.0,
-        sum(beam is not None for beam in (beams.transmit, beams.receive)),
     )

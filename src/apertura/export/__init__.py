@@ -1,36 +1,145 @@
-"""Images out of the house: one file per format, one row per file."""
+"""Files for other programs: one module per format, one row per file.
 
-from collections.abc import Mapping
+A row says the file's name, which raster it is written from and what writes it. Rows drive the rules of the workflow,
+the steps and the tests; nothing else names a product. To add one, write a function such as
+`apertura.export.cog.write_power` and add its row to `EXPORTS`; or, from another package, register an `Export` as entry
+point of group ``apertura.exports``. Importing this module imports no format.
+"""
+
+import pkgutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
-from rasterio import Affine
-
-from apertura.export.cog import Raster, write_power, write_slc
-from apertura.export.db import write_db
-from apertura.export.layers import write_bistatic_angle, write_incidence, write_mask
-from apertura.export.quicklook import write_quicklook
-
-
-class Export(Protocol):
-    """Write a north-up (y, x) raster to `path`; parameters as `apertura.export.cog.write_slc`."""
-
-    def __call__(  # noqa: D102
-        self, path: Path, image: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-    ) -> None: ...
-
-
-EXPORTS: Mapping[str, Export] = {
-    "slc.tif": write_slc,
-    "power.tif": write_power,
-    "db.tif": write_db,
-    "quicklook.png": write_quicklook,
+SOURCES: Mapping[str, str] = {
+    "image": "pair",
+    "coherent": "fused",
+    "noncoherent": "fused",
+    "incidence": "layers",
+    "bistatic_angle": "layers",
+    "mask": "layers",
 }
-"""File name → what writes it from a complex image."""
+"""Raster that a file may be written from → kind of folder the file lies in.
 
-LAYERS: Mapping[str, Export] = {
-    "incidence.tif": write_incidence,
-    "bistatic_angle.tif": write_bistatic_angle,
-    "mask.tif": write_mask,
-}
-"""File name → what writes it from a layer of the scene's geometry."""
+``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
+complex amplitude without phase; the others are layers of the scene's geometry, real.
+"""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A product: one row of the table.
+
+    Attributes
+    ----------
+    file
+        Its name in the folder of the pair, of the fused images, or of the layers.
+    source
+        A key of `SOURCES`.
+    function
+        ``package.module:function``, imported when a file is written; called as
+        ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.export.cog.write_slc`.
+    pictured
+        Whether the workflow's report shows it.
+    """
+
+    file: str
+    source: str
+    function: str
+    pictured: bool = False
+
+    @property
+    def module(self) -> str:
+        """Dotted name of the module that writes the file."""
+        return self.function.partition(":")[0]
+
+    @property
+    def write(self) -> Callable[..., None]:
+        """The function that writes the file."""
+        function: Callable[..., None] = pkgutil.resolve_name(self.function)
+        return function
+
+
+EXPORTS: tuple[Export, ...] = (
+    Export("slc.tif", "image", "apertura.export.cog:write_slc"),
+    Export("power.tif", "image", "apertura.export.cog:write_power"),
+    Export("db.tif", "image", "apertura.export.db:write_db"),
+    Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
+    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc"),
+    Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
+    Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
+    Export("quicklook.png", "coherent", "apertura.export.quicklook:write_quicklook", pictured=True),
+    Export("noncoherent_power.tif", "noncoherent", "apertura.export.cog:write_power"),
+    Export("noncoherent_db.tif", "noncoherent", "apertura.export.db:write_db"),
+    Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
+    Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
+    Export("mask.tif", "mask", "apertura.export.layers:write_mask"),
+    *(point.load() for point in entry_points(group="apertura.exports")),
+)
+"""Every product, in the order in which they are written."""
+
+
+def exports_in(folder: str) -> Iterator[Export]:
+    """Yield the rows whose files lie in a kind of folder: ``pair``, ``fused`` or ``layers``.
+
+    Examples
+    --------
+    >>> [export.file for export in exports_in("layers")]
+    ['incidence.tif', 'bistatic_angle.tif', 'mask.tif']
+    """
+    return (export for export in EXPORTS if SOURCES[export.source] == folder)
+
+
+def export_modules(folder: str) -> list[str]:
+    """Return the modules that write the files of a kind of folder: code whose change makes them again.
+
+    Examples
+    --------
+    >>> export_modules("layers")
+    ['apertura.export.layers']
+    """
+    return sorted({export.module for export in exports_in(folder)})
+
+
+def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield every file that a finished campaign offers its user, relative to the results.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs.
+
+    Examples
+    --------
+    >>> list(product_files({"f01": ["a-b"]}))[2:5]
+    ['layers/mask.tif', 'f01/a-b/slc.tif', 'f01/a-b/power.tif']
+    """
+    yield from (f"layers/{export.file}" for export in exports_in("layers"))
+    for flight, names in pairs.items():
+        for folder, kind in (*((name, "pair") for name in names), ("fused", "fused")):
+            yield from (f"{flight}/{folder}/{file}" for file in (*(row.file for row in exports_in(kind)), "image.json"))
+
+
+def write_exports(
+    kind: str, folder: Path, rasters: Mapping[str, Any], *, titles: Mapping[str, str], **shared: Any
+) -> list[Path]:
+    """Write every file of a kind of folder; return their paths.
+
+    Parameters
+    ----------
+    kind
+        ``pair``, ``fused`` or ``layers``.
+    folder
+        Where they go.
+    rasters, titles
+        Source → (y, x) raster on the campaign's grid, and what a person would call it.
+    **shared
+        ``transform``, ``crs`` and ``tags``, as `apertura.export.cog.write_slc` takes them.
+    """
+    written = []
+    for export in exports_in(kind):
+        written.append(folder / export.file)
+        export.write(written[-1], rasters[export.source], title=titles[export.source], **shared)
+    return written

@@ -19,7 +19,7 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
-from apertura.atomic import whole
+from apertura.atomic import replacement
 from apertura.errors import CampaignError, ContractError
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
@@ -75,7 +75,7 @@ def write_slc(
     Parameters
     ----------
     path
-        ``….tif``; whole or absent, never half written.
+        ``….tif``; complete or absent.
     image
         (y, x) complex64, north-up, NaN where nothing was formed; read block by block.
     transform
@@ -148,10 +148,10 @@ def write_cog(
         As `write_slc`.
     """
     place = placed(image, transform, crs)
-    with whole(path) as draft, rasterio.Env(**GDAL):
-        source = draft.with_name("source.tif")
+    with replacement(path) as temporary, rasterio.Env(**GDAL):
+        source = temporary.with_name("source.tif")
         fill(source, lambda block: value(np.asarray(image[block])), band, place, described(tags, title))
-        finish(source, draft, band)
+        finish(source, temporary, band)
 
 
 def power(image: Pixels) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from rasterio import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window
 
-from apertura.atomic import whole
+from apertura.atomic import replacement
 from apertura.export.cog import BLOCK, GDAL, POWER, Band, Block, Pixels, Raster, described, fill, finish, placed, power
 
 DB = Band("float32", np.nan, "dB", "power of the focused scene, 10 log10", "AVERAGE")
@@ -39,8 +39,8 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
-    with whole(path) as draft, rasterio.Env(**GDAL):
-        linear = draft.with_name("power.tif")
+    with replacement(path) as temporary, rasterio.Env(**GDAL):
+        linear = temporary.with_name("power.tif")
         fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {})
         levels = max(0, int(np.ceil(np.log2(max(image.shape) / BLOCK))))
         with rasterio.open(linear, "r+") as raster:
@@ -50,13 +50,13 @@ def write_db(
             with rasterio.open(linear, **({"OVERVIEW_LEVEL": level - 1} if level else {})) as mean:
                 size = {"height": mean.height, "width": mean.width}
                 fill(
-                    draft.with_name("source.tif" + level * ".ovr"),
+                    temporary.with_name("source.tif" + level * ".ovr"),
                     partial(_read_decibels, mean),
                     DB,
                     size if level else place,
                     {} if level else described(tags, title),
                 )
-        finish(draft.with_name("source.tif"), draft, DB)
+        finish(temporary.with_name("source.tif"), temporary, DB)
 
 
 def _read_decibels(mean: rasterio.DatasetReader, block: Block) -> Pixels:

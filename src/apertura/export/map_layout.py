@@ -1,4 +1,4 @@
-"""The paper a quicklook is drawn on: metric axes, scale bar, north arrow, colour bar and words around a picture."""
+"""The layout of a quicklook: metric axes, scale bar, north arrow, colour bar and words around a picture."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 DPI = 150
-LONGER_SIDE = 6.4  # of the picture on paper, inch
+LONGER_SIDE = 6.4  # of the picture, inch
 PICTURE_DOTS = floor(LONGER_SIDE * DPI)
 LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the picture, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # room kept for words and colour bar beside a narrow or flat picture, inch
@@ -24,8 +24,8 @@ Marker = tuple[float, float, str]
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """A figure with a picture in true proportions; lengths on paper in inches from the lower left corner.
+class MapLayout:
+    """A figure with a picture in true proportions; lengths on the figure in inches from the lower left corner.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class Sheet:
     inch_per_m: float
 
     @classmethod
-    def for_bounds(cls, bounds: tuple[float, float, float, float]) -> "Sheet":
-        """Return an empty sheet on which the longer side of `bounds` is `LONGER_SIDE`."""
+    def for_bounds(cls, bounds: tuple[float, float, float, float]) -> "MapLayout":
+        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`."""
         west, south, east, north = bounds
         scale = LONGER_SIDE / max(east - west, north - south)
         wide, high = (east - west) * scale, (north - south) * scale

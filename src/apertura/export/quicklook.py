@@ -11,10 +11,10 @@ from pyproj import CRS
 from rasterio import Affine
 from rasterio.transform import array_bounds
 
-from apertura.atomic import whole
+from apertura.atomic import replacement
 from apertura.export.cog import READ, Raster, placed, power
 from apertura.export.db import decibels
-from apertura.export.map_layout import DPI, PICTURE_DOTS, Marker, Sheet
+from apertura.export.map_layout import DPI, PICTURE_DOTS, MapLayout, Marker
 
 
 def write_quicklook(
@@ -31,7 +31,7 @@ def write_quicklook(
 ) -> None:
     """Draw power in dB relative to the peak as a PNG that a person can read without a GIS.
 
-    An image of more pixels than the paper has dots is shrunk by averaging power, so that no target
+    An image of more pixels than the picture has dots is shrunk by averaging power, so that no target
     falls between the samples. The colours span `dynamic_range_db` downwards from the peak, or, where
     no more than three dots lie within 20 dB of the peak, from the fourth rounded up to 5 dB, so that
     a glitch does not blacken the scene.
@@ -39,7 +39,7 @@ def write_quicklook(
     Parameters
     ----------
     path
-        ``….png``; whole or absent.
+        ``….png``; complete or absent.
     image
         (y, x) complex64, north-up, NaN (left white) where nothing was formed; read block by block.
     transform, crs
@@ -69,12 +69,12 @@ def write_quicklook(
     """
     placed(image, transform, crs)
     mean, factor = shrink(image, PICTURE_DOTS)
-    decibel, top_db = _below_peak(mean)
+    decibel, top_db = below_peak(mean)
     rows, columns = (factor * size for size in mean.shape)  # the last groups may reach beyond the image
     north, west = transform.f, transform.c
     with matplotlib.style.context("default"):
-        sheet = Sheet.for_bounds(array_bounds(*image.shape, transform))
-        picture = sheet.axes.imshow(
+        layout = MapLayout.for_bounds(array_bounds(*image.shape, transform))
+        picture = layout.axes.imshow(
             np.ma.masked_invalid(decibel),
             extent=(west, west + columns * transform.a, north + rows * transform.e, north),
             cmap="inferno",
@@ -82,16 +82,18 @@ def write_quicklook(
             vmax=top_db,
             interpolation="nearest",
         )
-        sheet.draw_frame(_crs_name(crs))
+        layout.draw_frame(_crs_name(crs))
         averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
-        sheet.draw_colour_bar(picture, f"power re peak, dB{averaged}")
-        sheet.draw_scale_and_north()
-        sheet.draw_markers(markers)
+        layout.draw_colour_bar(picture, f"power re peak, dB{averaged}")
+        layout.draw_scale_and_north()
+        layout.draw_markers(markers)
         if not np.isfinite(decibel).any():
-            sheet.axes.text(0.5, 0.5, "no power in any pixel", transform=sheet.axes.transAxes, ha="center", va="center")
-        sheet.write_words(title, subtitle, _footer(tags))
-        with whole(path) as draft:
-            sheet.figure.savefig(draft, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+            layout.axes.text(
+                0.5, 0.5, "no power in any pixel", transform=layout.axes.transAxes, ha="center", va="center"
+            )
+        layout.write_words(title, subtitle, _footer(tags))
+        with replacement(path) as temporary:
+            layout.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
 
 
 def _crs_name(crs: str) -> str:
@@ -150,8 +152,30 @@ def _mean_of_groups(linear: NDArray[np.float32], factor: int) -> NDArray[np.floa
     return np.where(valid, np.nansum(groups, axis=(1, 3)) / np.maximum(valid, 1), np.nan)
 
 
-def _below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return dB relative to the peak, and the level at which the colours end."""
+def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return power relative to its peak, and the level at which the colours end.
+
+    Parameters
+    ----------
+    mean
+        (rows, columns) float64 power, NaN where nothing was formed.
+
+    Returns
+    -------
+    decibel
+        (rows, columns) float64 dB, NaN without power.
+    top_db
+        0, or less where only a glitch is brighter.
+
+    Notes
+    -----
+    Source: docs/theory/export.md, "Where the colours of a quicklook end".
+
+    Examples
+    --------
+    >>> below_peak(np.array([[1.0, 0.5], [0.25, 0.125]]))[1]
+    0.0
+    """
     decibel = decibels(mean)
     brightest = np.sort(decibel[np.isfinite(decibel)])[-4:]
     if not brightest.size:

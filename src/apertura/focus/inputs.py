@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.geometry.aperture import Aperture
+
 
 @dataclass(frozen=True)
-class Spectra:
+class PhaseHistory:
     """Calibrated transfer functions, as `reference` sums them.
 
     Attributes
@@ -20,25 +22,27 @@ class Spectra:
         (subcarrier,) float64, window over the subcarriers.
     reference_delay_s
         (pulse,) float64, delay already removed from `transfer`.
-    tx_position_m, rx_position_m
-        (pulse, 3) float64, phase centres in the frame of the pixels.
+    aperture
+        Phase centres in the frame of the pixels.
     """
 
     transfer: NDArray[np.complex64]
     frequency_hz: NDArray[np.float64]
     weight: NDArray[np.float64]
     reference_delay_s: NDArray[np.float64]
-    tx_position_m: NDArray[np.float64]
-    rx_position_m: NDArray[np.float64]
+    aperture: Aperture
 
-    def of_pulses(self, part: slice) -> "Spectra":
-        """Return the spectra of some pulses, as views."""
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.transfer)
+
+    def __getitem__(self, pulses: slice) -> "PhaseHistory":
+        """Return the phase history of some pulses, as views."""
         return replace(
             self,
-            transfer=self.transfer[part],
-            reference_delay_s=self.reference_delay_s[part],
-            tx_position_m=self.tx_position_m[part],
-            rx_position_m=self.rx_position_m[part],
+            transfer=self.transfer[pulses],
+            reference_delay_s=self.reference_delay_s[pulses],
+            aperture=self.aperture[pulses],
         )
 
 
@@ -62,8 +66,8 @@ class Profiles:
         f_mid.
     oversampling
         Nyquist cells per sample inverted: (c/B)/step_m.
-    tx_position_m, rx_position_m
-        (pulse, 3) float64, phase centres in the frame of the pixels.
+    aperture
+        Phase centres in the frame of the pixels.
     """
 
     samples: NDArray[np.complex64]
@@ -71,15 +75,17 @@ class Profiles:
     step_m: float
     centre_frequency_hz: float
     oversampling: float
-    tx_position_m: NDArray[np.float64]
-    rx_position_m: NDArray[np.float64]
+    aperture: Aperture
 
-    def of_pulses(self, part: slice) -> "Profiles":
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.samples)
+
+    def __getitem__(self, pulses: slice) -> "Profiles":
         """Return the profiles of some pulses, as views; images of pulse blocks add up to the image of all."""
         return replace(
             self,
-            samples=self.samples[part],
-            start_m=self.start_m[part],
-            tx_position_m=self.tx_position_m[part],
-            rx_position_m=self.rx_position_m[part],
+            samples=self.samples[pulses],
+            start_m=self.start_m[pulses],
+            aperture=self.aperture[pulses],
         )

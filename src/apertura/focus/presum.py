@@ -13,6 +13,10 @@ from scipy import sparse
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
+
+PRESUM_S = 8.0e-8
+"""Seconds per pulse and range sample, on one core."""
 
 _HALF_TAPS = 10
 _KAISER_BETA = 10.0
@@ -79,37 +83,32 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     return Presum(factor, at, weight)
 
 
-def presum_error_db(
-    presum: Presum,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    place_m: NDArray[np.float64],
-    *,
-    highest_hz: float,
-) -> float:
+def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.float64], *, highest_hz: float) -> float:
     """Return the RMS error of interpolating what pixels read, over all pulses and a net of places, dB.
 
     Parameters
     ----------
     presum
         From `design`.
-    tx_m, rx_m
-        (pulse, 3) float64, metres.
+    aperture
+        Of all pulses.
     place_m
         (place, 3) float64, metres: a net over the scene, its middle at the middle of the array.
     highest_hz
         Upper edge of the band, where phases turn fastest.
     """
     k = 2 * np.pi * highest_hz / SPEED_OF_LIGHT_M_S
-    real = _apart(tx_m, rx_m, place_m)
-    virtual = _apart(_positions(tx_m, presum.at), _positions(rx_m, presum.at), place_m)
+    real, virtual = (_against_middle(one.path(place_m)) for one in (aperture, _virtual(aperture, presum)))
     read = presum.weight.T @ np.exp(1j * k * virtual)
     return float(10 * np.log10((np.abs(read - np.exp(1j * k * real)) ** 2).mean() + 1e-16))
 
 
-def _apart(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    path = sum(np.linalg.norm(place_m - antenna[:, None], axis=-1) for antenna in (tx_m, rx_m))
-    return np.asarray(path - path[:, [len(place_m) // 2]])
+def _against_middle(path_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(path_m - path_m[:, [path_m.shape[1] // 2]])
+
+
+def _virtual(aperture: Aperture, presum: Presum) -> Aperture:
+    return Aperture(*(_positions(leg, presum.at) for leg in aperture.legs))
 
 
 def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,7 +122,7 @@ def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDAr
     return np.asarray(found + np.minimum(at, 0)[:, None] * slopes[0] + np.maximum(at - last, 0)[:, None] * slopes[1])
 
 
-def thin(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:
+def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:
     """Return profiles of the virtual pulses, whose image has the same sum.
 
     Parameters
@@ -140,9 +139,8 @@ def thin(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> P
     Source: docs/theory/planner.md, "Pulses".
     """
     k = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-    real = _path(profiles.tx_position_m, profiles.rx_position_m, middle_m)
-    tx_m, rx_m = (_positions(p, presum.at) for p in (profiles.tx_position_m, profiles.rx_position_m))
-    virtual = _path(tx_m, rx_m, middle_m)
+    aperture = _virtual(profiles.aperture, presum)
+    real, virtual = profiles.aperture.path(middle_m), aperture.path(middle_m)
     begin = profiles.start_m - real
     first, last = begin.min(), begin.max()
     count = profiles.samples.shape[1] + int(np.ceil((last - first) / profiles.step_m))
@@ -156,13 +154,8 @@ def thin(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> P
         profiles.step_m,
         profiles.centre_frequency_hz,
         profiles.oversampling,
-        tx_m,
-        rx_m,
+        aperture,
     )
-
-
-def _path(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(sum(np.linalg.norm(place_m - antenna, axis=-1) for antenna in (tx_m, rx_m)))
 
 
 def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: int) -> NDArray[np.complex64]:

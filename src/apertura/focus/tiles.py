@@ -1,125 +1,149 @@
-"""An image formed tile by tile: each tile on its own, in any order, by any number of threads."""
+"""An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import numpy as np
-from dask.base import compute
-from dask.delayed import delayed
-from dask.diagnostics.progress import ProgressBar
 from numpy.typing import NDArray
 
+from apertura.antenna.beam import Beams
 from apertura.contracts import Window
+from apertura.focus.engines import load_engine
+from apertura.focus.engines.engine import Setting
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.presum import Presum, presummed
 from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import Terrain
 
-Former = Callable[[NDArray[np.float64]], NDArray[np.complex64]]
-"""Pixels (y, x, 3) → (y, x) complex64; releases the GIL."""
+if TYPE_CHECKING:
+    from dask.array.core import Array
 
 
-def form_tiles(
-    form: Former,
+def image_array(
+    inputs: PhaseHistory | Profiles,
+    setting: Setting,
     grid: SceneGrid,
-    windows: Iterable[Window],
+    terrain: Terrain,
     *,
-    write: Callable[[Window, NDArray[np.complex64]], None],
-    threads: int,
-    heights: Callable[[Window], NDArray[np.float64]] | None = None,
-    seconds_between_reports: float = 0.1,
-) -> None:
-    """Form each window of `grid` and write it as soon as it is done.
+    side_px: int,
+    beams: Beams | None = None,
+    presum: tuple[Presum, NDArray[np.float64]] | None = None,
+) -> "Array":
+    """Return an image, the mean over the pulses, as a dask array whose chunks are square tiles.
+
+    Tables are prepared once per block of pulses and shared by all tiles; with several blocks each one's tables are
+    prepared when the tiles of the block before are done, so that one block's tables are held at a time. A tile is the
+    same to the bit whichever others are computed, in whatever order, by threads, processes or a cluster.
 
     Parameters
     ----------
-    form
-        What a tile's pixels hold.
-    grid
-        The whole scene.
+    inputs
+        What the setting's engine reads.
+    setting
+        Engine, options, and into how many blocks pulses are split.
+    grid, terrain
+        The scene; pixels lie on the terrain.
+    side_px
+        Of a tile, a multiple of 16 pixels.
+    beams
+        Weight of each pulse at each pixel by its antennas; none by default.
+    presum
+        Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
+
+    Returns
+    -------
+    dask.array.Array
+        (row, column) complex64; 1 is the amplitude of an echo seen by every pulse.
+    """
+    from dask.array.core import Array
+
+    prepare = partial(_prepare, setting, presum)
+    count, pulses = np.float32(len(inputs)), len(inputs) if presum is None else len(presum[0].at)
+    ends = [number * pulses // setting.pulse_blocks for number in range(setting.pulse_blocks + 1)]
+    name = f"image-{uuid4().hex}"
+    graph: dict[Any, Any] = {f"{name}-inputs": inputs}
+    before: list[Any] = []  # what must be done before the next block's tables are prepared
+    for number, block in enumerate(slice(*pair) for pair in pairwise(ends)):
+        tables, last = f"{name}-tables-{number}", block.stop == pulses
+        graph[tables] = (partial(prepare, block), f"{name}-inputs", before)
+        before = []
+        for rows, columns in grid.tiles(side_px):
+            place = (rows.start // side_px, columns.start // side_px)
+            form = partial(_form, setting, grid[rows, columns], terrain, beams and beams[block], count)
+            sum_before = (f"{name}-{number - 1}", *place) if number else None
+            key = (name if last else f"{name}-{number}", *place)
+            graph[key] = (form, tables, sum_before)
+            graph[f"{name}-done-{number}", *place] = (_nothing, key)
+            before.append((f"{name}-done-{number}", *place))
+    chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
+    return Array(graph, name, chunks, dtype=np.complex64)
+
+
+def _prepare(
+    setting: Setting,
+    presum: tuple[Presum, NDArray[np.float64]] | None,
+    block: slice,
+    inputs: PhaseHistory | Profiles,
+    _before: list[None],
+) -> Any:
+    """Return what all tiles share of a block of pulses."""
+    if presum is not None and isinstance(inputs, Profiles):
+        inputs = presummed(inputs, *presum)
+    return load_engine(setting.engine).prepare(inputs[block], **setting.options)
+
+
+def _form(  # noqa: PLR0917
+    setting: Setting,
+    grid: SceneGrid,
+    terrain: Terrain,
+    beams: Beams | None,
+    count: np.float32,
+    tables: Any,
+    sum_before: NDArray[np.complex64] | None,
+) -> NDArray[np.complex64]:
+    """Return one tile of the image of a block of pulses, added to that of the blocks before."""
+    image = load_engine(setting.engine).form(tables, terrain.positions(grid), beams=beams, **setting.form_options)
+    tile = np.asarray(image / count, np.complex64)
+    return tile if sum_before is None else sum_before + tile
+
+
+def _nothing(_done: Any) -> None:
+    """Return None once a tile is done."""
+
+
+def compute_tiles(
+    image: "Array", windows: Sequence[Window], target: Any, *, threads: int, seconds_between_reports: float = 0.1
+) -> None:
+    """Compute some tiles of an image and write each as soon as it is done.
+
+    Parameters
+    ----------
+    image
+        From `image_array`.
     windows
-        Tiles still to be formed.
-    write
-        Takes each finished tile; called from several threads, for windows that do not overlap.
+        Tiles to compute: windows of chunks of the array.
+    target
+        (y, x) array that takes blocks: numpy or zarr.
     threads
         How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
-    heights
-        Gives the pixel heights (m) of a window, from several threads; flat ground at `grid.height_m` if None.
     seconds_between_reports
         How often the progress bar is redrawn.
 
     Examples
     --------
-    >>> grid = SceneGrid("local", 0.0, 4.0, 1.0, (4, 6), 0.0)
-    >>> image = np.zeros(grid.shape, np.complex64)
-    >>> form_tiles(lambda pixels: pixels[..., 0], grid, grid.tiles(4), write=image.__setitem__, threads=2)
+    >>> import dask.array
+    >>> target = np.zeros((4, 6))
+    >>> compute_tiles(dask.array.ones((4, 6), chunks=2), [(slice(0, 2), slice(4, 6))], target, threads=1)
     [...
-    >>> image[0].real
-    array([0.5, 1.5, 2.5, 3.5, 4.5, 5.5], dtype=float32)
+    >>> target.sum()
+    np.float64(4.0)
     """
+    from dask.array.core import store
+    from dask.diagnostics.progress import ProgressBar
 
-    def work(window: Window) -> None:
-        height_m = None if heights is None else heights(window)
-        write(window, np.asarray(form(grid[window].positions(height_m)), np.complex64))
-
-    tasks: list[Any] = [delayed(work)(window) for window in windows]
+    parts = [image[window] for window in windows]
     with ProgressBar(dt=seconds_between_reports):
-        compute(*tasks, scheduler="threads", num_workers=threads)
-
-
-def form_blocks(
-    former: Callable[[slice], Former],
-    pulses: int,
-    grid: SceneGrid,
-    windows: Iterable[Window],
-    *,
-    blocks: int,
-    write: Callable[[Window, NDArray[np.complex64]], None],
-    scratch: Path,
-    **how: Any,
-) -> None:
-    """Form each window as the sum of its images from blocks of pulses, so that one block's tables are held at a time.
-
-    Sums over blocks are complex64 in a file without a name; windows are written with the last block, those of a run
-    that was killed before are formed anew.
-
-    Parameters
-    ----------
-    former
-        Pulses of a block → what its tiles hold; called when the one before is done with.
-    pulses
-        How many there are in all.
-    grid, windows, write
-        As `form_tiles`.
-    blocks
-        How many; of equal size but for one pulse.
-    scratch
-        Folder on a disk with 8 bytes to spare per pixel.
-    how
-        Other keywords of `form_tiles`.
-
-    Examples
-    --------
-    >>> grid = SceneGrid("local", 0.0, 4.0, 1.0, (4, 6), 0.0)
-    >>> image = np.zeros(grid.shape, np.complex64)
-    >>> count = lambda part: lambda pixels: np.full(pixels.shape[:2], part.stop - part.start, np.complex64)
-    >>> form_blocks(count, 7, grid, grid.tiles(4), blocks=3, write=image.__setitem__, scratch=Path(), threads=1)
-    [...
-    >>> image.real.min(), image.real.max()
-    (np.float32(7.0), np.float32(7.0))
-    """
-    windows = list(windows)
-    edges = [number * pulses // blocks for number in range(blocks + 1)]
-    *early, last = (slice(*pair) for pair in pairwise(edges))
-    if not early:
-        return form_tiles(former(last), grid, windows, write=write, **how)
-    with TemporaryFile(dir=scratch) as file:
-        total = np.memmap(file, np.complex64, "w+", shape=grid.shape)
-
-        def add(window: Window, part: NDArray[np.complex64]) -> None:
-            total[window] += part
-
-        for block in early:
-            form_tiles(former(block), grid, windows, write=add, **how)
-        form_tiles(former(last), grid, windows, write=lambda window, part: write(window, total[window] + part), **how)
-    return None
+        store(parts, [target] * len(parts), regions=list(windows), lock=False, scheduler="threads", num_workers=threads)

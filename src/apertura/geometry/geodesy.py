@@ -6,13 +6,16 @@ Positions are computed in ECEF (EPSG:4978) float64: no zone, no scale factor, no
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 
 from apertura.errors import CampaignError
 
 ECEF = "EPSG:4978"
 GEODETIC = "EPSG:4979"
+
+LOCAL = "local"
+"""CRS of a frame without a place on Earth: x east, y north, z up, metres."""
 
 Positions = NDArray[np.float64]
 
@@ -93,6 +96,45 @@ def projected_from_ecef(crs: str, position: Positions) -> Positions:
     return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
 
 
+def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) -> Positions:
+    """Return (..., 3) float64 positions (m) in the processing frame: ECEF, or the local axes themselves.
+
+    Parameters
+    ----------
+    crs
+        As `ecef_from_projected`, or 'local'.
+    x, y
+        (...,) float64, metres, easting and northing.
+    height_m
+        (...,) float64, metres above the ellipsoid, or z of the local frame.
+
+    Raises
+    ------
+    CampaignError
+        As `ecef_from_projected`.
+
+    Examples
+    --------
+    >>> frame_from_map("local", [1.0, 2.0], 5.0, 0.5)
+    array([[1. , 5. , 0.5],
+           [2. , 5. , 0.5]])
+    """
+    places = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, height_m)))
+    return np.stack(places, axis=-1) if crs == LOCAL else ecef_from_projected(crs, *places)
+
+
+def map_from_frame(crs: str, position: Positions) -> Positions:
+    """Return (..., 3) float64 easting, northing and height (m) of positions (..., 3) in the processing frame.
+
+    Examples
+    --------
+    >>> place = frame_from_map("EPSG:32632", 500000.0, 5300000.0, 700.0)
+    >>> map_from_frame("EPSG:32632", place).round(6)
+    array([5.0e+05, 5.3e+06, 7.0e+02])
+    """
+    return position if crs == LOCAL else projected_from_ecef(crs, position)
+
+
 @lru_cache(maxsize=64)
 def _transformer(source: str, target: str) -> Transformer:
     """Return PROJ's way between two systems, kept: it takes milliseconds to find."""
@@ -146,7 +188,7 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     >>> (body_axes(np.radians([0.0, 0.0, 90.0])) @ [1.0, 0.0, 0.0]).round(12) + 0.0  # nose east
     array([0., 1., 0.])
     """
-    from scipy.spatial.transform import Rotation  # a tenth of a second that most steps need not pay
+    from scipy.spatial.transform import Rotation  # slow to import, and most steps turn no body
 
     flat = np.reshape(attitude_rad, (-1, 3))
     matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()

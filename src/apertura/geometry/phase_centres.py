@@ -53,7 +53,8 @@ def phase_centres(
 
     Notes
     -----
-    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED.
+    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
+    (DESIGN section 3).
     """
     _check_covered(track_time, at, where)
     centres = _spline(track_time, position)(_seconds(at - track_time[0]))
@@ -93,7 +94,7 @@ def attitude_axes(
 
 
 def _spline(track_time: NDArray[np.datetime64], position: NDArray[np.float64]) -> "BSpline":
-    from scipy.interpolate import make_interp_spline  # a third of a second that most steps need not pay
+    from scipy.interpolate import make_interp_spline  # slow to import, and most steps only read finished positions
 
     return make_interp_spline(_seconds(track_time - track_time[0]), position, k=min(3, len(track_time) - 1))
 

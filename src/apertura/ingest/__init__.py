@@ -3,10 +3,10 @@
 Rows name their readers and do not import them: a step pays for the formats that it meets.
 """
 
+import pkgutil
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from apertura.errors import CampaignError
 
@@ -37,7 +37,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
         In the order of a row of `RECORDERS`.
     """
     row = next(row for row in RECORDERS if all(file.name.endswith(end) for file, end in zip(files, row, strict=True)))
-    opened: Recording = _function(RECORDERS[row])(*files)
+    opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
     return opened
 
 
@@ -56,16 +56,11 @@ def read_track(path: Path, *, node: str) -> "xr.Dataset":
             expected=f"one of {sorted(TRACKS)}",
             remedy="Convert the log, or write a reader for it.",
         )
-    track: xr.Dataset = _function(TRACKS[path.suffix])(path, node=node)
+    track: xr.Dataset = pkgutil.resolve_name(TRACKS[path.suffix])(path, node=node)
     return track
 
 
 def read_phase_history(kind: str, paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     """Return the `echo` stage of phase-history files; `kind` is a key of `PHASE_HISTORIES`."""
-    echo: xr.Dataset = _function(PHASE_HISTORIES[kind][1])(paths, pair=pair)
+    echo: xr.Dataset = pkgutil.resolve_name(PHASE_HISTORIES[kind][1])(paths, pair=pair)
     return echo
-
-
-def _function(name: str) -> Any:
-    module, _, function = name.partition(":")
-    return getattr(import_module(module), function)

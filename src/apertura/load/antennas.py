@@ -12,12 +12,13 @@ from apertura.antenna.illumination import Illumination, illuminate
 from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, sampled_cut
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
 from apertura.ingest.beam_pattern import read_beam_pattern
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import OpenScene
 from apertura.settings import Antenna
 
 _STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
-_NET = 33
+_POINTS = 33
 
 
 def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
@@ -67,10 +68,10 @@ def lit(
     campaign: Campaign,
     pair: str,
     beams: Beams | None,
-    grid: SceneGrid,
-    places: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> dict[str, Any]:
-    """Return beams and illumination as the planner's job takes them, nothing without beams.
+    scene: OpenScene,
+    aperture: Aperture,
+) -> Illumination | None:
+    """Return how many pulses see each point of the scene; None without beams.
 
     Parameters
     ----------
@@ -78,10 +79,10 @@ def lit(
         Which.
     beams
         Of the pair.
-    grid
+    scene
         The campaign's.
-    places
-        Phase centres of transmitter and receiver, (pulse, 3) float64 metres.
+    aperture
+        Of the pair.
 
     Raises
     ------
@@ -89,13 +90,12 @@ def lit(
         If no pulse sees anything of the scene.
     """
     if beams is None:
-        return {}
-    rows, columns = (np.linspace(0, size - 1, min(size, _NET)) for size in grid.shape)
-    net = grid.positions_at(*np.meshgrid(rows, columns, indexing="ij"))
-    illumination = illuminate(beams, *places, net.reshape(-1, 3))
+        return None
+    points = scene.grid.sample_points(_POINTS, scene.level.height_m)
+    illumination = illuminate(beams, aperture, points.reshape(-1, 3))
     if illumination.unseen == 1:
-        _refuse(campaign, pair, beams, net[len(rows) // 2, len(columns) // 2], places)
-    return {"beams": beams, "illumination": illumination}
+        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
+    return illumination
 
 
 def _refuse(
@@ -103,12 +103,12 @@ def _refuse(
     pair: str,
     beams: Beams,
     middle_m: NDArray[np.float64],
-    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    aperture: Aperture,
 ) -> None:
     """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
     stated = campaign.antennas(pair)
     keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
-    legs = {"radar_tx": (beams.transmit, places[0]), "radar_rx": (beams.receive, places[1])}
+    legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
     for point, (node, _) in stated.items():
         beam, place = legs[point]
         if beam is None:

@@ -1,4 +1,4 @@
-"""What is known of a pair before and after its echo is formed: from the echo, or from what the flight logs promise."""
+"""A pair, opened once: from its echo, or before that is formed from what the flight logs promise."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,53 +12,53 @@ from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import window_weights
 from apertura.echo.demodulate import subcarrier_numbers
-from apertura.focus.inputs import Spectra
+from apertura.focus.inputs import PhaseHistory
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
+from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
-from apertura.load.inputs import spectra_of
-from apertura.scene.grid import SceneGrid
+from apertura.load.scene import Flown
 from apertura.settings import OfdmWaveform
-from apertura.steps.scene import PATH, scene_grid, settle
 from apertura.store import manifest_of, open_stage
 
 
-@dataclass(frozen=True)
-class Outlook:
-    """What is known of a pair's echo before it is formed, or after.
+@dataclass(frozen=True, eq=False)
+class OpenPair:
+    """What is known of a pair.
 
     Attributes
     ----------
-    tx, rx
-        (pulse, 3) float64, phase centres, metres.
+    flight, name
+        Which: the name is transmitter-receiver.
+    aperture
+        Phase centres.
     frequency_hz, weight
         (subcarrier,) float64, RF frequency and window.
     path_limit_m
         Longest total path inside the cyclic prefix.
-    spectra
+    history
         The echo itself; None before it is formed.
     beams
         Of the antennas; None where they look everywhere alike.
     """
 
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
+    flight: str
+    name: str
+    aperture: Aperture
     frequency_hz: NDArray[np.float64]
     weight: NDArray[np.float64]
     path_limit_m: float
-    spectra: Spectra | None = None
+    history: PhaseHistory | None = None
     beams: Beams | None = None
 
-
-def campaign_grid(campaign: Campaign, outlook: Outlook) -> SceneGrid:
-    """Return the campaign's grid, settled or as it will be."""
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
-        return scene_grid(campaign)
-    return settle(asked, outlook.tx, outlook.rx, outlook.frequency_hz, outlook.path_limit_m, root=campaign.root)[0]
+    @property
+    def flown(self) -> Flown:
+        """What `auto` settles the grid from."""
+        return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
 
 
-def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> Outlook:
+def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> OpenPair:
     """Return what is known of a pair: `echo`, its stage as far as it is formed, or what the logs promise."""
     waveform = campaign.settings.waveform
     if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
@@ -68,13 +68,13 @@ def outlook_of(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset |
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
         echo = read_phase_history(waveform.format, files, pair=pair)
-    spectra = spectra_of(echo, campaign.settings.processing.window)
+    history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
-    places, beams = (spectra.tx_position_m, spectra.rx_position_m), beams_of(campaign, pair, body_axes(echo))
-    return Outlook(*places, spectra.frequency_hz, spectra.weight, limit_m, spectra, beams)
+    beams = beams_of(campaign, pair, body_axes(echo))
+    return OpenPair(flight, pair, history.aperture, history.frequency_hz, history.weight, limit_m, history, beams)
 
 
-def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> Outlook:
+def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
     """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
     tx, rx = pair.split("-")
     logs = {node: campaign.track_file(flight, node) for node in (tx, rx)}
@@ -96,7 +96,8 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
     weight = window_weights(campaign.settings.processing.window, len(frequency))
     limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
-    return Outlook(places[0], places[1], frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
+    aperture = Aperture(places[0], places[1])
+    return OpenPair(flight, pair, aperture, frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
 
 
 def _pulse_times(

@@ -1,85 +1,59 @@
-"""Edges of imaging: what a campaign may not do, and what it may but should be told about."""
+"""Limits of imaging: what a job may not do, and what it may but a person should be told about."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.planning.view import phase_rates, upward
+from apertura.focus.job import Job
+from apertura.geometry.aperture import Aperture
 
 
-def crossed_edges(
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    net_m: NDArray[np.float64],
-    *,
-    spacing_m: float,
-    band_hz: tuple[float, float],
-    path_limit_m: float = np.inf,
-    lowest_m: float | None = None,
-) -> dict[str, str]:
-    """Return flags: name → what was found, in one line.
+def check_geometry(job: Job) -> dict[str, str]:
+    """Return flags: limit of imaging that the job exceeds → what was found, in one line.
 
     Parameters
     ----------
-    tx_m, rx_m
-        (pulse, 3) float64, phase centres, metres.
-    net_m
-        (row, column, 3) float64, metres: places evenly spread over the scene; rows go south, columns east.
-    spacing_m
-        Of the pixels.
-    band_hz
-        Lowest and highest frequency.
-    path_limit_m
-        Longest total path inside the cyclic prefix.
-    lowest_m
-        Lowest height of a DEM over the net, metres: a platform beside it may be lower. None: the ground is flat.
+    job
+        What is to be imaged.
 
     Raises
     ------
     CampaignError
-        If there is no pulse, a position is not finite, a platform is at or below flat ground, or no echo of the scene
-        arrives inside the prefix.
+        If there is no pulse, a position is not finite, or no echo of the scene arrives inside the prefix.
     """
-    _check_finite(tx_m, rx_m)
-    place_m, up = net_m.reshape(-1, 3), upward(net_m)
-    flags = {}
-    platforms = ((tx_m, "transmitter"), (rx_m, "receiver"))
-    for position, which in platforms:
-        height = (position - net_m[0, 0]) @ up
-        if lowest_m is None:
-            _check_above(height, which)
-        elif height.min() <= lowest_m:
-            flags["platform_below_scene"] = (
-                f"the {which} is {lowest_m - height.min():.1f} m below the lowest ground of the scene: check the unit "
-                f"and the datum of the DEM, unless the radar looks up a hillside"
-            )
-    inside = [_over(position, net_m, up, spacing_m) for position, _ in platforms]
-    over = int((inside[0] | inside[1]).sum())
-    if over:
+    aperture, ground_m = job.aperture, job.ground_m
+    _check_finite(aperture)
+    up = vertical(ground_m)
+    flags: dict[str, str] = {}
+    over = np.zeros(len(aperture), bool)
+    for leg in aperture.legs:
+        over |= _over(leg, ground_m, up, job.spacing_m)
+    if over.any():
         flags["platform_inside_scene"] = (
-            f"{over} of {len(tx_m)} pulses are sent or received above the scene: echoes from both sides mix"
+            f"{int(over.sum())} of {len(aperture)} pulses are sent or received above the scene: echoes from both sides "
+            "mix"
         )
-    cell_m = finest_cell_m(tx_m, rx_m, net_m, band_hz=band_hz)
-    if spacing_m > cell_m:
+    cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz)
+    if job.spacing_m > cell_m:
         flags["spacing_coarse"] = (
-            f"spacing {spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
+            f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
         )
-    spread, _ = phase_rates(tx_m, rx_m, place_m, wavelength_m=SPEED_OF_LIGHT_M_S / band_hz[1])
+    spread, _ = aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
     if spread > 1:
         flags["pulses_sparse"] = f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous"
-    unseen = _unseen(tx_m, rx_m, place_m, path_limit_m)
+    unseen = _unseen(aperture, job.points_m, job.path_limit_m)
     if unseen:
         flags["places_unseen"] = f"{100 * unseen:.0f} % of the scene is seen by no pulse inside the cyclic prefix"
     return flags
 
 
-def _check_finite(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
-    if len(tx_m) == 0:
+def _check_finite(aperture: Aperture) -> None:
+    if len(aperture) == 0:
         raise CampaignError(
             "zero pulses", where="echo", expected="at least one", remedy="Check the triggers and the sidelink."
         )
-    lost = np.asarray(~np.isfinite(np.hstack([tx_m, rx_m])).all(axis=1))
+    lost = np.asarray(~np.isfinite(np.hstack(aperture.legs)).all(axis=1))
     if lost.any():
         raise CampaignError(
             f"{int(lost.sum())} of {len(lost)} phase centres are not finite, first at pulse {int(lost.argmax())}",
@@ -89,23 +63,12 @@ def _check_finite(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
         )
 
 
-def _check_above(height_m: NDArray[np.float64], which: str) -> None:
-    low = int(height_m.argmin())
-    if height_m[low] <= 0:
-        raise CampaignError(
-            f"the {which} is {height_m[low]:.2f} m above the ground at pulse {low}",
-            where="config/config.yaml: scene.height_m",
-            expected="a platform above the ground",
-            remedy="Check height_m and its datum (logs may count from the geoid), and the heights in the flight log.",
-        )
-
-
 def _over(
-    position_m: NDArray[np.float64], net_m: NDArray[np.float64], up: NDArray[np.float64], spacing_m: float
+    position_m: NDArray[np.float64], ground_m: NDArray[np.float64], up: NDArray[np.float64], spacing_m: float
 ) -> NDArray[np.bool_]:
     """Return which pulses are above the scene."""
-    corner, over = net_m[0, 0], np.ones(len(position_m), bool)
-    right, down = net_m[0, -1] - corner, net_m[-1, 0] - corner
+    corner, over = ground_m[0, 0], np.ones(len(position_m), bool)
+    right, down = ground_m[0, -1] - corner, ground_m[-1, 0] - corner
     lengths = [float(np.linalg.norm(side)) for side in (right, down)]
     if not lengths[1]:  # one row or column is as wide as a pixel
         down = np.cross(right if lengths[0] else np.eye(3)[np.abs(up).argmin()], up)
@@ -117,37 +80,10 @@ def _over(
     return over
 
 
-def finest_cell_m(
-    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], net_m: NDArray[np.float64], *, band_hz: tuple[float, float]
-) -> float:
-    """Return the finest resolution cell of the scene along rows or columns, metres.
-
-    Notes
-    -----
-    Source: docs/theory.md, eq. 8: the inverse of the widest spatial spectrum of a place.
-    """
-    place_m = net_m.reshape(-1, 3)
-    thin = slice(None, None, max(1, len(tx_m) // 64))
-    gradient = np.zeros((len(tx_m[thin]), len(place_m), 3))
-    for antenna in (tx_m, rx_m):
-        apart = place_m - antenna[thin, None]
-        gradient += apart / np.linalg.norm(apart, axis=-1, keepdims=True)
-    widest = 1e-9
-    for side in (net_m[0, -1] - net_m[0, 0], net_m[-1, 0] - net_m[0, 0]):
-        slope = gradient @ side / max(float(np.linalg.norm(side)), 1e-9)
-        cycles = np.concatenate([slope * frequency / SPEED_OF_LIGHT_M_S for frequency in band_hz])
-        widest = max(widest, float(np.ptp(cycles, axis=0).max()))
-    return 1 / widest
-
-
-def _unseen(
-    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], place_m: NDArray[np.float64], path_limit_m: float
-) -> float:
+def _unseen(aperture: Aperture, points_m: NDArray[np.float64], path_limit_m: float) -> float:
     if not np.isfinite(path_limit_m):
         return 0.0
-    thin = slice(None, None, max(1, len(tx_m) // 256))
-    legs = [np.linalg.norm(place_m - antenna[thin, None], axis=-1) for antenna in (tx_m, rx_m)]
-    shortest = np.asarray(legs[0] + legs[1]).min(axis=0)
+    shortest = aperture[aperture.sample(256)].path(points_m).min(axis=0)
     beyond = shortest > path_limit_m
     if beyond.all():
         raise CampaignError(
@@ -158,3 +94,19 @@ def _unseen(
             "scene.height_m, or unit and datum of scene.dem.",
         )
     return float(beyond.mean())
+
+
+def vertical(ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit normal of ground points (row, column, 3) whose rows go south and columns east.
+
+    Examples
+    --------
+    >>> east, south = np.meshgrid(np.arange(3.0), np.arange(2.0))
+    >>> vertical(np.stack([east, -south, 0 * east], -1))
+    array([0., 0., 1.])
+    """
+    if min(ground_m.shape[:2]) < 2:
+        first = ground_m[0, 0]
+        return np.asarray(first / np.linalg.norm(first)) if np.linalg.norm(first) > 6e6 else np.array([0.0, 0.0, 1.0])
+    normal = np.cross(ground_m[0, -1] - ground_m[0, 0], ground_m[0, 0] - ground_m[-1, 0])
+    return np.asarray(normal / np.linalg.norm(normal))

@@ -7,24 +7,25 @@ from typing import Any
 from apertura.antenna.illumination import decide_antennas
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.focus.presum import Presum, design, presum_error_db
-from apertura.planning.candidates import Setting, power_sum_db
-from apertura.planning.checks import crossed_edges
-from apertura.planning.cost import Costs
-from apertura.planning.desk import Desk
-from apertura.planning.memory import block_decision, bytes_needed, setting_decisions, wall_seconds
-from apertura.planning.models import Decision, decide_midpoint, decide_terrain, midpoint_error_db
-from apertura.planning.plan import Job, Plan
-from apertura.planning.view import phase_rates, upward
+from apertura.focus.engines.engine import Setting, power_sum_db
+from apertura.focus.job import Job
+from apertura.focus.presum import PRESUM_S, Presum, design, presum_error_db
+from apertura.planning.checks import check_geometry
+from apertura.planning.memory import block_decision, bytes_needed
+from apertura.planning.plan import Decision, Plan
+from apertura.planning.search import Search
+from apertura.planning.terrain_model import decide_terrain
 
 MARGIN_DB = 3.0
 """Predicted errors lie this far below what is asked."""
 
-THINNING_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
+PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 
 
-def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[str, Any] | None = None) -> Plan:
-    """Choose the cheapest setting and models that meet the accuracy asked.
+def make_plan(
+    job: Job, *, accuracy_db: float, overrides: Mapping[str, Any] | None = None, where: str = "processing"
+) -> Plan:
+    """Choose the cheapest setting and models that meet the accuracy asked. The same job gives the same plan.
 
     Parameters
     ----------
@@ -32,158 +33,118 @@ def make_plan(job: Job, *, accuracy_db: float, costs: Costs, overrides: Mapping[
         What is to be imaged.
     accuracy_db
         Numerical error asked.
-    costs
-        Constants of the machine. The same job and costs give the same plan.
     overrides
-        Choice → value that a person asks for: engine, table_degree, table_oversampling, accumulate,
-        phase_tolerance_rad, pulse_thinning, pulse_blocks, midpoint, terrain. 'auto' or None leaves the choice to the
-        planner.
+        Choice → value that a person asks for: engine, engine_options (engine → option → value), presum, pulse_blocks,
+        terrain. 'auto' or None leaves the choice to the planner.
+    where
+        Section of the config that asks, for messages.
 
     Raises
     ------
     CampaignError
-        If the job holds no pulse, a platform is below the ground, or what is asked cannot run here.
+        If the job holds no pulse, or what is asked cannot run here.
 
     Notes
     -----
     Source: docs/theory/planner.md.
     """
     asked = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
-    flags = crossed_edges(
-        job.tx_position_m,
-        job.rx_position_m,
-        job.net_m,
-        spacing_m=job.spacing_m,
-        band_hz=job.band_hz,
-        path_limit_m=job.path_limit_m,
-        lowest_m=None if job.heights_m is None else float(job.heights_m.min()),
-    )
-    desk = Desk(job, job.view, costs, asked)
-    whole = desk.cheapest(len(job.tx_position_m), accuracy_db - MARGIN_DB)
-    thinning, presum, chosen = _decide_thinning(desk, whole, accuracy_db)
-    midpoint = _decide_midpoint(desk, accuracy_db)
-    terrain = _decide_terrain(desk)
-    antennas, missed = decide_antennas(job.beams, job.illumination, asked)
-    chosen = desk.fitted(chosen, presum)
-    models = [decision.error_db for decision in (thinning, midpoint) if decision.error_db is not None]
-    expected_db = power_sum_db(chosen.error_db, *models)
+    flags = check_geometry(job)
+    search = Search(job, asked.get("engine"), asked.get("engine_options", {}), asked.get("pulse_blocks"), where)
+    every_pulse = search.cheapest(len(job.aperture), accuracy_db - MARGIN_DB)
+    presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, asked.get("presum"))
+    terrain = decide_terrain(job, asked=asked.get("terrain"), where=where)
+    antennas, missed = decide_antennas(job.beams, job.illumination)
+    chosen = search.fitted(chosen, presum)
+    expected_db = power_sum_db(chosen.error_db, *([] if presumming.error_db is None else [presumming.error_db]))
     if expected_db > accuracy_db:
         flags["prediction_misses"] = (
             f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
         )
     memory, disk = bytes_needed(job, chosen, presum)
+    blocks = block_decision(chosen, job, asked="pulse_blocks" in asked)
     return Plan(
         setting=chosen,
-        better=desk.ladder(chosen.error_db, chosen.engine),
+        fallbacks=search.fallbacks(chosen),
         decisions=(
-            *setting_decisions(chosen, asked, accuracy_db),
-            thinning,
-            block_decision(chosen, job, asked="pulse_blocks" in asked),
-            midpoint,
+            *search.decisions(chosen, accuracy_db),
+            presumming,
+            blocks,
             terrain,
-            *antennas,
+            *(Decision("antenna", value, reason) for value, reason in antennas),
         ),
         predicted_error_db=expected_db + max(0.0, job.content_db or 0.0),
-        predicted_seconds=wall_seconds(chosen, job),
+        predicted_seconds=chosen.table_seconds + chosen.form_seconds / min(job.threads, job.tiles),
         memory_bytes=memory,
         disk_bytes=disk,
         flags=flags | missed,
+        terrain=job.terrain.called(str(terrain.value)),
         presum=presum,
-        midpoint=bool(midpoint.value),
-        middle_m=job.place_m[len(job.place_m) // 2],
-        tilt_m=job.tilt_m if terrain.value == "tilted_plane" else None,
-        cost_source=costs.source,
+        middle_m=job.points_m[len(job.points_m) // 2],
         illumination=job.illumination,
     )
 
 
-def _decide_thinning(desk: Desk, whole: Setting, accuracy_db: float) -> tuple[Decision, Presum | None, Setting]:
-    job, asked = desk.job, desk.asked.get("pulse_thinning")
-    tx_m, rx_m, pulses = job.tx_position_m, job.rx_position_m, len(job.tx_position_m)
-    _, widest = phase_rates(tx_m, rx_m, job.place_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
+def _decide_presum(
+    search: Search, every_pulse: Setting, accuracy_db: float, asked: int | None
+) -> tuple[Decision, Presum | None, Setting]:
+    """Return the decision, the low-pass sum over pulses, and the setting with it."""
+    job, pulses = search.job, len(search.job.aperture)
+    _, widest = job.aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
     oversampled = f"the scene's middle and its edges differ by up to {widest:.3f} cycles per pulse"
 
     def keep(why: str) -> tuple[Decision, None, Setting]:
-        return Decision("pulse_thinning", 1, f"{oversampled}; {why}"), None, whole
+        return Decision("presum", 1, f"{oversampled}; {why}"), None, every_pulse
 
     if asked == 1:
-        return keep("asked for in config/config.yaml")
+        return keep("asked for in the config")
     if job.beams is not None:
+        if asked is not None:
+            raise _no_presum(asked, search.where)
         return keep("the antennas weigh every pulse for itself")
-    if whole.engine == "reference":
+    if every_pulse.engine == "reference":
         return keep("the double sum takes every pulse")
-    limit_db = accuracy_db - MARGIN_DB - desk.content_db - 3
-    found = _presum(job, (asked,) if asked else THINNING_FACTORS, widest, limit_db)
-    if found is None and asked:
+    limit_db = accuracy_db - MARGIN_DB - search.content_db - 3
+    best = _best_presum(job, (asked,) if asked else PRESUM_FACTORS, widest, limit_db)
+    if best is None and asked:
         raise CampaignError(
-            f"pulse_thinning is {asked}",
-            where="config/config.yaml: processing.pulse_thinning",
+            f"presum is {asked}",
+            where=f"{search.where}.presum",
             expected=f"at most {0.3 / max(widest, 1e-9):.1f} pulses made one: {oversampled}",
             remedy="Use a smaller factor or auto.",
         )
-    if found is None:
+    if best is None:
         return keep(
             f"a low-pass sum of fewer pulses would err by more than {limit_db:.0f} dB, "
             f"which leaves room for tables and for what is weak in the scene"
         )
-    presum, error_db = found
-    spent = desk.costs.seconds["thin"] * pulses * job.signal.samples
-    less = desk.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
-    if not asked and spent + less.seconds > 0.9 * whole.seconds:
+    presum, error_db = best
+    spent = PRESUM_S * pulses * job.signal.samples
+    less = search.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
+    if not asked and spent + less.seconds > 0.9 * every_pulse.seconds:
         return keep(f"a low-pass sum {presum.factor}:1 costs more than it saves")
     line = f"{oversampled}; a low-pass sum makes {len(presum.at)} of {pulses} pulses"
-    chosen = replace(less, seconds=less.seconds + spent, table_seconds=less.table_seconds + spent)
-    return Decision("pulse_thinning", presum.factor, f"{line} and errs by {error_db:.1f} dB", error_db), presum, chosen
+    chosen = replace(less, table_seconds=less.table_seconds + spent)
+    return Decision("presum", presum.factor, f"{line} and errs by {error_db:.1f} dB", error_db), presum, chosen
 
 
-def _presum(job: Job, factors: tuple[int, ...], widest: float, limit_db: float) -> tuple[Presum, float] | None:
+def _no_presum(asked: int, where: str) -> CampaignError:
+    return CampaignError(
+        f"presum is {asked}, and the antennas have beams",
+        where=f"{where}.presum",
+        expected="1 or auto: every pulse is weighed by the antennas that sent and received it",
+        remedy="Leave presum to the planner, or set the nodes' antennas to null.",
+    )
+
+
+def _best_presum(job: Job, factors: tuple[int, ...], widest: float, limit_db: float) -> tuple[Presum, float] | None:
+    """Return the low-pass sum of the largest factor that errs less than the limit, and its error."""
+    pulses = len(job.aperture)
     for factor in factors:
-        presum = design(len(job.tx_position_m), factor, widest_cycles=widest, error_db=limit_db)
-        if presum is None or len(presum.at) > 0.8 * len(job.tx_position_m):
+        presum = design(pulses, factor, widest_cycles=widest, error_db=limit_db)
+        if presum is None or len(presum.at) > 0.8 * pulses:
             continue
-        error_db = presum_error_db(presum, job.tx_position_m, job.rx_position_m, job.place_m, highest_hz=job.band_hz[1])
+        error_db = presum_error_db(presum, job.aperture, job.points_m, highest_hz=job.band_hz[1])
         if error_db <= limit_db or len(factors) == 1:
             return presum, error_db
     return None
-
-
-def _decide_midpoint(desk: Desk, accuracy_db: float) -> Decision:
-    job = desk.job
-    some = slice(None, None, max(1, len(job.tx_position_m) // 256))
-    found = decide_midpoint(
-        job.tx_position_m[some],
-        job.rx_position_m[some],
-        job.place_m,
-        wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz,
-        accuracy_db=accuracy_db,
-        bistatic_costs=False,  # every engine here sums both legs, native before the pixel loop
-    )
-    asked = desk.asked.get("midpoint")
-    if asked is None or bool(asked) == found.value or found.reason.startswith("monostatic"):
-        return found
-    some_tx, some_rx = job.tx_position_m[some], job.rx_position_m[some]
-    error_db = midpoint_error_db(some_tx, some_rx, job.place_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz)
-    return Decision("midpoint", bool(asked), f"asked for in config/config.yaml; {found.reason}", error_db)
-
-
-def _decide_terrain(desk: Desk) -> Decision:
-    job = desk.job
-    found = decide_terrain(
-        job.heights_m,
-        track_m=(job.tx_position_m + job.rx_position_m) / 2,
-        place_m=job.place_m,
-        up=upward(job.net_m),
-        wavelength_m=SPEED_OF_LIGHT_M_S / job.centre_hz,
-        spacing_m=job.spacing_m,
-    )
-    asked = desk.asked.get("terrain")
-    if asked is None or asked == found.value:
-        return found
-    if job.heights_m is None:
-        raise CampaignError(
-            f"terrain is {asked}",
-            where="config/config.yaml: processing.terrain",
-            expected="plane or auto: the scene has no DEM",
-            remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
-        )
-    return Decision("terrain", asked, f"asked for in config/config.yaml; the rule says {found.value}: {found.reason}")

@@ -1,17 +1,17 @@
 """Point targets in an image: where they peak, how wide they are, what lies beside them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.quality.measures import Raster
-from apertura.scene.grid import SceneGrid
 
 PATCH_PX = 64
 
-_NET = np.linspace(-1, 1, 9)
-_PEAK_PX = 1e-4
+_REFINEMENTS = 7
+"""From one pixel to a grid of 6e-5 pixel in steps of four."""
 
 
 class Patch:
@@ -98,12 +98,46 @@ def find_peak(image: Raster, row: int, column: int) -> Peak:
     (30.3, 33.6)
     """
     patch = Patch(image, row, column)
-    at, reach = np.array([row, column], np.float64), 1.0
-    while reach > _PEAK_PX:
-        rows, columns = np.meshgrid(*(at[:, None] + reach * _NET), indexing="ij")
-        best = np.unravel_index(np.abs(patch.at(rows, columns)).argmax(), rows.shape)
-        at, reach = np.array([rows[best], columns[best]]), reach * (_NET[1] - _NET[0])
-    return Peak(float(at[0]), float(at[1]), complex(patch.at(at[0], at[1])))
+    at, _ = locate_maximum(lambda *pixels: np.abs(patch.at(*pixels)), (row, column), (1.0, 1.0), rounds=_REFINEMENTS)
+    return Peak(*at, complex(patch.at(*at)))
+
+
+def locate_maximum(
+    level: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.floating]],
+    start: tuple[float, float],
+    reach: tuple[float, float],
+    *,
+    rounds: int,
+    counts: tuple[int, int] = (9, 9),
+) -> tuple[tuple[float, float], float]:
+    """Return where a function of two coordinates is largest near a point, and its value there.
+
+    Parameters
+    ----------
+    level
+        Values at two (n, m) float64 arrays of coordinates.
+    start, reach
+        The search covers `start` ± `reach` in each coordinate.
+    rounds
+        Each searches a grid about the best point of the one before, one of its steps to each side.
+    counts
+        Points of the first grid along each coordinate; later ones have 9 × 9.
+
+    Examples
+    --------
+    >>> (x, y), top = locate_maximum(lambda x, y: 2 - (x - 0.3) ** 2 - (y + 0.1) ** 2, (0, 0), (1, 1), rounds=7)
+    >>> round(x, 3), round(y, 3), round(top, 6)
+    (0.3, -0.1, 2.0)
+    """
+    for _ in range(rounds):
+        axes = (at + np.linspace(-far, far, count) for at, far, count in zip(start, reach, counts, strict=True))
+        first, second = np.meshgrid(*axes, indexing="ij")
+        values = level(first, second)
+        best = np.unravel_index(int(values.argmax()), values.shape)
+        start, highest = (float(first[best]), float(second[best])), float(values[best])
+        reach = (2 * reach[0] / (counts[0] - 1), 2 * reach[1] / (counts[1] - 1))
+        counts = (9, 9)
+    return start, highest
 
 
 @dataclass(frozen=True)
@@ -197,9 +231,3 @@ def half_power_width(power: NDArray[np.float64], middle: int) -> float:
         k = int(below[0])
         sides.append(k - 1 + (side[k - 1] - half) / (side[k - 1] - side[k]))
     return float(sum(sides))
-
-
-def ground_position(grid: SceneGrid, peak: Peak) -> tuple[float, float]:
-    """Return easting and northing (m, in the grid's CRS) of a peak."""
-    west, _, _, north = grid.bounds_m
-    return (west + (peak.column + 0.5) * grid.spacing_m, north - (peak.row + 0.5) * grid.spacing_m)

@@ -50,9 +50,9 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     names = tuple(names) or GRIDS.get(datum, ())
     wanted = f"the undulations of {datum}" + (f", such as {' or '.join(names)}" if names else "")
     if given is None:
-        found = [folder / name for folder in _proj_folders() for name in names if (folder / name).is_file()]
-        if found:
-            return found[0]
+        paths = [folder / name for folder in grid_folders() for name in names if (folder / name).is_file()]
+        if paths:
+            return paths[0]
         raise CampaignError(
             f"heights count from {datum}, but its geoid grid is not here",
             where="config/config.yaml: scene.geoid",
@@ -71,7 +71,8 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     return given
 
 
-def _proj_folders() -> list[Path]:
+def grid_folders() -> list[Path]:
+    """Return the folders in which grids of undulations are looked for: PROJ's."""
     listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
     return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
 

@@ -1,24 +1,24 @@
-"""The scene grid as an immutable value: CRS, origin, spacing, shape, ground height; sliceable into tiles."""
+"""The scene grid as an immutable value: CRS, origin, spacing, shape; sliceable into windows. Heights come with it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from rasterio.crs import CRS
 
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_projected
+from apertura.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
+from apertura.scene.map_crs import check_crs
 from apertura.scene.pixel_positions import BLOCK_PX, block
 
-LOCAL = "local"
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """North-up pixels on the ground.
+    """North-up pixels on a map; `apertura.scene.terrain` says how high each one lies.
 
     Attributes
     ----------
@@ -30,15 +30,15 @@ class SceneGrid:
         Pixel spacing, metres.
     shape
         Rows, columns.
-    height_m
-        Ground height: ellipsoidal metres, or z of the local frame.
     first
         Row and column of pixel (0, 0) in the whole grid: a window counts from the whole grid's corner, so that its
         coordinates are the whole's to the bit.
+    name
+        What GIS software shows for a local frame.
 
     Examples
     --------
-    >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60), 10.0)
+    >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60))
     >>> grid.bounds_m
     (500000.0, 80.0, 500030.0, 100.0)
     >>> grid[0:10, 5:10].shape, float(grid[0:10, 5:10].x_m[0]) == float(grid.x_m[5])
@@ -50,12 +50,12 @@ class SceneGrid:
     north_m: float
     spacing_m: float
     shape: tuple[int, int]
-    height_m: float
     first: tuple[int, int] = (0, 0)
+    name: str = LOCAL
 
     @classmethod
     def from_bounds(
-        cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, height_m: float
+        cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, name: str = LOCAL
     ) -> "SceneGrid":
         """Return the grid anchored at (xmin, ymax) of `bounds_m` (outer pixel edges).
 
@@ -67,8 +67,25 @@ class SceneGrid:
         xmin, ymin, xmax, ymax = bounds_m
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
         if crs != LOCAL:
-            _check_crs(crs, bounds_m)
-        return cls(crs, xmin, ymax, spacing_m, shape, height_m)
+            check_crs(crs, bounds_m)
+        return cls(crs, xmin, ymax, spacing_m, shape, name=name)
+
+    @property
+    def frame(self) -> str:
+        """'local', or 'ecef' (EPSG:4978): the frame of positions."""
+        return "local" if self.crs == LOCAL else "ecef"
+
+    @property
+    def crs_wkt(self) -> str:
+        """The CRS of rasters on this grid, as GDAL writes it."""
+        return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """Coordinates y, x and spatial_ref (CF grid mapping) of an xarray raster on this grid."""
+        step, _, west, _, _, north = self.transform
+        reference = {"crs_wkt": self.crs_wkt, "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+        return {"y": self.y_m, "x": self.x_m, "spatial_ref": ((), 0, reference)}
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -87,19 +104,19 @@ class SceneGrid:
         return (self.west_m + self.first[1] * self.spacing_m, self.north_m - self.first[0] * self.spacing_m)
 
     @property
-    def x_m(self) -> NDArray[np.float64]:
+    def x_m(self) -> Floats:
         """Pixel centres eastward, (column,) float64."""
         return self._easting(np.arange(self.shape[1]))
 
     @property
-    def y_m(self) -> NDArray[np.float64]:
+    def y_m(self) -> Floats:
         """Pixel centres from north to south, (row,) float64."""
         return self._northing(np.arange(self.shape[0]))
 
-    def _easting(self, column: ArrayLike) -> NDArray[np.float64]:
+    def _easting(self, column: ArrayLike) -> Floats:
         return np.asarray(self.west_m + (np.asarray(column) + self.first[1] + 0.5) * self.spacing_m, np.float64)
 
-    def _northing(self, row: ArrayLike) -> NDArray[np.float64]:
+    def _northing(self, row: ArrayLike) -> Floats:
         return np.asarray(self.north_m - (np.asarray(row) + self.first[0] + 0.5) * self.spacing_m, np.float64)
 
     def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
@@ -117,26 +134,41 @@ class SceneGrid:
                     slice(column, min(column + side_px, self.shape[1])),
                 )
 
-    def positions(self, height_m: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    def coarse(self, count: int) -> "SceneGrid":
+        """Return the grid of square blocks of pixels, at least `count` along the longer side if it has so many.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 40)).coarse(8)
+        SceneGrid(crs='local', west_m=0.0, north_m=8.0, spacing_m=2.5, shape=(3, 8), first=(0, 0), name='local')
+        """
+        west, north = self._corner
+        side = max(1, max(self.shape) // count)
+        rows, columns = (max(1, size // side) for size in self.shape)
+        return SceneGrid(self.crs, west, north, self.spacing_m * side, (rows, columns), name=self.name)
+
+    def positions(self, height_m: ArrayLike) -> Floats:
         """Return the pixel centres in the processing frame.
 
         Parameters
         ----------
         height_m
-            (row, column) float64, height of each pixel, metres, counted as `self.height_m`; flat ground if None.
+            Scalar or (row, column) float64: height of all pixels or of each, metres above the ellipsoid of `crs` (z in
+            a local frame).
 
         Returns
         -------
         ndarray
             (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
         """
+        height = np.asarray(height_m, np.float64)
         if self.crs == LOCAL:
-            return self._place(*np.meshgrid(self.x_m, self.y_m), height_m)
-        places = np.empty((*self.shape, 3))
+            return frame_from_map(self.crs, *np.meshgrid(self.x_m, self.y_m), height)
+        positions = np.empty((*self.shape, 3))
         for rows, columns in self._blocks():
-            height = None if height_m is None else height_m[rows, columns]
-            places[rows, columns] = self[rows, columns]._of_block(height)
-        return places
+            part = height[rows, columns] if height.ndim else height
+            positions[rows, columns] = self[rows, columns]._positions_in_block(part)
+        return positions
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
         """Yield the parts of blocks of the whole grid that this window holds."""
@@ -146,84 +178,77 @@ class SceneGrid:
         )
         return product(rows, columns)
 
-    def _of_block(self, height_m: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def _positions_in_block(self, height_m: Floats) -> Floats:
         index = (self.first[0] // BLOCK_PX, self.first[1] // BLOCK_PX)
-        found = block(self.crs, (self.north_m, self.west_m), self.spacing_m, self.height_m, index)
-        if not found.exact:
-            return self._place(*np.meshgrid(self.x_m, self.y_m), height_m)
+        polynomials = block(self.crs, (self.north_m, self.west_m), self.spacing_m, index)
+        if not polynomials.exact:
+            return frame_from_map(self.crs, *np.meshgrid(self.x_m, self.y_m), height_m)
         row, column = (np.arange(size) + at % BLOCK_PX for size, at in zip(self.shape, self.first, strict=True))
-        return found.positions(row, column, None if height_m is None else height_m - self.height_m)
+        return polynomials.positions(row, column, height_m)
 
-    def positions_at(
-        self, row: ArrayLike, column: ArrayLike, height_m: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+    def positions_at(self, row: ArrayLike, column: ArrayLike, height_m: ArrayLike) -> Floats:
         """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre.
 
         Examples
         --------
-        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 6), 0.0).positions_at([0], [1], np.array([2.5]))
+        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 6)).positions_at([0], [1], 2.5)
         array([[1.5, 3.5, 2.5]])
         """
-        return self._place(self._easting(column), self._northing(row), height_m)
+        return frame_from_map(self.crs, self._easting(column), self._northing(row), height_m)
 
-    def direction(self, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
+    def map_at(self, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return (..., 2) float64 easting and northing (m) in `crs` of fractional pixel indices."""
+        return np.stack([self._easting(column), self._northing(row)], -1)
+
+    def pixel_of(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Floats, Floats]:
+        """Return fractional row and column of map coordinates (m): what `map_at` takes.
+
+        Examples
+        --------
+        >>> row, column = SceneGrid("local", 0.0, 4.0, 1.0, (4, 6)).pixel_of(1.5, 3.25)
+        >>> float(row), float(column)
+        (0.25, 1.0)
+        """
+        row = (self.north_m - np.asarray(y_m, np.float64)) / self.spacing_m - 0.5 - self.first[0]
+        column = (np.asarray(x_m, np.float64) - self.west_m) / self.spacing_m - 0.5 - self.first[1]
+        return np.asarray(row), np.asarray(column)
+
+    def pixel_below(self, position: Floats) -> Floats:
+        """Return (..., 3) float64 row, column (fractional) and height (m) of positions (..., 3) of the frame.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)).pixel_below(np.array([0.25, 7.75, 3.0]))
+        array([0., 0., 3.])
+        """
+        place = map_from_frame(self.crs, position)
+        return np.stack([*self.pixel_of(place[..., 0], place[..., 1]), place[..., 2]], -1)
+
+    def sample_pixels(self, count: int) -> tuple[Floats, Floats]:
+        """Return rows and columns, (count, count) float64 each, of pixels evenly spread over the grid, with corners.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 7)).sample_pixels(3)[1][0]
+        array([0., 3., 6.])
+        """
+        row, column = (np.linspace(0, size - 1, min(size, count)) for size in self.shape)
+        rows, columns = np.meshgrid(row, column, indexing="ij")
+        return rows, columns
+
+    def sample_points(self, count: int, height_m: float) -> Floats:
+        """Return (count, count, 3) float64 positions (m) of `sample_pixels` at one height; rows go south."""
+        return self.positions_at(*self.sample_pixels(count), height_m)
+
+    def direction(self, vector_m: Floats, row: float, column: float) -> tuple[float, float]:
         """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel.
 
         Examples
         --------
-        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16), 0.0).direction(np.array([3.0, 4.0, 1.0]), 2.0, 5.0)
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)).direction(np.array([3.0, 4.0, 1.0]), 2.0, 5.0)
         (3.0, 4.0)
         """
-        here, east, north = self.positions_at([row, row, row - 1], [column, column + 1, column])
+        here, east, north = self.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
         axes = np.stack([east - here, north - here])
         steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
         return float(steps[0]), float(steps[1])
-
-    def map_at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.float64]:
-        """Return (..., 2) float64 easting and northing (m) in `crs` of fractional pixel indices."""
-        return np.stack([self._easting(column), self._northing(row)], -1)
-
-    def _place(
-        self, x: NDArray[np.float64], y: NDArray[np.float64], height_m: NDArray[np.float64] | None
-    ) -> NDArray[np.float64]:
-        height = np.full_like(x, self.height_m) if height_m is None else np.asarray(height_m, np.float64)
-        return np.stack([x, y, height], -1) if self.crs == LOCAL else ecef_from_projected(self.crs, x, y, height)
-
-
-def _check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
-    where = "config/config.yaml: scene"
-    try:
-        system = CRS(crs)
-    except CRSError as error:
-        raise CampaignError(
-            f"crs {crs!r} is unknown to PROJ",
-            where=where,
-            expected="an EPSG code such as EPSG:32632, auto, or local",
-            remedy="Correct scene.crs.",
-        ) from error
-    if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info):
-        raise CampaignError(
-            f"crs {crs} ({system.name}) is not projected in metres",
-            where=where,
-            expected="a projected CRS in metres, such as a UTM zone",
-            remedy="Choose another scene.crs.",
-        )
-    _check_area_of_use(system, bounds_m, where)
-
-
-def _check_area_of_use(system: CRS, bounds_m: tuple[float, float, float, float], where: str) -> None:
-    area = system.area_of_use
-    if area is None:
-        return
-    inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
-    xmin, ymin, xmax, ymax = bounds_m
-    longitude, latitude = inverse.transform([xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax])
-    for lon, lat in zip(longitude, latitude, strict=True):
-        if not (np.isfinite(lon) and area.west <= lon <= area.east and area.south <= lat <= area.north):
-            raise CampaignError(
-                f"bounds_m {list(bounds_m)} reach longitude {lon:.4f}, latitude {lat:.4f}",
-                where=where,
-                expected=f"inside the area of use of {system.name}: longitude {area.west} to {area.east}, "
-                f"latitude {area.south} to {area.north}",
-                remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
-            )

@@ -19,33 +19,33 @@ DEGREE = 4
 TOLERANCE_M = 3e-8
 """Blocks whose polynomials miss PROJ by more than this between the nodes are placed by PROJ, pixel by pixel."""
 
-_CLIMB_M = 1e4  # ECEF is linear in ellipsoidal height: two heights tell all
+_CLIMB_M = 1e4  # ECEF is exactly linear in ellipsoidal height: positions at two heights tell all
 _NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 _BETWEEN = np.array([-1.0, -0.5, 0.45, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Polynomials of the places of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1 down and right.
+    """Polynomials of the positions of BLOCK_PX × BLOCK_PX pixels over -1 ≤ u, v ≤ 1 down and right.
 
     Attributes
     ----------
     middle_m
-        (3,) float64, ECEF metres.
-    place_m, normal
-        (DEGREE + 1, DEGREE + 1, 3) float64, coefficient of u^k v^l: ECEF metres from the middle, on the ground of the
-        grid; and change per metre of height.
+        (3,) float64, ECEF metres, on the ellipsoid.
+    offset_m, normal
+        (DEGREE + 1, DEGREE + 1, 3) float64, coefficient of u^k v^l: ECEF metres from the middle, on the ellipsoid; and
+        change per metre of height.
     exact
-        Whether they are.
+        Whether they are within `TOLERANCE_M` of PROJ.
     """
 
     middle_m: NDArray[np.float64]
-    place_m: NDArray[np.float64]
+    offset_m: NDArray[np.float64]
     normal: NDArray[np.float64]
     exact: bool
 
     def positions(
-        self, row: NDArray[np.int64], column: NDArray[np.int64], above_m: NDArray[np.float64] | None
+        self, row: NDArray[np.int64], column: NDArray[np.int64], height_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return (row, column, 3) float64 ECEF metres.
 
@@ -53,20 +53,19 @@ class Block:
         ----------
         row, column
             (row,) and (column,) int64, counted from the block's corner.
-        above_m
-            (row, column) float64, height above the ground of the grid; None: on it.
+        height_m
+            () or (row, column) float64, ellipsoidal height of all pixels or of each.
         """
         down, right = ((2 * index + 1) / BLOCK_PX - 1 for index in (row, column))
-        place = _evaluated(self.place_m, down, right)
-        if above_m is not None:
-            place += above_m[..., None] * _evaluated(self.normal, down, right)
-        return place + self.middle_m
+        if height_m.ndim == 0:  # one height: one polynomial
+            return _evaluated(self.offset_m + height_m * self.normal, down, right) + self.middle_m
+        offset = _evaluated(self.offset_m, down, right)
+        offset += height_m[..., None] * _evaluated(self.normal, down, right)
+        return offset + self.middle_m
 
 
 @lru_cache(maxsize=4096)
-def block(
-    crs: str, north_west_m: tuple[float, float], spacing_m: float, height_m: float, index: tuple[int, int]
-) -> Block:
+def block(crs: str, north_west_m: tuple[float, float], spacing_m: float, index: tuple[int, int]) -> Block:
     """Return the polynomials of a block of a grid.
 
     Parameters
@@ -77,15 +76,13 @@ def block(
         Northing and easting of the grid's outer corner.
     spacing_m
         Of its pixels.
-    height_m
-        Of its ground, ellipsoidal.
     index
         Row and column of the block in the grid.
 
     Examples
     --------
-    >>> found = block("EPSG:32632", (5e6, 5e5), 0.5, 100.0, (0, 0))
-    >>> found.exact, found.positions(np.arange(2), np.arange(3), None).shape
+    >>> corner = block("EPSG:32632", (5e6, 5e5), 0.5, (0, 0))
+    >>> corner.exact, corner.positions(np.arange(2), np.arange(3), np.array(100.0)).shape
     (True, (2, 3, 3))
     """
     side_m = BLOCK_PX * spacing_m
@@ -95,16 +92,16 @@ def block(
         down, right = np.meshgrid((nodes + 1) * side_m / 2, (nodes + 1) * side_m / 2, indexing="ij")
         return ecef_from_projected(crs, west_m + right, north_m - down, np.full(down.shape, height))
 
-    ground, above = proj(_NODES, height_m), proj(_NODES, height_m + _CLIMB_M)
+    ground, above = proj(_NODES, 0.0), proj(_NODES, _CLIMB_M)
     middle_m = ground[DEGREE // 2, DEGREE // 2]
     inverse = np.linalg.inv(np.vander(_NODES, increasing=True))
-    place, normal = (
+    offset, normal = (
         np.einsum("ki,lj,ijc->klc", inverse, inverse, values)
         for values in (ground - middle_m, (above - ground) / _CLIMB_M)
     )
-    between = _evaluated(place, _BETWEEN, _BETWEEN) + middle_m
-    worst = np.abs(between - proj(_BETWEEN, height_m)).max()
-    return Block(middle_m, place, normal, bool(worst < TOLERANCE_M))
+    between = _evaluated(offset, _BETWEEN, _BETWEEN) + middle_m
+    worst = np.abs(between - proj(_BETWEEN, 0.0)).max()
+    return Block(middle_m, offset, normal, bool(worst < TOLERANCE_M))
 
 
 def _evaluated(

@@ -1,15 +1,15 @@
-"""How the scene is seen: incidence, bistatic angle, and where terrain hides or folds."""
+"""How the scene is seen: incidence, bistatic angle, and where terrain casts shadow or is laid over."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.contracts import Window
-from apertura.geometry.geodesy import projected_from_ecef
-from apertura.scene.grid import LOCAL, SceneGrid
+from apertura.geometry.geodesy import LOCAL
+from apertura.scene.grid import SceneGrid
 from apertura.scene.sightlines import BLOCK, mark_layover, mark_shadow
+from apertura.scene.terrain import Terrain
 
 EARTH_RADIUS_M = 6371e3
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def surface_normals(position: Floats) -> Floats:
-    """Return the upward unit normals of a surface given at pixels.
+    """Return the unit normals, upward, of a surface given at pixels.
 
     Parameters
     ----------
@@ -86,81 +86,67 @@ class Relief:
 
     Attributes
     ----------
+    grid, base_m
+        The scene, and the height that the others count from.
     height_m
-        (row, column) float32, metres above the grid's flat model, `grid.height_m`.
+        (row, column) float32, metres above `base_m`.
     highest_m
         (block row, block column) float32: highest ground of each block of 16 × 16 pixels and one pixel around it.
     lowest_m
         Lowest ground.
-    spacing_m
-        Of the pixels.
-    curvature_per_m
-        1/2R: how fast the ground falls below a horizontal line, times distance squared; 0 in a local frame.
     """
 
+    grid: SceneGrid
+    base_m: float
     height_m: NDArray[np.float32]
     highest_m: NDArray[np.float32]
     lowest_m: float
-    spacing_m: float
-    curvature_per_m: float
 
     @classmethod
-    def of(cls, grid: SceneGrid, heights: Callable[[Window], Floats]) -> "Relief":
-        """Return the relief of a scene from what gives the heights (m) of a window; they are read by strips."""
+    def of(cls, grid: SceneGrid, terrain: Terrain, base_m: float) -> "Relief":
+        """Return the relief of a scene above a height (m) amid its ground: float32 then holds it to micrometres."""
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
-            relative[strip] = heights(strip) - float(grid.height_m)
+            relative[strip] = terrain.heights(grid[strip]) - base_m
         rows, columns = (-(-size // BLOCK) for size in grid.shape)
         highest = np.empty((rows, columns), np.float32)
         for row in range(rows):
-            strip = relative[max(0, row * BLOCK - 1) : (row + 1) * BLOCK + 1].max(axis=0)
+            strip_top = relative[max(0, row * BLOCK - 1) : (row + 1) * BLOCK + 1].max(axis=0)
             for column in range(columns):
-                highest[row, column] = strip[max(0, column * BLOCK - 1) : (column + 1) * BLOCK + 1].max()
-        return cls(
-            relative,
-            highest,
-            float(relative.min()),
-            grid.spacing_m,
-            0.0 if grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M,
-        )
+                highest[row, column] = strip_top[max(0, column * BLOCK - 1) : (column + 1) * BLOCK + 1].max()
+        return cls(grid, base_m, relative, highest, float(relative.min()))
 
+    @property
+    def curvature_per_m(self) -> float:
+        """1/2R: how fast the ground falls below a horizontal line, times distance squared; 0 in a local frame."""
+        return 0.0 if self.grid.crs == LOCAL else 0.5 / EARTH_RADIUS_M
 
-def antennas_over(grid: SceneGrid, antenna: Floats) -> Floats:
-    """Return (pulse, 3) float64 row, column (fractional) and height above `grid.height_m` (m) of phase centres.
+    def above(self, antenna: Floats) -> Floats:
+        """Return (pulse, 3) float64 row, column (fractional) and height above `base_m` (m) of phase centres.
 
-    Parameters
-    ----------
-    grid
-        The scene.
-    antenna
-        (pulse, 3) float64 metres, in the grid's processing frame.
-
-    Examples
-    --------
-    >>> antennas_over(SceneGrid("local", 0.0, 8.0, 0.5, (16, 16), 1.0), np.array([[0.25, 7.75, 3.0]]))
-    array([[0., 0., 2.]])
-    """
-    place = antenna if grid.crs == LOCAL else projected_from_ecef(grid.crs, antenna)
-    west, _, _, north = grid.bounds_m
-    row = (north - place[:, 1]) / grid.spacing_m - 0.5
-    return np.stack([row, (place[:, 0] - west) / grid.spacing_m - 0.5, place[:, 2] - grid.height_m], -1)
+        Parameters
+        ----------
+        antenna
+            (pulse, 3) float64 metres, in the grid's processing frame.
+        """
+        return self.grid.pixel_below(antenna) - [0.0, 0.0, self.base_m]
 
 
 def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArray[np.uint8]:
     """Return where one pair sees the ground of a window in shadow or in layover.
 
-    Shadow: from more than half of the looks the straight line to the transmitter or to the receiver runs through
-    ground of the scene. Layover: at the look with the shortest total path, the path does not grow along the line of
-    look from all ground before the pixel to all behind, so that another place shares its range. Ground outside the
-    scene hides nothing and folds nowhere.
+    Shadow: at more than half of the pulses given the straight line to the transmitter or to the receiver runs through
+    ground of the scene. Layover: at the pulse with the shortest total path, the path does not grow along the line of
+    sight from all ground before the pixel to all behind, so that another place shares its range. Ground outside the
+    scene hides nothing and is not laid over.
 
     Parameters
     ----------
     relief
         Of the whole scene.
     tx, rx
-        (look, 3) float64 from `antennas_over`: some pulses, evenly spread over the aperture.
+        (pulse, 3) float64 from `Relief.above`: some pulses, evenly spread over the aperture.
     window
         Rows and columns asked for.
 
@@ -175,17 +161,19 @@ def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArra
 
     Examples
     --------
-    >>> grid = SceneGrid("local", 0.0, 8.0, 1.0, (8, 32), 0.0)
+    >>> from apertura.scene.terrain import GridHeights
+    >>> grid = SceneGrid("local", 0.0, 8.0, 1.0, (8, 32))
     >>> ground = np.zeros(grid.shape)
     >>> ground[:, 10] = 4.0
-    >>> look = antennas_over(grid, np.array([[-30.0, 4.0, 20.0]]))
-    >>> visibility(Relief.of(grid, ground.__getitem__), look, look, (slice(4, 5), slice(0, 32)))[0, 7:22]
+    >>> relief = Relief.of(grid, GridHeights(grid, ground), 0.0)
+    >>> antenna = relief.above(np.array([[-30.0, 4.0, 20.0]]))
+    >>> visibility(relief, antenna, antenna, (slice(4, 5), slice(0, 32)))[0, 7:22]
     array([0, 0, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0], dtype=uint8)
     """
     first = np.array([part.start for part in window])
     mask = np.zeros([part.stop - part.start for part in window], np.uint8)
     legs = np.stack([tx, rx], axis=1)
-    ground = (relief.height_m, relief.spacing_m, relief.curvature_per_m)
+    ground = (relief.height_m, relief.grid.spacing_m, relief.curvature_per_m)
     mark_shadow(mask, first, legs if (tx != rx).any() else legs[:, :1].copy(), relief.highest_m, ground)
     mark_layover(mask, first, legs, (relief.lowest_m, float(relief.highest_m.max())), ground)
     return mask

@@ -1,23 +1,23 @@
 """The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
 
-Only `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
+Only `load`, `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
 """
 
-from apertura.settings.antennas import Antenna, Antennas
-from apertura.settings.calibration import Calibration
-from apertura.settings.config import Settings
-from apertura.settings.names import Name
-from apertura.settings.node import LeverArms, Node, PathOffsets
-from apertura.settings.processing import Processing
-from apertura.settings.reading import read_settings, validated
+from apertura.settings.config import CONFIG, Settings, read_settings, validated
+from apertura.settings.flights import FLIGHTS, Flight, read_flights
+from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
+from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
-from apertura.settings.section import Section
+from apertura.settings.section import Name, Section
 from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Waveform
 
 __all__ = [
+    "CONFIG",
+    "FLIGHTS",
     "Antenna",
     "Antennas",
     "Calibration",
+    "Flight",
     "LeverArms",
     "Name",
     "Node",
@@ -29,6 +29,7 @@ __all__ = [
     "Section",
     "Settings",
     "Waveform",
+    "read_flights",
     "read_settings",
     "validated",
 ]

@@ -1,16 +1,19 @@
-"""The config as a whole."""
+"""The config as one value: from config/config.yaml to `Settings`, or to the message that says all that is wrong."""
 
+from pathlib import Path
 from typing import Self
 
 from pydantic import Field, model_validator
 
-from apertura.settings.calibration import Calibration
-from apertura.settings.names import Name
-from apertura.settings.node import Node
-from apertura.settings.processing import Processing
+from apertura import validation
+from apertura.settings.nodes import Node
+from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
-from apertura.settings.section import Section
+from apertura.settings.section import Name, Section
 from apertura.settings.waveform import PhaseHistoryWaveform, Waveform
+
+CONFIG = Path("config/config.yaml")
+"""Where the config lies in a campaign folder."""
 
 
 class Settings(Section):
@@ -39,3 +42,34 @@ class Settings(Section):
                 f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
             )
         return self
+
+
+def read_settings(path: Path) -> Settings:
+    """Return the settings in a config file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, is not YAML, or `validated` refuses it.
+    """
+    remedy = "`apertura init` writes a commented one."
+    return validated(validation.read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
+
+
+def validated(document: object, *, where: object) -> Settings:
+    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+
+    Raises
+    ------
+    CampaignError
+        With file, key, what was found and what was expected.
+
+    Examples
+    --------
+    >>> validated({"campaing": "x"}, where="config.yaml")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); campaign: missing; ...
+    """
+    expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
+    return validation.validated(Settings, document, where=where, expected=expected)

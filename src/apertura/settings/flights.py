@@ -8,7 +8,8 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from apertura.errors import CampaignError
-from apertura.settings import Name
+from apertura.settings.config import CONFIG
+from apertura.settings.section import Name
 
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
@@ -38,7 +39,7 @@ def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
     path
         Tab-separated, columns flight, kind, transmitter, nodes.
     nodes
-        Names that config/config.yaml knows.
+        Names that the config knows.
 
     Raises
     ------
@@ -56,7 +57,10 @@ def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
         table = csv.DictReader(lines, delimiter="\t")
         if table.fieldnames is None or [name.strip() for name in table.fieldnames] != _COLUMNS:
             raise CampaignError(
-                f"columns {table.fieldnames}", where=path, expected=f"{_COLUMNS}, tab-separated", remedy="Mend line 1."
+                f"columns {table.fieldnames}",
+                where=path,
+                expected=f"{_COLUMNS}, tab-separated",
+                remedy="Correct it.",
             )
         seen: set[str] = set()
         for number, row in enumerate(table, start=2):
@@ -86,7 +90,7 @@ def _flight(row: dict[str, str | None], known: Collection[str], *, where: str) -
         problem = f"kind {cells['kind']!r} is neither image nor calibration"
     unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
     if unknown:
-        problem = f"node {unknown[0]!r} is not in config/config.yaml: nodes"
+        problem = f"node {unknown[0]!r} is not in {CONFIG}: nodes"
     if not nodes or len(set(nodes)) != len(nodes):
         problem = f"nodes {cells['nodes']!r} are none or doubled"
     if problem:
@@ -94,6 +98,6 @@ def _flight(row: dict[str, str | None], known: Collection[str], *, where: str) -
             problem,
             where=where,
             expected=f"flight, image|calibration, a transmitter and nodes among {sorted(known)}",
-            remedy="Mend the line.",
+            remedy="Correct the line.",
         )
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)

@@ -1,10 +1,11 @@
-"""Section `processing`: how to compute."""
+"""Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from apertura.settings.section import Section
+from apertura.focus.engines import ENGINES, load_engine
+from apertura.settings.section import Metres3, Name, Section
 
 
 class Processing(Section):
@@ -12,7 +13,16 @@ class Processing(Section):
 
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
     accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
-    engine: Literal["auto", "native", "numba", "reference"] = Field("auto", description="backprojection engine")
+    engine: str = Field(
+        "auto",
+        description=f"backprojection engine: auto, {', '.join(ENGINES)}",
+        json_schema_extra={"enum": ["auto", *ENGINES]},
+    )
+    engine_options: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="options of engines that the planner shall not choose: engine → option → value",
+        examples=[{}],
+    )
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
@@ -20,27 +30,41 @@ class Processing(Section):
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
     tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
-    table_degree: Annotated[int, Field(ge=1, le=2)] | Literal["auto"] = Field(
-        "auto", description="native: degree of the polynomials in a table cell, 1 or 2"
-    )
-    table_oversampling: Annotated[int, Field(ge=2, le=64)] | Literal["auto"] = Field(
-        "auto", description="native and numba: table cells per resolution cell c/B of total path"
-    )
-    phase_tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | Literal["auto"] = Field(
-        "auto", description="native: largest phase error its fast forms may make, rad"
-    )
-    accumulate: Literal["auto", "complex64", "complex128"] = Field(
-        "auto", description="native: type of sums over pulses"
-    )
-    pulse_thinning: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
+    presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
         "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
     )
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
         "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
     )
-    midpoint: bool | Literal["auto"] = Field(
-        "auto", description="image a bistatic pair as if both antennas were at their midpoint: true, false or auto"
-    )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
         "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
     )
+
+    @field_validator("engine")
+    @classmethod
+    def _engine_is_known(cls, name: str) -> str:
+        if name not in {"auto", *ENGINES}:
+            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
+        return name
+
+    @model_validator(mode="after")
+    def _options_are_those_of_engines(self) -> Self:
+        for name, options in self.engine_options.items():
+            if name not in ENGINES:
+                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
+            try:
+                load_engine(name).Options.model_validate(options)
+            except ValidationError as error:
+                first = error.errors()[0]
+                known = ", ".join(load_engine(name).Options.model_fields) or "none"
+                option = ".".join(map(str, first["loc"]))
+                raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
+        return self
+
+
+class Calibration(Section):
+    """Which flight the path offsets come from."""
+
+    flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
+    reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
+    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")

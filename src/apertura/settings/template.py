@@ -45,7 +45,7 @@ def _section(model: type[BaseModel], depth: int) -> list[str]:
         value = _EXAMPLES.get(name) if depth == 0 and name in _EXAMPLES else _value(field)
         if isinstance(value, type) and issubclass(value, BaseModel):
             lines += [f"{indent}{name}:", *_section(value, depth + 1)]
-        elif isinstance(value, dict):
+        elif isinstance(value, dict) and value:
             lines.append(f"{indent}{name}:")
             for key, inner in value.items():
                 lines += [f"{indent}  {key}:", *_section(inner, depth + 2)]

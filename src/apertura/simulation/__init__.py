@@ -1,1 +1,132 @@
-"""Campaign folders like real ones from a scene, trajectories and impairments with known truth."""
+"""Campaign folders like real ones from a scene, tracks and impairments, with the truth beside them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from numpy.random import Generator, default_rng
+
+from apertura.errors import CampaignError
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.continuous import Framing
+from apertura.simulation.impairments import Impairments
+from apertura.simulation.presets import PRESETS
+from apertura.simulation.scene import Clutter, Line, Origin, Plate, PointTarget, Target
+from apertura.simulation.specification import (
+    CampaignSpecification,
+    ImageGrid,
+    SimulatedFlight,
+    SimulatedNode,
+    WaveformSpecification,
+    read_specification,
+    specification_text,
+)
+from apertura.simulation.trajectory import GaussianBeam, Straight, Track, Waypoints, Wobble
+from apertura.validation import validated
+
+__all__ = [
+    "CampaignSpecification",
+    "Clutter",
+    "Framing",
+    "GaussianBeam",
+    "ImageGrid",
+    "Impairments",
+    "Line",
+    "Origin",
+    "Plate",
+    "PointTarget",
+    "SimulatedFlight",
+    "SimulatedNode",
+    "Straight",
+    "WaveformSpecification",
+    "Waypoints",
+    "Wobble",
+    "preset",
+    "read_specification",
+    "simulate",
+    "specification_text",
+]
+
+
+def simulate(
+    directory: str | Path,
+    specification: CampaignSpecification | str | Path = "demo",
+    *,
+    targets: Sequence[Target] | None = None,
+    tracks: Mapping[str, Track] | None = None,
+    waveform: WaveformSpecification | None = None,
+    impairments: Mapping[str, Impairments] | None = None,
+    seed: int | Generator = 1,
+) -> Path:
+    """Write a simulated campaign: SigMF recordings, flight logs, codes, config, and truth.json.
+
+    Parameters
+    ----------
+    directory
+        The folder to make; it must not exist, or be empty.
+    specification
+        A specification, the path of one in YAML, or a preset: `demo`, `paper`, `swarm`, `continuous`.
+    targets
+        What stands in the scene instead, east, north and up (m) of the specification's origin.
+    tracks
+        Node → how it flies instead, in every flight; nodes that the specification lacks are perfect ones.
+    waveform
+        What is transmitted instead.
+    impairments
+        Node → what is wrong with it instead.
+    seed
+        Of everything random, or the generator itself; the same seed gives identical bytes.
+
+    Returns
+    -------
+    Path
+        `directory`.
+
+    Raises
+    ------
+    CampaignError
+        If the folder holds something already, or the specification is wrong.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> track = Straight(start_m=(-1.0, -11.0, 5.0), velocity_m_s=(1.0, 0.0, 0.0))
+    >>> with TemporaryDirectory() as folder:
+    ...     made = simulate(f"{folder}/campaign", preset("demo", pulses=2), targets=[PointTarget((0.0, 0.0, 0.0))],
+    ...                     tracks={"uav1": track}, impairments={"uav1": Impairments(radar_snr_db=20.0)})
+    ...     sorted(path.name for path in made.rglob("*") if path.is_file())
+    ['codes.npy', 'config.yaml', 'flights.tsv', 'truth.json', 'uav1.sigmf-data', 'uav1.sigmf-meta', 'uav1.track.csv']
+    """
+    base = specification
+    if not isinstance(base, CampaignSpecification):
+        base = preset(base) if isinstance(base, str) and base in PRESETS else read_specification(Path(base))
+    parts = vars(base) | {"nodes": dict(base.nodes)}
+    if targets is not None:
+        parts["targets"] = tuple(targets)
+    if waveform is not None:
+        parts["waveform"] = waveform
+    if tracks is not None:
+        parts["nodes"] = {name: base.nodes.get(name, SimulatedNode()) for name in tracks}
+        parts["flights"] = tuple(vars(flight) | {"tracks": tracks} for flight in base.flights)
+    for name, own in (impairments or {}).items():
+        parts["nodes"][name] = replace(parts["nodes"].get(name, SimulatedNode()), impairments=own)
+    checked = validated(CampaignSpecification, parts, where="simulate", expected="parts that fit together")
+    return write_campaign(Path(directory), checked, default_rng(seed))
+
+
+def preset(name: str, *, pulses: int | None = None) -> CampaignSpecification:
+    """Return a preset's specification, with another number of pulses if one is given.
+
+    Raises
+    ------
+    CampaignError
+        If there is no preset of that name.
+
+    Examples
+    --------
+    >>> preset("swarm").flights[0].tracks.keys()
+    dict_keys(['uav1', 'uav2', 'uav3', 'uav4'])
+    """
+    if name not in PRESETS:
+        raise CampaignError(f"preset {name!r}", "simulate", f"one of {', '.join(PRESETS)}", "Choose one of them.")
+    return PRESETS[name]() if pulses is None else PRESETS[name](pulses=pulses)

@@ -1,4 +1,7 @@
-"""A recorder that never stops: preamble, payload and symbol of every pulse in one stream, noise between them."""
+"""A recorder that never stops: frames of preamble, payload and symbol in one stream, noise between them.
+
+preamble chips | counter bits, then the same inverted | guard | cyclic prefix, symbol
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -6,16 +9,89 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from apertura.errors import CampaignError
-from apertura.simulation.frame import Framing
-from apertura.simulation.hidden import independent_streams
-from apertura.simulation.impairments import Adc
-from apertura.simulation.radar import Floats
+from apertura.simulation.draw import independent_streams
+from apertura.simulation.impairments import STRICT_KEYS, Adc
+from apertura.simulation.radar import Floats, TransmitWaveform
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate
 
-_SAMPLES_AT_ONCE = 2**18
+Chips = NDArray[np.int8]
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class Framing:
+    """What goes before the symbol, keyed on the middle subcarrier: a PN preamble and a payload that counts frames.
+
+    Examples
+    --------
+    >>> framing = Framing(register_bits=3, chip_samples=2, counter_bits=2, bit_chips=3)
+    >>> framing.preamble()
+    array([ 1,  1,  1, -1,  1, -1, -1], dtype=int8)
+    >>> framing.payload(6)  # counts 2: bits 1 0, inverted 0 1
+    array([ 1,  1,  1, -1, -1, -1, -1, -1, -1,  1,  1,  1], dtype=int8)
+    """
+
+    register_bits: int = Field(
+        default=10, ge=2, le=20, description="length k of the shift register: 2^k - 1 chips of preamble"
+    )
+    chip_samples: int = Field(
+        default=4, ge=1, description="samples per chip; the sampling rate over it must fit the band"
+    )
+    counter_bits: int = Field(default=16, ge=1, description="width of the frame counter; it wraps at 2^counter_bits")
+    bit_chips: int = Field(default=15, ge=1, description="chips per payload bit, all of one sign: +1 for a one")
+    guard_samples: int = Field(default=256, ge=0, description="silence before the prefix, longer than the longest echo")
+    level_db: float = Field(default=0.0, description="power against the mean power of the symbol, dB")
+
+    def preamble(self) -> Chips:
+        """Return (chip,) int8 of ±1: a maximum-length sequence."""
+        from scipy.signal import max_len_seq  # slow to import, and few recordings have frames
+
+        return np.asarray(2 * max_len_seq(self.register_bits)[0].astype(np.int8) - 1)
+
+    def counted(self, frame: int) -> int:
+        """Return the number that the payload of frame `frame` says."""
+        return int(frame % 2**self.counter_bits)
+
+    def payload(self, frame: int) -> Chips:
+        """Return (chip,) int8 of ±1: the counter, most significant bit first, then its complement."""
+        number = self.counted(frame)
+        bits = np.array([(number >> place) & 1 for place in reversed(range(self.counter_bits))], np.int8)
+        return np.repeat(2 * np.concatenate([bits, 1 - bits]) - 1, self.bit_chips)
+
+    @property
+    def lead_samples(self) -> int:
+        """Samples from the start of the preamble to the start of the cyclic prefix."""
+        chips = 2**self.register_bits - 1 + 2 * self.counter_bits * self.bit_chips
+        return int(chips * self.chip_samples + self.guard_samples)
+
+    def centre_hz(self, waveform: TransmitWaveform) -> float:
+        """Return the baseband frequency of the chips' carrier: the middle subcarrier."""
+        return float(waveform.baseband_hz[len(waveform.codes) // 2])
+
+    def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:
+        """Return the preamble and payload as sent, at baseband.
+
+        Parameters
+        ----------
+        waveform
+            Gives sampling rate, band centre and power.
+        frame
+            Number before it wraps.
+        time_s
+            (...,) float64, seconds after the start of the cyclic prefix (negative).
+        """
+        chips = np.concatenate([self.preamble(), self.payload(frame)])
+        rate = waveform.sample_rate_hz
+        # a millionth of a sample is rounding, not an earlier chip
+        index = np.floor((time_s * rate + self.lead_samples + 1e-6) / self.chip_samples).astype(int)
+        inside = (index >= 0) & (index < len(chips))
+        level = np.sqrt((np.abs(waveform.codes) ** 2).sum()) * 10 ** (self.level_db / 20)
+        keyed = np.where(inside, chips[np.clip(index, 0, len(chips) - 1)], 0)
+        return np.asarray(level * keyed * np.exp(2j * np.pi * self.centre_hz(waveform) * time_s))
 
 
 def recording_start_s(channel: Channel) -> float:
@@ -40,6 +116,7 @@ def continuous_blocks(
     *,
     framing: Framing | None = None,
     first_frame: int = 0,
+    block_samples: int = 2**18,
 ) -> Iterator[NDArray[np.int16]]:
     """Yield (sample, channel, 2) int16 counts of a whole flight, a bounded number of samples at a time.
 
@@ -57,6 +134,8 @@ def continuous_blocks(
         What goes before each symbol; None: nothing.
     first_frame
         Number of the first pulse.
+    block_samples
+        How many samples of noise alone to make at a time.
 
     Raises
     ------
@@ -74,7 +153,7 @@ def continuous_blocks(
     streams = dict(zip(channels, independent_streams(generator, len(channels)), strict=True))
     done = 0
     for pulse, (start, stop) in enumerate([*regions, (total, total)]):
-        pieces = [(begin, min(begin + _SAMPLES_AT_ONCE, start)) for begin in range(done, start, _SAMPLES_AT_ONCE)]
+        pieces = [(begin, min(begin + block_samples, start)) for begin in range(done, start, block_samples)]
         for begin, end in [*pieces, (start, stop)]:
             counts = []
             for name, channel in channels.items():

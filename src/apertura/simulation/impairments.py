@@ -1,30 +1,36 @@
-"""What goes wrong, each on its own switch and off by default."""
+"""What is wrong with a node, each impairment on its own switch and off by default.
 
-from dataclasses import dataclass
+Plain values: their bounds hold wherever they come from, and the same keys stand in a YAML specification.
+"""
+
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 Floats = NDArray[np.float64]
+STRICT_KEYS = ConfigDict(extra="forbid", allow_inf_nan=False)
+"""Of everything that a specification may hold: unknown keys are errors."""
+RadarPoint = Literal["radar_tx", "radar_rx"]
+AntennaPoint = Literal["radar_tx", "radar_rx", "sidelink"]
+ChannelName = Literal["radar", "sidelink"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Clock:
-    """The receiver's clock against the transmitter's.
+    """The receiver's clock against the transmitter's; docs/theory/simulate.md, eq. 3.
 
-    Attributes
-    ----------
-    cfo_hz, sfo_hz
-        Its local oscillator and sampling rate less their nominal frequencies, Hz: the received signal turns by
-        −cfo_hz at baseband and is sampled sfo_hz too often.
-    continuous_phase
-        The oscillator runs on between pulses (phase −2π·cfo·t from pulse to pulse) instead of beginning anew
-        at each trigger.
+    The received signal turns by −cfo_hz at baseband and is sampled sfo_hz too often.
     """
 
-    cfo_hz: float = 0.0
-    sfo_hz: float = 0.0
-    continuous_phase: bool = False
+    cfo_hz: float = Field(default=0.0, description="local oscillator less its nominal frequency, Hz")
+    sfo_hz: float = Field(default=0.0, description="sampling rate less its nominal value, Hz")
+    continuous_phase: bool = Field(
+        default=False,
+        description="the oscillator runs on from pulse to pulse (-2π·cfo·t) instead of restarting at each trigger",
+    )
 
     @classmethod
     def of_ppm(cls, ppm: float, *, carrier_hz: float, sample_rate_hz: float, continuous_phase: bool = False) -> "Clock":
@@ -38,81 +44,73 @@ class Clock:
         return cls(ppm * carrier_hz / 1e6, ppm * sample_rate_hz / 1e6, continuous_phase)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class UniformPhase:
-    """Carrier phase per pulse, uniform in ±half_width_rad (π: unknown altogether)."""
+    """Carrier phase per pulse, uniform in ± a width."""
 
-    half_width_rad: float = np.pi
+    half_width_rad: float = Field(default=np.pi, ge=0, description="half width, rad; π: unknown altogether")
+    kind: Literal["uniform"] = Field(default="uniform", kw_only=True, repr=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class PhaseWalk:
-    """Carrier phase as a random walk: free-running oscillators, variance growing by rad²/s."""
+    """Carrier phase as a random walk: free-running oscillators."""
 
-    rad_per_root_s: float
+    rad_per_root_s: float = Field(ge=0, description="root of the variance's growth in rad²/s")
+    kind: Literal["walk"] = Field(default="walk", kw_only=True, repr=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Timing:
-    """Start of the capture less start of the pulse.
+    """Start of the capture less start of the pulse."""
 
-    Attributes
-    ----------
-    offset_s
-        Constant.
-    half_width_s
-        Uniform in ± this per pulse.
-    jitter_samples
-        Standard deviation of whole samples by which the trigger fires late.
-    """
-
-    offset_s: float = 0.0
-    half_width_s: float = 0.0
-    jitter_samples: float = 0.0
+    offset_s: float = Field(default=0.0, description="constant, s")
+    half_width_s: float = Field(default=0.0, ge=0, description="uniform in ± this per pulse, s")
+    jitter_samples: float = Field(default=0.0, ge=0, description="standard deviation of whole samples of trigger delay")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class TimeTag:
-    """Error of the node's UTC tags: constant, growing, and scattering (standard deviation)."""
+    """Error of the node's UTC tags."""
 
-    offset_s: float = 0.0
-    drift_ppm: float = 0.0
-    jitter_s: float = 0.0
+    offset_s: float = Field(default=0.0, description="constant, s")
+    drift_ppm: float = Field(default=0.0, description="growing, microseconds per second")
+    jitter_s: float = Field(default=0.0, ge=0, description="standard deviation per pulse, s")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Reflection:
-    """An extra sidelink path: metres longer than the direct one, amplitude relative to it."""
+    """An extra sidelink path."""
 
-    excess_m: float
-    amplitude: complex
+    excess_m: float = Field(description="length beyond the direct path, m")
+    amplitude: complex = Field(description="relative to the direct path")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Blockage:
-    """Sidelink shadowed in bursts: share of pulses, mean length of a burst in pulses, attenuation.
+    """Sidelink shadowed in bursts.
 
     Notes
     -----
     Source: E. N. Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960): two-state chain.
     """
 
-    fraction: float
-    mean_pulses: float = 10.0
-    attenuation_db: float = 60.0
+    fraction: float = Field(ge=0, lt=1, description="share of the pulses")
+    mean_pulses: float = Field(default=10.0, ge=1, description="mean length of a burst, pulses")
+    attenuation_db: float = Field(default=60.0, ge=0, description="loss while shadowed, dB")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Leakage:
-    """Direct coupling of the radar antennas, dB against the RMS echo spectrum; `path_m` beyond their distance."""
+    """Direct coupling of the radar antennas."""
 
-    level_db: float
-    path_m: float = 0.0
+    level_db: float = Field(description="against the RMS echo spectrum, dB")
+    path_m: float = Field(default=0.0, description="electrical path beyond the antennas' distance, m")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Ripple:
-    """An internal reflection: response 1 + ρ·exp(-j2πf·delay), `peak_to_peak_db` across the band.
+    """An internal reflection: response 1 + ρ·exp(-j2πf·delay).
 
     Examples
     --------
@@ -122,44 +120,36 @@ class Ripple:
     1.0
     """
 
-    peak_to_peak_db: float
-    delay_s: float
+    peak_to_peak_db: float = Field(description="across the band, dB")
+    delay_s: float = Field(description="of the reflection, s")
 
     def response(self, frequency_hz: Floats) -> NDArray[np.complex128]:
-        """Return (subcarrier,) complex128."""
+        """Return (subcarrier,) complex128 at RF frequencies (subcarrier,) float64."""
         ratio = 10 ** (self.peak_to_peak_db / 20)
         reflected = (ratio - 1) / (ratio + 1)
         return np.asarray(1 + reflected * np.exp(-2j * np.pi * frequency_hz * self.delay_s))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Adc:
-    """Bits of the converter, and how far under its full scale the RMS of I and of Q lies."""
+    """The converter."""
 
-    bits: int = 14
-    backoff_db: float = 14.0
+    bits: int = Field(default=14, ge=1, le=16, description="bits of I and of Q")
+    backoff_db: float = Field(default=14.0, description="how far under full scale the RMS of I and of Q lies, dB")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Localization:
-    """Logged position less true position.
+    """Logged position less true position: white noise after a moving average."""
 
-    Attributes
-    ----------
-    sigma_m
-        Standard deviation per axis after the moving average.
-    window_s
-        Length of the moving average over white noise.
-    points
-        Antennas that are elsewhere than the log says: `radar_tx`, `radar_rx`, `sidelink`.
-    """
-
-    sigma_m: float
-    window_s: float = 1.0
-    points: tuple[str, ...] = ("radar_tx", "radar_rx", "sidelink")
+    sigma_m: float = Field(ge=0, description="standard deviation per axis after the moving average, m")
+    window_s: float = Field(default=1.0, gt=0, description="length of the moving average, s")
+    points: tuple[AntennaPoint, ...] = Field(
+        default=("radar_tx", "radar_rx", "sidelink"), description="antennas that are elsewhere than the log says"
+    )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Impairments:
     """Everything that is wrong with one node; the default is a perfect one with a 14-bit converter.
 
@@ -167,20 +157,24 @@ class Impairments:
     and subcarriers, against the noise of one DFT bin. What else reaches the channel does not change the noise.
     """
 
-    clock: Clock = Clock()
-    carrier_phase: UniformPhase | PhaseWalk | None = None
-    timing: Timing = Timing()
-    missed_fraction: float = 0.0
-    time_tag: TimeTag = TimeTag()
-    radar_snr_db: float | None = None
-    sidelink_snr_db: float | None = None
-    sidelink_gain_db: float = 0.0
-    sidelink_multipath: tuple[Reflection, ...] = ()
-    sidelink_blockage: Blockage | None = None
-    leakage: Leakage | None = None
-    transmit_ripple: Ripple | None = None
-    radar_ripple: Ripple | None = None
-    sidelink_ripple: Ripple | None = None
-    adc: Adc = Adc()
-    localization: Localization | None = None
-    doppler: bool = False
+    clock: Clock = Field(default=Clock(), description="clock offset")
+    carrier_phase: Annotated[UniformPhase | PhaseWalk, Field(discriminator="kind")] | None = Field(
+        default=None, description="carrier phase per pulse: uniform or walk; null: coherent"
+    )
+    timing: Timing = Field(default=Timing(), description="start of each capture")
+    missed_fraction: float = Field(
+        default=0.0, ge=0, lt=1, description="share of the pulses at which the trigger fails"
+    )
+    time_tag: TimeTag = Field(default=TimeTag(), description="error of the UTC tags")
+    radar_snr_db: float | None = Field(default=None, description="SNR of the radar channel, dB; null: no noise")
+    sidelink_snr_db: float | None = Field(default=None, description="SNR of the sidelink, dB; null: no noise")
+    sidelink_gain_db: float = Field(default=0.0, description="gain of the direct path, dB")
+    sidelink_multipath: tuple[Reflection, ...] = Field(default=(), description="reflections of the sidelink")
+    sidelink_blockage: Blockage | None = Field(default=None, description="shadowing of the sidelink")
+    leakage: Leakage | None = Field(default=None, description="direct coupling into the radar channel")
+    transmit_ripple: Ripple | None = Field(default=None, description="of the transmitter")
+    radar_ripple: Ripple | None = Field(default=None, description="of the radar receiver")
+    sidelink_ripple: Ripple | None = Field(default=None, description="of the sidelink receiver")
+    adc: Adc = Field(default=Adc(), description="converter")
+    localization: Localization | None = Field(default=None, description="error of the logged positions")
+    doppler: bool = Field(default=False, description="motion within the pulse; off: stop and go")

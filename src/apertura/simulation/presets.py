@@ -1,93 +1,156 @@
-"""Campaigns worth flying again: the demo, and the scene of the paper."""
+"""Simulations to start from, each a specification; and the paper's scene as arrays."""
 
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
-from numpy.random import Generator
 
-from apertura.simulation.campaign import write_campaign
-from apertura.simulation.flight import Sampled, Straight, wobble
-from apertura.simulation.hidden import independent_streams
-from apertura.simulation.impairments import Impairments, TimeTag, Timing, UniformPhase
-from apertura.simulation.plan import Flight, Node, Simulation, grid_around
-from apertura.simulation.radar import Waveform, newman_codes, qpsk_codes
+from apertura.simulation.continuous import Framing
+from apertura.simulation.impairments import Impairments, Leakage, TimeTag, Timing, UniformPhase
+from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import Geometry
-from apertura.simulation.scene import Origin, PointTarget, Scatterers, Scene
+from apertura.simulation.scene import Origin, PointTarget, Scatterers
+from apertura.simulation.specification import (
+    CampaignSpecification,
+    ImageGrid,
+    SimulatedFlight,
+    SimulatedNode,
+    WaveformSpecification,
+)
+from apertura.simulation.trajectory import Straight, Wobble
 
-DEMO_ORIGIN = Origin(48.42255, 9.95509, 620.0)
-"""Middle of the demo's scene, on flat ground by the Danube."""
+DEMO_ORIGIN = Origin(48.42255, 9.95509, 620.0)  # flat ground by the Danube
+_DEMO_WAVEFORM = WaveformSpecification(1024, 1.2e9, 400e3, 3.125e-6, 0.78125e-6, 1.024e9, 20.0)
+_DEMO_TARGETS = (
+    PointTarget((0.0, 0.0, 0.0)),
+    PointTarget((-1.9, -0.7, 0.0), 0.8),
+    PointTarget((2.1, 0.9, 0.0), 0.9),
+    PointTarget((-1.0, 1.7, 0.0), 0.6),
+    PointTarget((1.3, -3.2, 0.0), 0.7),
+)
+_PRIMARY = SimulatedNode(
+    {"radar_tx": (0.1, 0.25, 0.12), "radar_rx": (0.1, 0.15, 0.12), "sidelink": (-0.2, 0.0, 0.05)},
+    {"radar": 1.374, "sidelink": 0.655},
+    impairments=Impairments(radar_snr_db=25.0, missed_fraction=0.02),
+)
+_PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")
+_PAPER_TARGETS = ((0.0, 5.0), (-4.0, 10.0), (0.0, 15.0), (4.0, 20.0), (0.0, 25.0))
+"""Cross-range and ground range, m."""
 
 
-def tandem_demo(directory: str | Path, generator: Generator, *, pulses: int = 300) -> Path:
-    """Write the campaign of `make demo`: two UAVs, one transmits, both receive, five targets on 12 m × 12 m.
+def demo(*, pulses: int = 300) -> CampaignSpecification:
+    """Return the campaign of `make demo`: two UAVs, one transmits, both receive, five targets on 12 m × 12 m.
 
     The secondary has its own clock: tags off by milliseconds, random phase and start of every capture. Both
     miss some triggers, both digitise 14 bits with noise.
 
     Parameters
     ----------
-    directory
-        The folder to make.
-    generator
-        Everything random.
     pulses
-        Pulses at 20 Hz; 300 fly 7.5 m and make about 14 MB.
+        Pulses at 20 Hz and 0.5 m/s; 300 fly 7.5 m and make about 14 MB.
     """
-    return write_campaign(directory, tandem(generator, pulses=pulses), generator)
+    tracks = {"uav1": _pass_by(-1.9, pulses), "uav2": _pass_by(2.8, pulses)}
+    nodes = {"uav1": _PRIMARY, "uav2": _secondary(0.911, 0.402, tag_s=3.7e-3)}
+    return _over_the_demo_scene("tandem_demo", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
 
 
-def tandem(generator: Generator, *, pulses: int = 300) -> Simulation:
-    """Return the demo before it is flown; the flight is along azimuth 40°, the scene to its right."""
-    codes, first, second = independent_streams(generator, 3)
-    waveform = Waveform(qpsk_codes(1024, codes), 1.2e9, "band_start", 400e3, 3.125e-6, 0.78125e-6, 1.024e9, 20.0)
-    along = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
-    right = np.array([along[1], -along[0], 0.0])
-    duration_s = (pulses - 1) / waveform.prf_hz
+def swarm(*, pulses: int = 240) -> CampaignSpecification:
+    """Return one transmitter and three more receivers, each with a clock of its own, over the demo's targets."""
+    nodes = {"uav1": _PRIMARY}
+    tracks = {"uav1": _pass_by(0.0, pulses)}
+    for number, (middle_m, right_m, up_m) in enumerate(((-4.5, -11.5, 4.6), (4.5, -11.0, 5.0), (9.0, -12.5, 5.4)), 2):
+        name = f"uav{number}"
+        nodes[name] = _secondary(0.4 * number, 0.2 * number, tag_s=1.3e-3 * (number - 3.3))
+        tracks[name] = _pass_by(middle_m, pulses, right_m=right_m, up_m=up_m)
+    return _over_the_demo_scene("swarm", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
 
-    def pass_by(middle_m: float, stream: Generator) -> Sampled:
-        start = along * (middle_m - 0.25 * duration_s) - right * 11.5 + [0.0, 0.0, 4.8]
-        velocity = 0.5 * along
-        straight = Straight((start[0], start[1], start[2]), (velocity[0], velocity[1], 0.0))
-        return wobble(straight, duration_s, stream)
 
-    uav1 = Node(
-        "uav1",
-        {"radar_tx": (0.1, 0.25, 0.12), "radar_rx": (0.1, 0.15, 0.12), "sidelink": (-0.2, 0.0, 0.05)},
-        {"radar": 1.374, "sidelink": 0.655},
-        impairments=Impairments(radar_snr_db=25.0, missed_fraction=0.02),
+def continuous(*, pulses: int = 60) -> CampaignSpecification:
+    """Return a flight whose recorders never stopped, to be triggered by the preamble before each symbol.
+
+    Parameters
+    ----------
+    pulses
+        Pulses at 1 kHz and 20 m/s; 60 make about 46 MB.
+    """
+    waveform = WaveformSpecification(200, 1.2e9, 250e3, 5e-6, 2e-6, 64e6, 1000.0)
+    velocity = (20.0, 0.0, 0.0)
+    half_m = 10e-3 * (pulses - 1)
+    tracks = {name: Straight((x - half_m, -30.0, 20.0), velocity) for name, x in (("uav1", -2.0), ("uav2", 3.0))}
+    # its own preamble, leaking in, is what triggers the transmitter to the sample; echoes alone would not
+    own = Impairments(radar_snr_db=20.0, leakage=Leakage(20.0))
+    late = Impairments(
+        timing=Timing(offset_s=7e-6), time_tag=TimeTag(offset_s=0.1e-3), radar_snr_db=20.0, sidelink_snr_db=20.0
     )
-    uav2 = Node(
-        "uav2",
-        path_offset_m={"radar": 0.911, "sidelink": 0.402},
+    return CampaignSpecification(
+        "continuous",
+        DEMO_ORIGIN,
+        waveform,
+        (PointTarget((0.0, 0.0, 0.0)), PointTarget((6.0, 12.0, 0.0), 0.7)),
+        {"uav1": SimulatedNode(impairments=own), "uav2": SimulatedNode(impairments=late)},
+        (SimulatedFlight("f01", "uav1", tracks, pulses, framing=Framing(), continuous=True),),
+        ImageGrid("EPSG:32632", half_width_m=20.0, spacing_m=0.25),
+    )
+
+
+def paper(*, pulses: int = 600) -> CampaignSpecification:
+    """Return the paper's simulated scene as a campaign: 4096 subcarriers, 30 m of straight track at 10 m height.
+
+    Parameters
+    ----------
+    pulses
+        Over the 30 s of the flight. The paper has 3000; 600, every 5 cm, are still unambiguous and make 38 MB.
+    """
+    waveform = replace(_PAPER_WAVEFORM, prf_hz=pulses / 30)
+    track = Straight((-0.5 * (pulses - 1) / waveform.prf_hz, -15.0, 10.0), (1.0, 0.0, 0.0))
+    return CampaignSpecification(
+        "paper",
+        DEMO_ORIGIN,
+        waveform,
+        tuple(PointTarget((cross, ground - 15.0, 0.0)) for cross, ground in _PAPER_TARGETS),
+        {"uav1": SimulatedNode()},
+        (SimulatedFlight("f01", "uav1", {"uav1": track}, pulses),),
+        ImageGrid("EPSG:32632", half_width_m=12.0, spacing_m=0.04),
+    )
+
+
+PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
+    made.__name__: made for made in (demo, paper, swarm, continuous)
+}
+
+
+def _over_the_demo_scene(name: str, nodes: dict[str, SimulatedNode], flight: SimulatedFlight) -> CampaignSpecification:
+    grid = ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.05)
+    return CampaignSpecification(name, DEMO_ORIGIN, _DEMO_WAVEFORM, _DEMO_TARGETS, nodes, (flight,), grid)
+
+
+def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float) -> SimulatedNode:
+    return SimulatedNode(
+        path_offset_m={"radar": radar_m, "sidelink": sidelink_m},
         attitude="none",
         log_format="pos",
         impairments=Impairments(
             carrier_phase=UniformPhase(),
             timing=Timing(offset_s=12e-9, half_width_s=40e-9),
             missed_fraction=0.03,
-            time_tag=TimeTag(offset_s=3.7e-3, jitter_s=0.2e-3),
+            time_tag=TimeTag(offset_s=tag_s, jitter_s=0.2e-3),
             radar_snr_db=25.0,
             sidelink_snr_db=30.0,
         ),
     )
-    flight = Flight("f01", "uav1", {"uav1": pass_by(-1.9, first), "uav2": pass_by(2.8, second)}, pulses)
-    grid = grid_around(DEMO_ORIGIN, "EPSG:32632", 6.0, spacing_m=0.05)
-    return Simulation("tandem_demo", waveform, demo_scene(), (uav1, uav2), (flight,), grid)
 
 
-def demo_scene() -> Scene:
-    """Return five point targets on the ground about `DEMO_ORIGIN`."""
-    targets = (
-        PointTarget((0.0, 0.0, 0.0)),
-        PointTarget((-1.9, -0.7, 0.0), 0.8),
-        PointTarget((2.1, 0.9, 0.0), 0.9),
-        PointTarget((-1.0, 1.7, 0.0), 0.6),
-        PointTarget((1.3, -3.2, 0.0), 0.7),
-    )
-    return Scene(DEMO_ORIGIN, targets)
+def _pass_by(middle_m: float, pulses: int, *, right_m: float = -11.5, up_m: float = 4.8) -> Straight:
+    """Fly along azimuth 40° at 0.5 m/s, the scene on the right; the middle of the flight is `middle_m` ahead of it."""
+    along = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
+    right = np.array([along[1], -along[0], 0.0])
+    duration_s = (pulses - 1) / _DEMO_WAVEFORM.prf_hz
+    start = along * (middle_m - 0.25 * duration_s) + right * right_m + [0.0, 0.0, up_m]
+    velocity = 0.5 * along
+    return Straight((start[0], start[1], start[2]), (velocity[0], velocity[1], 0.0), Wobble())
 
 
-def paper_waveform(*, prf_hz: float = 100.0) -> Waveform:
+def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     """Return the paper's waveform: 4096 subcarriers of 100 kHz at 1.2 GHz, 3.125 µs + 12.5 µs at 1.024 GS/s.
 
     Examples
@@ -96,7 +159,7 @@ def paper_waveform(*, prf_hz: float = 100.0) -> Waveform:
     >>> len(wave.codes) * wave.subcarrier_spacing_hz
     409600000.0
     """
-    return Waveform(newman_codes(4096), 1.2e9, "band_start", 100e3, 12.5e-6, 3.125e-6, 1.024e9, prf_hz)
+    return replace(_PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
 
 
 def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
@@ -118,7 +181,7 @@ def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float
 
     Notes
     -----
-    Source: the paper's simulation table; ../shared/DESIGN.md section 4.
+    Source: the simulation table of the paper that docs/theory.md cites.
 
     Examples
     --------
@@ -126,7 +189,7 @@ def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float
     >>> geometry.radar_tx[:, 0], scatterers.position_m[:, 1]
     (array([-15.,   0.,  15.]), array([ 5., 10., 15., 20., 25.]))
     """
-    cross_ground = np.array([(0, 5), (-4, 10), (0, 15), (4, 20), (0, 25)], np.float64)
+    cross_ground = np.array(_PAPER_TARGETS)
     scatterers = Scatterers(np.column_stack([cross_ground, np.zeros(5)]), np.ones(5, np.complex128))
     along = np.linspace(-length_m / 2, length_m / 2, pulses)
     sender = np.column_stack([along, np.zeros(pulses), np.full(pulses, 10.0)])

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Waveform:
+class TransmitWaveform:
     """One OFDM symbol per pulse: s(t) = Σ c_n exp(j2πnΔf(t − T_cp)) for 0 ≤ t < T_cp + T.
 
     Attributes
@@ -30,7 +30,7 @@ class Waveform:
 
     Examples
     --------
-    >>> paper = Waveform(np.ones(4096), 1.2e9, "band_start", 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0)
+    >>> paper = TransmitWaveform(np.ones(4096), 1.2e9, "band_start", 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0)
     >>> paper.dft_samples, paper.prefix_samples, paper.capture_samples
     (10240, 3200, 16000)
     """
@@ -156,7 +156,7 @@ def echo_paths(
 
     Notes
     -----
-    Source: ../shared/DESIGN.md section 3 (delays) and 4 (R⁻² amplitude); docs/theory/simulate.md, eq. 1.
+    Source: docs/theory/simulate.md, eq. 1.
 
     Examples
     --------

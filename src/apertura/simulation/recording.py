@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.simulation.hidden import Hidden
-from apertura.simulation.impairments import Adc, Impairments
-from apertura.simulation.radar import Floats, Paths, Waveform, direct_path, echo_paths
+from apertura.simulation.draw import ImpairmentDraw
+from apertura.simulation.impairments import Adc, ChannelName, Impairments
+from apertura.simulation.radar import Floats, Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum
 
@@ -42,14 +42,14 @@ class Geometry:
 
 
 def receive(
-    waveform: Waveform,
+    waveform: TransmitWaveform,
     scatterers: Scatterers,
     geometry: Geometry,
     *,
     impairments: Impairments,
-    hidden: Hidden,
+    draw: ImpairmentDraw,
     transmitter: Impairments | None = None,
-    path_offset_m: Mapping[str, float] | None = None,
+    path_offset_m: Mapping[ChannelName, float] | None = None,
     sidelink: bool = True,
 ) -> dict[str, Channel]:
     """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.
@@ -62,7 +62,7 @@ def receive(
         The scene.
     geometry
         Where the antennas truly are.
-    impairments, hidden
+    impairments, draw
         What is wrong with the receiving node, and what was drawn of it.
     transmitter
         Impairments of the transmitting node, for its ripple; the receiving node itself if None.
@@ -91,16 +91,28 @@ def receive(
     sent = (transmitter or impairments).transmit_ripple
     transmitted = sent.response(waveform.frequency_hz) if sent else np.ones(len(waveform.codes), np.complex128)
     power = spectral_power(waveform, echoes)
-    heard = {"radar": (_with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power), power)}
+    leaked = _with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power)
+    heard = {"radar": (leaked, power, impairments.radar_ripple, impairments.radar_snr_db)}
     if sidelink:
-        heard["sidelink"] = (_sidelink(direct, impairments, hidden), spectral_power(waveform, direct))
+        power = spectral_power(waveform, direct)
+        paths = _sidelink(direct, impairments, draw)
+        heard["sidelink"] = (paths, power, impairments.sidelink_ripple, impairments.sidelink_snr_db)
     return {
-        name: _channel(waveform, name, paths, level, transmitted=transmitted, impairments=impairments, hidden=hidden)
-        for name, (paths, level) in heard.items()
+        name: Channel(
+            waveform,
+            paths,
+            transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
+            draw.phase_rad,
+            draw.start_s,
+            cfo_hz=impairments.clock.cfo_hz,
+            sfo_hz=impairments.clock.sfo_hz,
+            noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
+        )
+        for name, (paths, power, ripple, snr_db) in heard.items()
     }
 
 
-def spectral_power(waveform: Waveform, paths: Paths, response: Complex | None = None) -> float:
+def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | None = None) -> float:
     """Return the mean of |Σ a·exp(-j2πfτ)|² over pulses and subcarriers."""
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
     parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
@@ -134,31 +146,6 @@ def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray
     return np.asarray(np.clip(counts, -limit, limit - 1), np.int16)
 
 
-def _channel(
-    waveform: Waveform,
-    name: str,
-    paths: Paths,
-    power: float,
-    *,
-    transmitted: Complex,
-    impairments: Impairments,
-    hidden: Hidden,
-) -> Channel:
-    radar = name == "radar"
-    ripple = impairments.radar_ripple if radar else impairments.sidelink_ripple
-    snr_db = impairments.radar_snr_db if radar else impairments.sidelink_snr_db
-    return Channel(
-        waveform,
-        paths,
-        transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
-        hidden.phase_rad,
-        hidden.start_s,
-        cfo_hz=impairments.clock.cfo_hz,
-        sfo_hz=impairments.clock.sfo_hz,
-        noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
-    )
-
-
 def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, offset_m: float, power: float) -> Paths:
     leakage = impairments.leakage
     if leakage is None:
@@ -168,7 +155,7 @@ def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, o
     return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
 
 
-def _sidelink(direct: Paths, impairments: Impairments, hidden: Hidden) -> Paths:
+def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw) -> Paths:
     paths = direct
     for reflection in impairments.sidelink_multipath:
         later = Paths(
@@ -178,5 +165,5 @@ def _sidelink(direct: Paths, impairments: Impairments, hidden: Hidden) -> Paths:
         )
         paths = paths.and_also(later)
     shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
-    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * hidden.blocked) / 20)
+    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * draw.blocked) / 20)
     return Paths(paths.delay_s, paths.amplitude * gain[:, None], paths.delay_rate)

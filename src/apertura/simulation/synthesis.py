@@ -5,6 +5,7 @@ time grid by an inverse DFT, or by a chirp-z transform where its sampling rate i
 echo is absent before it arrives and after it has ended.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -12,9 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.signal import CZT
 
-from apertura.simulation.radar import Floats, Paths, Waveform
+from apertura.simulation.radar import Floats, Paths, TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
@@ -44,7 +44,7 @@ class Channel:
         E|n|² of a complex sample.
     """
 
-    waveform: Waveform
+    waveform: TransmitWaveform
     paths: Paths
     response: Complex
     phase_rad: Floats
@@ -54,7 +54,7 @@ class Channel:
     noise_variance: float = 0.0
 
 
-def path_spectrum(waveform: Waveform, delay_s: Floats, amplitude: Complex) -> Complex:
+def path_spectrum(waveform: TransmitWaveform, delay_s: Floats, amplitude: Complex) -> Complex:
     """Return Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
 
     Notes
@@ -64,7 +64,7 @@ def path_spectrum(waveform: Waveform, delay_s: Floats, amplitude: Complex) -> Co
 
     Examples
     --------
-    >>> wave = Waveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
+    >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
     >>> np.angle(path_spectrum(wave, np.array([0.25e-6]), np.array([1.0 + 0j]))).round(3) + 0.0
     array([ 0.   , -1.571, -3.142,  1.571])
     """
@@ -119,7 +119,7 @@ def samples(
 
     Examples
     --------
-    >>> wave = Waveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.5e-6, 8e6, 1.0)
+    >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.5e-6, 8e6, 1.0)
     >>> path = Paths(np.array([[0.25e-6]]), np.array([[1.0 + 0j]]), np.zeros((1, 1)))
     >>> abs(samples(Channel(wave, path, np.ones(4), np.zeros(1), np.zeros(1)), None)).round(2)
     array([[0.  , 0.  , 0.  , 1.08, 0.  , 2.61, 4.  , 2.61, 0.  , 1.08, 0.  , 1.08]])
@@ -204,8 +204,11 @@ def _rotations(turns: float, first: int, count: int) -> Complex:
 
 
 @lru_cache(maxsize=8)
-def _zoom(size: int, count: int, turns: float) -> CZT:
-    return CZT(size, count, w=np.exp(2j * np.pi * turns))
+def _zoom(size: int, count: int, turns: float) -> Callable[[Complex], Complex]:
+    from scipy.signal import CZT  # slow to import, and only a sampling clock that is off needs it
+
+    transform: Callable[[Complex], Complex] = CZT(size, count, w=np.exp(2j * np.pi * turns))
+    return transform
 
 
 def sampling_rate(channel: Channel) -> float:

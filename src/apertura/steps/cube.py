@@ -1,16 +1,16 @@
-"""Rule of the cube wing: every image of the campaign on one grid, and each flight's pairs added up."""
+"""Rule `cube`: every image of the campaign on one grid, and each flight's pairs added up."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
-import zarr
 
 from apertura.campaign import Campaign
 from apertura.fusion.sums import coherent_sum, noncoherent_sum
-from apertura.steps.scene import scene_grid
+from apertura.load.scene import settled_scene
 from apertura.steps.stamping import stamped
-from apertura.store import finish, lay_out, open_stage, writing
+from apertura.store import create, finish, open_array, open_stage, writing
 
 
 def cube(campaign: Campaign) -> Path:
@@ -18,21 +18,23 @@ def cube(campaign: Campaign) -> Path:
     flights = campaign.image_flights
     pairs = sorted({pair for flight in flights for pair in flight.pairs})
     images = {
-        (flight.name, pair): open_stage(campaign.stage("image", flight.name, pair), "image")
+        f"{flight.name}/{pair}": open_stage(campaign.stage("image", flight.name, pair), "image")
         for flight in flights
         for pair in flight.pairs
     }
     side = campaign.settings.processing.tile_px
-    folder = campaign.stage("cube")
+    windows, folder = list(settled_scene(campaign).grid.tiles(side)), campaign.stage("cube")
     with writing(folder) as wip:
-        empty = _empty(images, [flight.name for flight in flights], pairs)
+        empty = stamped(
+            _empty(images, [flight.name for flight in flights], pairs), "cube", modules=[__name__], parents=images
+        )
         chunks = {"image": (1, 1, side, side), "coherent": (1, side, side), "noncoherent": (1, side, side)}
-        lay_out(wip, stamped(empty, "cube", module=__name__, parents=list(images.values())), chunks)
-        arrays = {name: zarr.open_array(wip / name, mode="r+") for name in chunks}
+        create(wip, empty, chunks)
+        arrays = {name: open_array(wip, name) for name in chunks}
         for place, flight in enumerate(flights):
-            present = [images[flight.name, pair] for pair in flight.pairs]
+            present = [images[f"{flight.name}/{pair}"] for pair in flight.pairs]
             peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present])
-            for window in scene_grid(campaign).tiles(side):
+            for window in windows:
                 stack = np.stack([image.image[window].values for image in present])
                 for pair, block in zip(flight.pairs, stack, strict=True):
                     arrays["image"][place, pairs.index(pair), *window] = block
@@ -42,7 +44,7 @@ def cube(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(images: dict[tuple[str, str], xr.Dataset], flights: list[str], pairs: list[str]) -> xr.Dataset:
+def _empty(images: Mapping[str, xr.Dataset], flights: Sequence[str], pairs: Sequence[str]) -> xr.Dataset:
     first = next(iter(images.values()))
     shape = first.image.shape
     missing = np.complex64(np.nan + 1j * np.nan)

@@ -42,7 +42,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         inputs = merged(inputs, calibration["inputs"])
     relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
-    save_stage(stamped(dataset, "echo", module=__name__, parents=parents, settings=relevant, inputs=inputs), folder)
+    save_stage(stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
 
 

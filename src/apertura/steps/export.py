@@ -1,127 +1,137 @@
-"""Rules of the export wing: rasters and pictures of one image, or of what a flight's images add up to."""
+"""Rules `export` and `export_fused`: rasters and pictures of one image, or of what a flight's images add up to."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura import __version__
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
-from apertura.contracts import canonical_json
-from apertura.export import EXPORTS
-from apertura.geometry.geodesy import local_crs
-from apertura.provenance import chained_sha256, code_sha256
-from apertura.quality.measures import Raster, coherence_factor, survey
-from apertura.quality.point_targets import Patch, find_peak, ground_position
-from apertura.scene.grid import LOCAL
-from apertura.steps.scene import scene_grid
-from apertura.store import open_stage, write_json
-
-
-@dataclass(frozen=True)
-class Amplitude:
-    """A raster of power as complex amplitudes without phase, block by block."""
-
-    power: xr.DataArray
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Rows, columns."""
-        return self.power.shape
-
-    def __getitem__(self, window: tuple[slice, slice]) -> NDArray[np.complex64]:
-        return np.asarray(np.sqrt(self.power[window].values), np.complex64)
+from apertura.export import export_modules, write_exports
+from apertura.load.scene import settled_scene
+from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256
+from apertura.quality.fused import Amplitude, coherence_of_images
+from apertura.quality.measures import Raster, survey
+from apertura.quality.point_targets import find_peak
+from apertura.scene.grid import SceneGrid
+from apertura.store import open_stage
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
-    """Write slc, power and db GeoTIFFs and the quicklook of one pair; return their paths."""
-    dataset = open_stage(campaign.stage("image", flight, pair), "image")
-    tags = _tags(dataset, dataset.attrs["quality"])
-    title = f"{campaign.settings.campaign} · flight {flight} · {pair}"
-    folder = campaign.results / flight / pair
-    return [_write(campaign, folder / name, dataset.image, tags, title) for name in EXPORTS]
+    """Write the products of one pair, or of 'fused'; return their paths."""
+    if pair == "fused":
+        return export_fused(campaign, flight)
+    image = open_stage(campaign.stage("image", flight, pair), "image")
+    origin = Provenance.of([__name__, *export_modules("pair")], [image])
+    return write_exports(
+        "pair",
+        campaign.results / flight / pair,
+        {"image": image.image},
+        titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
+        tags=origin.tags() | _quality_tags(image.attrs["quality"]),
+        **_georeference(settled_scene(campaign).grid),
+    )
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
-    """Write the coherent and non-coherent sums of a flight's pairs, and image.json; return their paths."""
-    dataset = open_stage(campaign.stage("cube"), "cube")
-    index = dataset.attrs["flights"].index(flight)
-    coherent, amplitude = dataset.coherent[index], Amplitude(dataset.noncoherent[index])
+    """Write the products of the sums of a flight's pairs, and image.json; return their paths."""
+    cube = open_stage(campaign.stage("cube"), "cube")
+    index = cube.attrs["flights"].index(flight)
+    sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
     pairs = campaign.flight(flight).pairs
-    images = [open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs]
-    quality = _worst(images)
-    tags, folder = _tags(dataset, quality), campaign.results / flight / "fused"
-    title = f"{campaign.settings.campaign} · flight {flight} · coherent sum of {' + '.join(pairs)}"
-    sums: dict[str, Raster] = {"coherent": coherent, "noncoherent": amplitude}
-    written = [
-        _write(campaign, folder / f"{kind}_{name}", sums[kind], tags, title)
-        for kind, names in (("coherent", ("slc.tif", "power.tif", "db.tif")), ("noncoherent", ("power.tif", "db.tif")))
-        for name in names
-    ]
+    images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
+    quality, name = _worst(list(images.values())), f"{campaign.settings.campaign} · flight {flight}"
+    titles = {"coherent": "coherent sum", "noncoherent": "non-coherent sum"}
+    folder, grid = campaign.results / flight / "fused", settled_scene(campaign).grid
+    written = write_exports(
+        "fused",
+        folder,
+        sums,
+        titles={source: f"{name} · {words} of {' + '.join(pairs)}" for source, words in titles.items()},
+        tags=_fused_provenance(cube, images).tags() | _quality_tags(quality),
+        **_georeference(grid),
+    )
     report = folder / "image.json"
-    write_json(report, quality | _fused_report(campaign, flight, sums, images))
-    return [*written, _write(campaign, folder / "quicklook.png", coherent, tags, title), report]
+    found = _measures(grid, campaign.settings.processing.tile_px, sums, images)
+    write_json(report, {"flight": flight, "pairs": list(pairs), **quality, **found})
+    return [*written, report]
 
 
-def _write(campaign: Campaign, path: Path, image: Raster, tags: dict[str, str], title: str) -> Path:
-    grid = scene_grid(campaign)
-    crs = local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs
-    product = path.name.removeprefix("coherent_").removeprefix("noncoherent_")
-    EXPORTS[product](path, image, transform=Affine(*grid.transform), crs=crs, tags=tags, title=title)
-    return path
+def _georeference(grid: SceneGrid) -> dict[str, Any]:
+    return {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
 
 
-def _fused_report(campaign: Campaign, flight: str, sums: dict[str, Raster], images: list[xr.Dataset]) -> dict[str, Any]:
-    grid = scene_grid(campaign)
-    windows = list(grid.tiles(campaign.settings.processing.tile_px))
-    found = {kind: survey(layer, windows) for kind, layer in sums.items()}
-    top = found["coherent"]
+def _fused_provenance(cube: xr.Dataset, images: Mapping[str, xr.Dataset]) -> Provenance:
+    """Return settings and inputs of the flight's own pairs, each apart, and the code that made the cube and its files.
+
+    The cube stands on every flight; a file of one flight does not.
+    """
+    modules = [__name__, *export_modules("fused")]
+    code = chained_sha256(code_sha256(*modules), [cube.attrs["code_sha256"]])
+    return replace(Provenance.of(modules, images), code_sha256=code)
+
+
+def _measures(
+    grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster], images: Mapping[str, xr.Dataset]
+) -> dict[str, Any]:
+    """Return what the pixels of the sums tell, and the flags of the images."""
+    windows = list(grid.tiles(tile_px))
+    surveys = {source: survey(layer, windows) for source, layer in sums.items()}
+    top = surveys["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
-    x, y = ground_position(grid, peak)
-    values = [
-        complex(Patch(image.image, top.row, top.column).at(peak.row, peak.column))
-        / image.attrs["quality"]["brightest"]["amplitude"]
-        for image in images
-    ]
+    x, y = map(float, grid.map_at(peak.row, peak.column))
+    amplitudes = [image.attrs["quality"]["brightest"]["amplitude"] for image in images.values()]
+    coherence = coherence_of_images([image.image for image in images.values()], amplitudes, (top.row, top.column), peak)
     return {
-        "flight": flight,
-        "pairs": list(campaign.flight(flight).pairs),
-        "entropy": {kind: round(layer.entropy, 6) for kind, layer in found.items()},
+        "entropy": {source: round(one.entropy, 6) for source, one in surveys.items()},
         "noise_floor_db": top.noise_floor_db,
         "brightest": {
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(np.array(values)),
+            "coherence_factor": coherence,
         },
-        "flags": {name: line for image in images for name, line in image.attrs["flags"].items()},
+        "flags": _flags(images),
     }
 
 
-def _worst(images: list[xr.Dataset]) -> dict[str, Any]:
+def _flags(images: Mapping[str, xr.Dataset]) -> dict[str, str]:
+    """Return the flags of all pairs; where pairs say different things of one flag, each with its name."""
+    raised: dict[str, dict[str, str]] = {}
+    for pair, image in images.items():
+        for flag, line in image.attrs["flags"].items():
+            raised.setdefault(flag, {})[pair] = line
+    return {
+        flag: next(iter(lines.values()))
+        if len(set(lines.values())) == 1
+        else "; ".join(f"{pair}: {line}" for pair, line in lines.items())
+        for flag, lines in raised.items()
+    }
+
+
+def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
     """Return what the errors and models of some images say of their sum."""
-    errors = ("numerical_error_db", "peak_error_db")
-    fusion = "mean of the peak-normalised images, with and without phase"
+    qualities = [image.attrs["quality"] for image in images]
+    worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
     return {
-        "models": {"fusion": fusion, "numerical_error": "that of the worst pair"},
-        **{name: max(image.attrs["quality"][name] for image in images) for name in errors},
-        "redone": [one for image in images for one in image.attrs["quality"]["redone"]],
+        "models": {
+            "fusion": "mean of the peak-normalised images, with and without phase",
+            "numerical_error": "that of the worst pair",
+        },
+        "numerical_error_db": worst["numerical_error_db"],
+        "numerical_error_std_db": worst["numerical_error_std_db"],
+        "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
+        "redone": [one for quality in qualities for one in quality["redone"]],
     }
 
 
-def _tags(dataset: xr.Dataset, quality: Mapping[str, Any]) -> dict[str, str]:
-    """Return the tags of DESIGN section 6; the export's own code ends the chain."""
+def _quality_tags(quality: Mapping[str, Any]) -> dict[str, str]:
     return {
-        "APERTURA_RUNSPEC": dataset.attrs["runspec"],
-        "APERTURA_INPUTS": canonical_json(dataset.attrs["inputs"]),
-        "APERTURA_CODE_SHA256": chained_sha256(code_sha256(__name__), [dataset.attrs["code_sha256"]]),
-        "APERTURA_VERSION": __version__,
         "APERTURA_ERROR_DB": f"{quality['numerical_error_db']:.2f}",
+        "APERTURA_ERROR_STD_DB": f"{quality['numerical_error_std_db']:.2f}",
         "APERTURA_PEAK_ERROR_DB": f"{quality['peak_error_db']:.2f}",
         "APERTURA_MODELS": canonical_json(quality["models"]),
         **({"APERTURA_REDONE": canonical_json(quality["redone"])} if quality["redone"] else {}),

@@ -1,14 +1,27 @@
 """Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import zarr
+import numpy as np
+import xarray as xr
 
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
+from apertura.contracts import Window
+from apertura.focus.engines import ENGINES
+from apertura.focus.tiles import compute_tiles
+from apertura.imaging.certify import certified, measures
+from apertura.imaging.formation import Formation
+from apertura.imaging.stages import profiles_of
 from apertura.load.antennas import antennas_report
-from apertura.steps.forming import Work
-from apertura.steps.quality import certified, measures
-from apertura.store import finish, sharing, tiles_missing, write_json, writing
+from apertura.load.pair import open_pair
+from apertura.load.plan import plan_pair
+from apertura.load.scene import OpenScene, open_scene
+from apertura.provenance import sha256_file
+from apertura.steps.stamping import stamped
+from apertura.store import finish, open_array, open_stage, resume, sharing, writing
 
 _QUOTED = ("pulses", "sidelink", "clock", "calibration")
 
@@ -18,26 +31,26 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
-    work = Work.of(campaign, flight, pair, module=__name__, threads=threads)
-    folder, echo, plan = work.folder, work.echo, work.plan
+    work = _open(campaign, flight, pair, threads=threads)
+    folder, echo, plan = work.folder, work.echo, work.formation.plan
     with writing(folder) as wip:
-        missing = tiles_missing(wip, work.empty, "image", work.windows)
-        target = zarr.open_array(wip / "image", mode="r+")
-        work.form_planned(target, missing)
+        missing = resume(wip, work.empty, "image", work.formation.windows)
+        target = open_array(wip, "image")
+        work.compute(missing, target)
+        accuracy_db = campaign.settings.processing.accuracy_db
         quality = {
             "engine": plan.engine,
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
-            **certified(work, target, plan.better, campaign.settings.processing.accuracy_db),
-            **measures(work, target),
+            **certified(work.formation, target, accuracy_db=accuracy_db, threads=threads),
+            **measures(work.formation, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
-            **work.heights.report,
+            **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
         }
-        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality.pop("crossed")}
-        zarr.open_group(wip, mode="r+").attrs.update({"quality": quality, "flags": quality["flags"]})
+        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"]}
         write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
-        finish(wip, folder)
+        finish(wip, folder, quality=quality, flags=quality["flags"])
     return folder
 
 
@@ -61,12 +74,57 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     number, jobs = (int(part) for part in share.split("-of-"))
     if not 1 <= number <= jobs:
         raise ValueError(f"{share=}: must be one of 1-of-{jobs} to {jobs}-of-{jobs}")
-    work = Work.of(campaign, flight, pair, module=__name__, threads=threads)
-    mine = work.windows[number - 1 :: jobs]
-    with sharing(work.folder, work.empty, "image", work.windows) as (wip, missing):
+    work = _open(campaign, flight, pair, threads=threads)
+    windows = work.formation.windows
+    mine = windows[number - 1 :: jobs]
+    with sharing(work.folder, work.empty, "image", windows) as (wip, missing):
         todo = [window for window in mine if window in missing]
         if todo:
-            work.form_planned(zarr.open_array(wip / "image", mode="r+"), todo)
+            work.compute(todo, open_array(wip, "image"))
     receipt = work.folder.with_name("tiles") / f"{share}.json"
-    write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.plan.setting.line})
+    write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.formation.plan.setting.line})
     return receipt
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What both rules open: where the stage goes, what it quotes, what forms it."""
+
+    folder: Path
+    echo: xr.Dataset
+    scene: OpenScene
+    formation: Formation
+    empty: xr.Dataset
+    threads: int
+
+    def compute(self, windows: list[Window], target: Any) -> None:
+        """Compute some tiles as planned."""
+        line = self.formation.plan.setting.line
+        print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
+        if windows:
+            compute_tiles(self.formation.image, windows, target, threads=self.threads)
+
+
+def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
+    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    scene, opened = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
+    if opened.history is None:
+        raise TypeError("an open echo stage holds a phase history")
+    plan = plan_pair(campaign, opened, scene, threads=threads)
+    side_px = campaign.settings.processing.tile_px
+    formation = Formation(opened.history, profiles_of(profile), scene.grid, plan, side_px, opened.beams)
+    # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
+    choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
+    empty = stamped(
+        xr.Dataset(
+            {"image": (("y", "x"), np.broadcast_to(np.complex64(0), scene.grid.shape))},
+            coords=scene.grid.coordinates,
+            attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
+        ),
+        "image",
+        modules=[__name__, *ENGINES.values()],
+        parents=[echo, profile, *scene.parents],
+        inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
+        settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
+    )
+    return _Work(campaign.stage("image", flight, pair), echo, scene, formation, empty, threads)

@@ -24,7 +24,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
         If a file is missing, damaged, or not what its format promises.
     """
     log = campaign.track_file(flight, node)
-    track = stamped(read_track(log, node=node), "track", module=__name__, inputs=_hashes(campaign, log))
+    track = stamped(read_track(log, node=node), "track", modules=[__name__], inputs=_hashes(campaign, log))
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash()
     files = list(recording.files)
@@ -34,7 +34,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
         dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
         files.append(campaign.root / recording.framing["preamble"])
     inputs = _hashes(campaign, *files)
-    raw = stamped(dataset, "raw", module=__name__, settings=settings, inputs=inputs)
+    raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=inputs)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
     save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256})
     save_stage(track, folders[1])

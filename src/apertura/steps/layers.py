@@ -1,11 +1,10 @@
 """Rule `layers`: incidence, bistatic angle, and the mask of shadow and layover, as GeoTIFFs on the campaign's grid.
 
 One layer stands for the campaign: that of the first image flight. Its pairs share the transmitter, whose incidence it
-is; the bistatic angle is the largest of the pairs'; the mask marks what any pair does not see plainly, because their
-sum does not either.
+is; the bistatic angle is the largest of the pairs'; the mask marks what any pair sees in shadow or layover, because
+their sum lacks it too.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,57 +16,56 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura import __version__
 from apertura.campaign import Campaign
-from apertura.contracts import Window, canonical_json
-from apertura.export import LAYERS
-from apertura.geometry.geodesy import local_crs
-from apertura.provenance import chained_sha256, code_sha256, merged
-from apertura.scene.grid import LOCAL, SceneGrid
-from apertura.scene.visibility import (
-    Relief,
-    antennas_over,
-    bistatic_angle_deg,
-    incidence_deg,
-    surface_normals,
-    visibility,
-)
-from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
-from apertura.steps.terrain import Heights, open_heights
+from apertura.contracts import Window
+from apertura.export import export_modules, write_exports
+from apertura.load.scene import OpenScene, open_scene
+from apertura.provenance import Provenance
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround, Terrain
+from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.store import open_stage
 
-LOOKS = 17
+MASK_PULSES = 17
 """Pulses, evenly spread over the aperture, from which shadow is decided."""
 
 _TILE_PX = 256
 
 
 def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
-    """Write results/layers/{incidence,bistatic_angle,mask}.tif; return their paths."""
-    grid, heights, flight = scene_grid(campaign), open_heights(campaign), campaign.image_flights[0]
-    echoes = [open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs]
-    rasters = _rasters(grid, heights, [_track(echo) for echo in echoes], threads=threads)
-    tags = _tags(grid, [*echoes, *heights.parents], scene_inputs(campaign))
-    crs = local_crs(campaign.settings.campaign) if grid.crs == LOCAL else grid.crs
-    folder = campaign.results / "layers"
-    for name, raster in rasters.items():
-        title = f"{campaign.settings.campaign} · flight {flight.name} · {name.removesuffix('.tif')}"
-        LAYERS[name](folder / name, raster, transform=Affine(*grid.transform), crs=crs, tags=tags, title=title)
-    return [folder / name for name in rasters]
+    """Write the products of results/layers: incidence, bistatic angle and mask; return their paths."""
+    scene, flight = open_scene(campaign), campaign.image_flights[0]
+    echoes = {pair: open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs}
+    rasters = _rasters(scene, [_track(echo) for echo in echoes.values()], threads=threads)
+    origin = Provenance.of(
+        [__name__, *export_modules("layers")],
+        {**echoes, **dict(zip(["terrain"], scene.parents, strict=False))},
+        settings=scene.spec,
+        inputs=scene.inputs,
+    )
+    return write_exports(
+        "layers",
+        campaign.results / "layers",
+        rasters,
+        titles={name: f"{campaign.settings.campaign} · flight {flight.name} · {name}" for name in rasters},
+        tags=origin.tags(),
+        transform=Affine(*scene.grid.transform),
+        crs=scene.grid.crs_wkt,
+    )
 
 
 @dataclass(frozen=True)
 class Track:
-    """Phase centres of a pair: at mid-aperture (3,), and at some looks (look, 3), metres."""
+    """Phase centres of a pair: at mid-aperture (3,), and at the pulses of the mask, 2 × (pulse, 3), metres."""
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
-    looks: tuple[NDArray[np.float64], NDArray[np.float64]]
+    spread: tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _track(echo: xr.Dataset) -> Track:
     tx, rx = echo.tx_position.values, echo.rx_position.values
-    some = np.unique(np.linspace(0, len(tx) - 1, LOOKS).round().astype(int))
+    some = np.unique(np.linspace(0, len(tx) - 1, MASK_PULSES).round().astype(int))
     return Track(tx[len(tx) // 2], rx[len(rx) // 2], (tx[some], rx[some]))
 
 
@@ -111,55 +109,44 @@ class Layer:
         return values
 
 
-def _rasters(grid: SceneGrid, heights: Heights, tracks: Sequence[Track], *, threads: int) -> dict[str, Layer]:
-    relief = None if heights.of is None else Relief.of(grid, heights.of)
-    looks = [tuple(antennas_over(grid, leg) for leg in track.looks) for track in tracks]
+def _rasters(scene: OpenScene, tracks: Sequence[Track], *, threads: int) -> dict[str, Layer]:
+    grid, terrain = scene.grid, scene.terrain
+    mask = _flat_mask(grid) if isinstance(terrain, FlatGround) else _mask(scene, tracks)
 
     def incidence(window: Window) -> NDArray[np.float64]:
-        return incidence_deg(*_surface(grid, heights, window), tracks[0].tx)
+        return incidence_deg(*_surface(grid, terrain, window), tracks[0].tx)
 
     def bistatic_angle(window: Window) -> NDArray[np.float64]:
-        position = grid[window].positions(None if heights.of is None else heights.of(window))
+        position = terrain.positions(grid[window])
         return np.asarray(np.max([bistatic_angle_deg(position, track.tx, track.rx) for track in tracks], axis=0))
 
-    def mask(window: Window) -> NDArray[np.uint8]:
-        if relief is None:
-            return np.zeros(grid[window].shape, np.uint8)
-        return np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in looks]))
-
     return {
-        "incidence.tif": Layer(grid, np.float32, incidence, threads),
-        "bistatic_angle.tif": Layer(grid, np.float32, bistatic_angle, threads),
-        "mask.tif": Layer(grid, np.uint8, mask, threads),
+        "incidence": Layer(grid, np.float32, incidence, threads),
+        "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
+        "mask": Layer(grid, np.uint8, mask, threads),
     }
 
 
-def _surface(grid: SceneGrid, heights: Heights, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and upward normals of a window; its neighbours count, so that tiles leave no seams."""
+def _flat_mask(grid: SceneGrid) -> Callable[[Window], NDArray[np.uint8]]:
+    return lambda window: np.zeros(grid[window].shape, np.uint8)
+
+
+def _mask(scene: OpenScene, tracks: Sequence[Track]) -> Callable[[Window], NDArray[np.uint8]]:
+    relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+    pairs = [tuple(relief.above(leg) for leg in track.spread) for track in tracks]
+    return lambda window: np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in pairs]))
+
+
+def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions and normals of a window; its neighbours count, so that tiles leave no seams."""
     around = [
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
         for part, size in zip(window, grid.shape, strict=True)
     ]
     rows, columns = around
     wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
-    height = None
-    if heights.of is not None:  # a grid of one row or column is continued level
-        known = [slice(axis[0], min(axis[-1] + 1, size)) for axis, size in zip(around, grid.shape, strict=True)]
-        found = heights.of((known[0], known[1]))
-        lacking = [(0, axis.size - size) for axis, size in zip(around, found.shape, strict=True)]
-        height = np.pad(found, lacking, mode="edge")
-    position = wider.positions(height)
+    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
+    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
     inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
     return position[inner], surface_normals(position)[inner]
-
-
-def _tags(grid: SceneGrid, parents: Sequence[xr.Dataset], inputs: dict[str, str]) -> dict[str, str]:
-    runspec: dict[str, Any] = {}
-    for parent in parents:
-        runspec |= json.loads(parent.attrs["runspec"])
-    return {
-        "APERTURA_RUNSPEC": canonical_json(runspec | {"grid": grid_spec(grid)}),
-        "APERTURA_INPUTS": canonical_json(merged(*(parent.attrs["inputs"] for parent in parents), inputs)),
-        "APERTURA_CODE_SHA256": chained_sha256(code_sha256(__name__), [one.attrs["code_sha256"] for one in parents]),
-        "APERTURA_VERSION": __version__,
-    }

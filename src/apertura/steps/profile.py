@@ -1,93 +1,45 @@
 """Rule `profile`: transfer functions of a pair become range profiles, cropped to what the scene needs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.errors import CampaignError
-from apertura.scene.auto_grid import clearance, swath
-from apertura.scene.grid import SceneGrid
-from apertura.steps.scene import grid_spec, scene_grid, scene_inputs
+from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
+from apertura.imaging.stages import phase_history_of
+from apertura.load.scene import open_scene
+from apertura.scene.clearance import check_antennas
+from apertura.settings import CONFIG
 from apertura.steps.stamping import stamped
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage, save_stage
-
-GUARD_SAMPLES = 32
-"""Samples beyond the swath on both sides, for the filters of the engines."""
-
-OVERSAMPLING = 2.0
 
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr."""
-    source, grid = open_stage(campaign.stage("echo", flight, pair), "echo"), scene_grid(campaign)
-    window, frequency = campaign.settings.processing.window, source.frequency.values
-    ground, places = open_heights(campaign), (source.tx_position.values, source.rx_position.values)
-    check_clearance(grid, *places, heights=ground, where=f"flight {flight}, pair {pair}")
-    nearest, farthest = swath(grid, *places, heights=ground.of)
-    _check_prefix(farthest, source.path_limit.values, where=f"flight {flight}, pair {pair}")
-    step, length = range_step(frequency, oversampling=OVERSAMPLING)
-    start = nearest - GUARD_SAMPLES * step
-    count = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
-    _check_unambiguous(count, length, step)
-    samples = compress(
-        source.transfer.values,
-        frequency,
-        weight=window_weights(window, len(frequency)),
-        reference_delay_s=source.reference_delay.values,
-        start_m=start,
-        count=count,
-        oversampling=OVERSAMPLING,
-    )
+    source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
+    history, where = phase_history_of(source, campaign.settings.processing.window), f"flight {flight}, pair {pair}"
+    check_antennas(scene.grid, scene.terrain, history.aperture, where=where)
+    window = RangeWindow.of(history.aperture, scene.grid, scene.terrain, history.frequency_hz)
+    _check_prefix(window.farthest_m, source.path_limit.values, where=where)
+    _check_unambiguous(window)
+    profiles = range_compress(history, scene.grid, scene.terrain, window=window)
     dataset = source[["time", "tx_position", "rx_position"]].assign(
-        profile=(("pulse", "range"), samples), start=("pulse", start)
+        profile=(("pulse", "range"), profiles.samples), start=("pulse", profiles.start_m)
     )
     dataset.attrs = {name: source.attrs[name] for name in ("frame", "pair", "flags")} | {
-        "step_m": step,
-        "centre_frequency_hz": centre_frequency(frequency),
-        "oversampling": length / len(frequency),
-        "window": window,
+        "step_m": profiles.step_m,
+        "centre_frequency_hz": profiles.centre_frequency_hz,
+        "oversampling": profiles.oversampling,
+        "window": campaign.settings.processing.window,
     }
     folder = campaign.stage("profile", flight, pair)
-    settings = {**campaign.relevant("profile"), "grid": grid_spec(grid)}
-    parents, inputs = [source, *ground.parents], scene_inputs(campaign)
-    save_stage(stamped(dataset, "profile", module=__name__, parents=parents, settings=settings, inputs=inputs), folder)
+    settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
+    how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": scene.inputs}
+    save_stage(stamped(dataset, "profile", **how), folder)
     return folder
-
-
-def check_clearance(
-    grid: SceneGrid, tx: NDArray[np.float64], rx: NDArray[np.float64], *, heights: Heights, where: str
-) -> None:
-    """Raise CampaignError where an antenna is not above the ground; it names what said how high the ground is.
-
-    Parameters
-    ----------
-    grid, heights
-        The scene and its ground.
-    tx, rx
-        (pulse, 3) float64 phase centres, metres, in the grid's processing frame.
-    where
-        Flight and pair.
-    """
-    source, keys = ("the ground", "scene.height_m and scene.height_datum")
-    if heights.of is not None:
-        source, keys = ("the DEM", "scene.dem (metres, not feet) and scene.dem_datum")
-    for antenna, which in ((tx, "transmitter"), (rx, "receiver")):
-        above, ground = clearance(grid, antenna, heights=heights.of)
-        low = above <= 0
-        if low.any():
-            pulse = int(np.nanargmin(above))
-            raise CampaignError(
-                f"{where}: at {int(low.sum())} pulses the {which} is in or below the ground of the scene, worst at "
-                f"pulse {pulse}: {above[pulse]:.2f} m above it, its height {above[pulse] + ground[pulse]:.2f} m where "
-                f"{source} has {ground[pulse]:.2f} m",
-                where=f"config/config.yaml: scene.{'height_m' if heights.of is None else 'dem'}",
-                expected="an antenna above the ground",
-                remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
-            )
 
 
 def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:
@@ -103,11 +55,14 @@ def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, 
         )
 
 
-def _check_unambiguous(count: int, length: int, step: float) -> None:
-    if count > length:
+def _check_unambiguous(window: RangeWindow) -> None:
+    if window.samples > window.unambiguous:
+        spans_m, most_m = (
+            (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)
+        )
         raise CampaignError(
-            f"the scene spans {(count - 2 * GUARD_SAMPLES) * step:.1f} m of total path",
-            where="config/config.yaml: scene.bounds_m",
-            expected=f"less than the unambiguous {(length - 2 * GUARD_SAMPLES) * step:.1f} m",
+            f"the scene spans {spans_m:.1f} m of total path",
+            where=f"{CONFIG}: scene.bounds_m",
+            expected=f"less than the unambiguous {most_m:.1f} m",
             remedy="Make the scene smaller.",
         )

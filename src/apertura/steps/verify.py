@@ -12,11 +12,11 @@ from rich.table import Table
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.geometry.geodesy import projected_from_ecef
+from apertura.export import product_files
+from apertura.load.scene import settled_scene
 from apertura.quality.point_targets import cut_through, find_peak
-from apertura.scene.grid import LOCAL
-from apertura.settings.flights import Flight
-from apertura.steps.scene import scene_grid
+from apertura.scene.grid import SceneGrid
+from apertura.settings import Flight
 from apertura.store import open_stage
 
 REACH_M = 1.0
@@ -59,7 +59,8 @@ def verify(campaign: Campaign) -> list[Finding]:
 
 
 def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
-    along = _along_track(campaign, flight)
+    grid = settled_scene(campaign).grid
+    along = _along_track(campaign, flight, grid)
     files = {pair: campaign.results / flight.name / pair / "slc.tif" for pair in flight.pairs}
     files["fused"] = campaign.results / flight.name / "fused" / "coherent_slc.tif"
     for name, file in files.items():
@@ -68,9 +69,9 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
                 "no such file", where=file, expected="a finished campaign", remedy="Run the workflow first."
             )
         with rasterio.open(file) as raster:
-            image, west, north, spacing = raster.read(1), raster.bounds.left, raster.bounds.top, raster.transform.a
+            image, spacing = raster.read(1), grid.spacing_m
         for number, target in enumerate(targets):
-            row, column = (north - target["y"]) / spacing - 0.5, (target["x"] - west) / spacing - 0.5
+            row, column = map(float, grid.pixel_of(target["x"], target["y"]))
             if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
                 continue
             peak = find_peak(image, *_brightest_near(image, row, column, REACH_M / 4 / spacing))
@@ -97,13 +98,12 @@ def _brightest_near(image: NDArray[np.complex64], row: float, column: float, rea
     return first[0] + int(down), first[1] + int(right)
 
 
-def _along_track(campaign: Campaign, flight: Flight) -> tuple[float, float]:
+def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[float, float]:
     """Return the transmitter's direction over ground as (east, north)."""
     echo = open_stage(campaign.stage("echo", flight.name, flight.pairs[0]), "echo")
     ends = echo.tx_position.values[[0, -1]]
-    crs = scene_grid(campaign).crs
-    east, north, _ = np.diff(ends if crs == LOCAL else projected_from_ecef(crs, ends), axis=0)[0]
-    return float(east), float(north)
+    down, right, _ = np.diff(grid.pixel_below(ends), axis=0)[0]
+    return float(right), float(-down)
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
@@ -122,8 +122,8 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
     console.print(table)
     console.print(_quality(campaign))
     if paths:
-        for path in sorted(campaign.results.rglob("*.tif")) + sorted(campaign.results.rglob("quicklook.png")):
-            print(path)
+        for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
+            print(campaign.results / file)
 
 
 def _quality(campaign: Campaign) -> Table:

@@ -1,18 +1,20 @@
-"""Whole stages: saved at once, opened after checking."""
+"""Stages saved at once, and opened after checking."""
 
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-
-import xarray as xr
+from typing import TYPE_CHECKING, Any
 
 from apertura.contracts import check
-from apertura.store.locks import finish, writing
-from apertura.store.manifest import check_whole
+from apertura.store.manifest import check_files
+from apertura.store.progress import finish, writable_zarr, writing
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
-def save_stage(dataset: xr.Dataset, folder: Path, *, chunks: Mapping[str, int] | None = None) -> None:
-    """Write a whole stage at once: `folder`.wip, rename, manifest.
+def save_stage(dataset: "xr.Dataset", folder: Path, *, chunks: Mapping[str, int] | None = None) -> None:
+    """Write a stage at once: `folder`.wip, rename, manifest.
 
     Parameters
     ----------
@@ -23,23 +25,24 @@ def save_stage(dataset: xr.Dataset, folder: Path, *, chunks: Mapping[str, int] |
     chunks
         Dimension → chunk length; a dimension not named is one chunk.
     """
+    writable_zarr()
     with writing(folder) as wip:
         shutil.rmtree(wip, ignore_errors=True)
-        encoding = {
+        encoding: dict[Any, dict[str, Any]] = {
             name: {"chunks": tuple((chunks or {}).get(str(dim), size) for dim, size in array.sizes.items())}
             for name, array in dataset.variables.items()
             if array.ndim and array.size
         }
         for name in set(encoding) & {"time"}:
-            encoding[name] |= {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}  # type: ignore[dict-item]
+            encoding[name] |= {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
         for name, array in dataset.data_vars.items():
             if "spatial_ref" in dataset.variables and {"y", "x"} <= set(array.dims):
-                encoding[name]["grid_mapping"] = "spatial_ref"  # type: ignore[assignment]
+                encoding[name]["grid_mapping"] = "spatial_ref"
         dataset.to_zarr(wip, mode="w", consolidated=False, zarr_format=3, encoding=encoding)
         finish(wip, folder)
 
 
-def open_stage(folder: Path, stage: str) -> xr.Dataset:
+def open_stage(folder: Path, stage: str) -> "xr.Dataset":
     """Open a finished stage lazily after checking its files against the manifest and its arrays against the contract.
 
     Raises
@@ -49,5 +52,7 @@ def open_stage(folder: Path, stage: str) -> xr.Dataset:
     ContractError
         If its arrays break the contract.
     """
-    check_whole(folder)
+    import xarray as xr
+
+    check_files(folder)
     return check(xr.open_zarr(folder, consolidated=False, chunks=None), stage)

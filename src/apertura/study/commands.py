@@ -1,4 +1,4 @@
-"""`apertura study …`: each job of the studies as one command; a file that is there is finished."""
+"""`apertura study …`: each job of the studies as one command; a file that exists is complete."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 if TYPE_CHECKING:
     from apertura.study.paper.claims import Claim
 
-app = typer.Typer(no_args_is_help=True, help="The paper's claims and the stability atlas.")
+app = typer.Typer(no_args_is_help=True, help="The paper's claims, and the stability of every correction.")
 
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
@@ -34,10 +34,11 @@ Folder = Annotated[Path, typer.Option("--folder", help="where results are writte
 @app.command()
 def paper_part(part: str, folder: Folder = PAPER) -> None:
     """Compute some rows of the claims table, parts/PART.csv."""
-    from apertura.study.paper.claims import write_claims
+    from apertura.study.tables import write_table
 
-    write_claims(folder / "parts" / f"{part}.csv", _claims(part)())
-    typer.echo(folder / "parts" / f"{part}.csv")
+    path = folder / "parts" / f"{part}.csv"
+    write_table(path, _claims(part)())
+    typer.echo(path)
 
 
 def _claims(part: str) -> "Callable[[], list[Claim]]":
@@ -58,12 +59,12 @@ def _claims(part: str) -> "Callable[[], list[Claim]]":
 @app.command()
 def paper_claims(folder: Folder = PAPER) -> None:
     """Put the parts together: claims.csv."""
-    from apertura.study.paper.claims import read_claims, write_claims
+    from apertura.study.paper.claims import Claim
+    from apertura.study.tables import read_table, write_table
 
-    write_claims(
-        folder / "claims.csv", [row for part in PAPER_PARTS for row in read_claims(folder / "parts" / f"{part}.csv")]
-    )
-    typer.echo(folder / "claims.csv")
+    path = folder / "claims.csv"
+    write_table(path, [row for part in PAPER_PARTS for row in read_table(folder / "parts" / f"{part}.csv", Claim)])
+    typer.echo(path)
 
 
 @app.command()
@@ -77,19 +78,20 @@ def paper_figure(error: str, folder: Folder = PAPER) -> None:
 @app.command()
 def stability_sweep(impairment: str, method: str, folder: Folder = STABILITY) -> None:
     """Sweep one impairment under one correction, parts/IMPAIRMENT.METHOD.csv."""
-    from apertura.study.stability.atlas import part_path, write_outcomes
     from apertura.study.stability.outcomes import run_sweep
+    from apertura.study.stability.summary import part_path
+    from apertura.study.tables import write_table
 
     path = part_path(folder, impairment, method)
-    write_outcomes(path, run_sweep(impairment, method))
+    write_table(path, run_sweep(impairment, method))
     typer.echo(path)
 
 
 @app.command()
 def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
     """Put the corrections of one impairment together: IMPAIRMENT.csv and .png."""
-    from apertura.study.stability.atlas import join_parts
     from apertura.study.stability.charts import draw_impairment
+    from apertura.study.stability.summary import join_parts
 
     outcomes = join_parts(folder, impairment)
     draw_impairment(impairment, outcomes, folder / f"{impairment}.png")
@@ -99,8 +101,8 @@ def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
 @app.command()
 def stability_summary(folder: Folder = STABILITY) -> None:
     """Where the loss passes 1 and 3 dB, and how far `auto` is from the best: summary.csv, .png, sidelink.csv."""
-    from apertura.study.stability.atlas import write_sidelink_table, write_summary
     from apertura.study.stability.charts import draw_summary
+    from apertura.study.stability.summary import write_sidelink_tables, write_summary
 
     draw_summary(write_summary(folder), folder / "summary.png")
-    typer.echo(write_sidelink_table(folder))
+    typer.echo(write_sidelink_tables(folder))

@@ -5,14 +5,16 @@ the GIL and start no threads of their own. Without a compiler at installation `a
 """
 
 import ctypes
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.binding import (
+from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.native_binding import (
     INSTRUCTION_SETS,
     ApertureJob,
     BeamJob,
@@ -21,12 +23,28 @@ from apertura.focus.engines.binding import (
     call,
     instruction_set,
 )
-from apertura.focus.engines.tables import MARGIN, TAPS, Plan, Tables, plan
+from apertura.focus.engines.native_constants import KERNEL
+from apertura.focus.engines.native_prediction import candidates
+from apertura.focus.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table
 from apertura.focus.inputs import Profiles
 
-__all__ = ["INSTRUCTION_SETS", "PATCH", "available", "form", "instruction_set", "prepare"]
+__all__ = ["INSTRUCTION_SETS", "PATCH", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
 
-PATCH = 16  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
+READS: Literal["profiles"] = "profiles"
+PATCH = KERNEL.patch_side  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
+
+
+class Options(EngineOptions):
+    """What may be asked of the engine."""
+
+    degree: Annotated[int, Field(ge=1, le=2)] | None = Field(None, description="of the polynomials in a table cell")
+    oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
+        None, description="table cells per resolution cell c/B of total path"
+    )
+    tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
+        None, description="largest phase error that the path series may make, rad"
+    )
+    accumulate: Literal["complex64", "complex128"] | None = Field(None, description="type of sums over pulses")
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Tables:
@@ -63,15 +81,15 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
         raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
     samples = np.ascontiguousarray(profiles.samples, np.complex64)
     start_m = np.ascontiguousarray(profiles.start_m, np.float64)
-    places = [np.asarray(p, np.float64) for p in (profiles.tx_position_m, profiles.rx_position_m)]
+    places = [np.asarray(p, np.float64) for p in profiles.aperture.legs]
     if not len(samples):
         raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
     if not all(np.isfinite(values).all() for values in (start_m, *places)):
         raise ValueError("phase centres and starts of the profiles must be finite")
     wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-    design = plan(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=degree)
+    design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=degree)
     cell_m = profiles.step_m * design.down / design.up
-    padding = [(0, -len(samples) % 8)]
+    padding = [(0, -len(samples) % KERNEL.batch)]
     return Tables(
         cells=_expand(samples, np.exp(1j * _turn(wavenumber * start_m)), wavenumber * cell_m, design, degree),
         transmitter_m=np.ascontiguousarray(np.pad(places[0], [*padding, (0, 0)], mode="edge").T),
@@ -79,8 +97,8 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
         first_path_m=np.pad(start_m - MARGIN * cell_m, padding, mode="edge"),
         cell_m=cell_m,
         carrier_rad_per_cell=wavenumber * cell_m,
-        phase_form=design.phase_form,
-        phase=design.phase,
+        phase_polynomial=design.phase_polynomial,
+        phase_coefficients=design.phase_coefficients,
         degree=degree,
         error_db=design.error_db(np.ones(1)),
     )
@@ -109,11 +127,11 @@ def form(
     accumulate
         Type of the sum over blocks of pulses.
     tolerance_rad
-        Largest phase error the fast forms may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
-        would exceed it are computed pixel by pixel in float64.
+        Largest phase error the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
+        would exceed it take exact paths, pixel by pixel in float64.
     counts
-        (4,) int64 to which the number of patches × pulses is added that took the shared curvature, each
-        block's own curvature, the exact way, or had no echo.
+        (4,) int64 to which the number of patches × pulses is added that took shared curvature, own
+        curvature, exact paths, or had no echo.
 
     Returns
     -------
@@ -151,8 +169,8 @@ def form(
         pixels.ctypes.data, image.ctypes.data, tally.ctypes.data,
         len(tables.cells), padded, tables.cells.shape[2], *image.shape,
         1 / tables.cell_m, tables.carrier_rad_per_cell, tolerance_rad,
-        tables.degree, tables.phase_form, accumulate == "complex128", (ctypes.c_float * 9)(*tables.phase),
-        pointers,
+        tables.degree, tables.phase_polynomial, accumulate == "complex128",
+        (ctypes.c_float * 9)(*tables.phase_coefficients), pointers,
     )  # fmt: skip
     call("apertura_image", job)
     if counts is not None:
@@ -185,7 +203,7 @@ def _expand(
     samples: NDArray[np.complex64],
     turn: NDArray[np.complex128],
     carrier_rad_per_cell: float,
-    design: Plan,
+    design: TableDesign,
     degree: int,
 ) -> NDArray[np.float32]:
     """Return the cells of `Tables`; `turn` is the carrier at the first sample of each pulse."""

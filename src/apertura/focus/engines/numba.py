@@ -1,18 +1,92 @@
 """Backprojection by interpolation in an oversampled range table, compiled by numba."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.engines.engine import BEAM_S, EngineOptions, Setting, asked_or, power_sum_db
+from apertura.focus.engines.native_tables import BAND, band_error_db
 from apertura.focus.inputs import Profiles
+from apertura.focus.job import Job
+from apertura.geometry.aperture import Aperture
 
+READS: Literal["profiles"] = "profiles"
+OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
+
+_SAMPLE_S = 3.1e-8  # per pulse and fine sample
+_PIXEL_S = 3.2e-8  # per pixel and pulse
+_REFINED_DB = -98.0  # the sinc filter of the table
 _HALF_TAPS = 10
 _PIXELS_AT_ONCE = 1024  # whose weights are held at once
 _KAISER_BETA = 10.0  # -100 dB, with half the band free for the transition
+
+
+class Options(EngineOptions):
+    """What may be asked of the engine."""
+
+    oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
+        None, description="table samples per resolution cell c/B of total path"
+    )
+
+
+def available() -> bool:
+    """Return True: numba is installed with the package."""
+    return True
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+    """Yield a setting per oversampling, as `apertura.focus.engines.engine.Engine` describes.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "Error" and "Cost".
+    """
+    signal, wanted = job.signal, asked_or(asked, "oversampling", OVERSAMPLINGS)
+    form_s = job.pixels * pulses * (_PIXEL_S + job.antennas * BEAM_S)
+    for oversampling in wanted:
+        if oversampling < signal.oversampling and len(wanted) > 1:
+            continue
+        factor = max(1, round(oversampling / signal.oversampling))
+        samples = pulses * signal.samples * factor
+        cubic_db = cubic_error_db(signal.oversampling * factor, signal.window)
+        reason = f"cubic interpolation of a {signal.oversampling * factor:.3g}× table errs by {cubic_db:.1f} dB"
+        yield Setting(
+            "numba",
+            {"oversampling": oversampling},
+            {},
+            power_sum_db(cubic_db, _REFINED_DB),
+            form_s,
+            table_seconds=samples * _SAMPLE_S,
+            table_bytes=8 * samples,
+            reasons={"oversampling": reason},
+        )
+
+
+def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
+    """Return the RMS error of four-point Lagrange interpolation of echoes that a window (subcarrier,) weighs, dB.
+
+    Examples
+    --------
+    >>> [round(cubic_error_db(n, window)) for window in (np.ones(64), np.hanning(64)) for n in (4, 8)]
+    [-54, -78, -72, -95]
+    """
+    omega = np.pi / oversampling * BAND
+    u = np.linspace(0, 1, 41)[:, None]
+    weights = (
+        -u * (u - 1) * (u - 2) / 6,
+        (u + 1) * (u - 1) * (u - 2) / 2,
+        -(u + 1) * u * (u - 2) / 2,
+        (u + 1) * u * (u - 1) / 6,
+    )
+    value = sum(weight * np.exp(1j * omega * (n - 1)) for n, weight in enumerate(weights))
+    return band_error_db((np.abs(value - np.exp(1j * omega * u)) ** 2).mean(axis=0), window)
 
 
 @dataclass(frozen=True)
@@ -29,16 +103,15 @@ class Tables:
         Total path between samples.
     wavenumber_rad_m
         2πf_mid/c.
-    tx_position_m, rx_position_m
-        (pulse, 3) float64.
+    aperture
+        Phase centres in the frame of the pixels.
     """
 
     samples: NDArray[np.complex64]
     start_m: NDArray[np.float64]
     step_m: float
     wavenumber_rad_m: float
-    tx_position_m: NDArray[np.float64]
-    rx_position_m: NDArray[np.float64]
+    aperture: Aperture
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
@@ -58,8 +131,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
         profiles.start_m,
         profiles.step_m / factor,
         2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S,
-        profiles.tx_position_m,
-        profiles.rx_position_m,
+        profiles.aperture,
     )
 
 
@@ -119,7 +191,6 @@ def form(tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = N
     """
     flat = np.ascontiguousarray(pixels.reshape(-1, 3))
     image = np.zeros(len(flat), np.complex128)
-    centres = (tables.tx_position_m, tables.rx_position_m)
     none, at_once = np.empty((0, 0)), len(flat) if beams is None else _PIXELS_AT_ONCE
     for first in range(0, len(flat), at_once):
         part = slice(first, first + at_once)
@@ -128,9 +199,9 @@ def form(tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = N
             tables.start_m,
             tables.step_m,
             tables.wavenumber_rad_m,
-            *centres,
+            *tables.aperture.legs,
             flat[part],
-            none if beams is None else beams.weight(*centres, flat[part]),
+            none if beams is None else beams.weight(tables.aperture, flat[part]),
             image[part],
         )
     return image.reshape(pixels.shape[:-1]).astype(np.complex64)

@@ -1,27 +1,51 @@
 """The double sum over pulses and subcarriers in float64: slow, and what every other engine answers to."""
 
+from collections.abc import Mapping
+from typing import Any, Literal
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.inputs import Spectra
+from apertura.focus.engines.engine import BEAM_S, EngineOptions, Setting
+from apertura.focus.inputs import PhaseHistory
+from apertura.focus.job import Job
+
+READS: Literal["phase_history"] = "phase_history"
 
 _PULSES_AT_ONCE = 16
+_SUBCARRIER_S = 5.3e-10  # per pixel, pulse and subcarrier
+_ERROR_DB = -140.0  # images are complex64
 
 
-def prepare(spectra: Spectra) -> Spectra:
-    """Return the spectra as they are: the double sum needs no table."""
-    return spectra
+class Options(EngineOptions):
+    """The double sum has no options."""
 
 
-def form(spectra: Spectra, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex128]:
+def available() -> bool:
+    """Return True: it runs everywhere."""
+    return True
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
+    """Return its one setting, as `apertura.focus.engines.engine.Engine` describes."""
+    each = job.subcarriers * _SUBCARRIER_S + job.antennas * BEAM_S
+    return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * each)]
+
+
+def prepare(history: PhaseHistory) -> PhaseHistory:
+    """Return the phase history as it is: the double sum needs no table."""
+    return history
+
+
+def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex128]:
     """Return the matched filter ΣΣ w_n H_n exp(+j2πf_n(τ-τ_ref)) over pulses and subcarriers at each pixel.
 
     Parameters
     ----------
-    spectra
+    history
         Calibrated transfer functions, subcarriers equally spaced.
     pixels
         (..., 3) float64, metres, in the frame of the phase centres.
@@ -39,36 +63,31 @@ def form(spectra: Spectra, pixels: NDArray[np.float64], *, beams: Beams | None =
 
     Examples
     --------
+    >>> from apertura.geometry.aperture import Aperture
     >>> f = 1e9 + 1e6 * np.arange(8)
     >>> tx = np.array([[0.0, 0.0, 10.0]])
     >>> echo = np.exp(-2j * np.pi * f * 20 / SPEED_OF_LIGHT_M_S).astype(np.complex64)[None]
-    >>> spectra = Spectra(echo, f, np.full(8, 1 / 8), np.zeros(1), tx, tx)
-    >>> form(spectra, np.zeros((1, 1, 3))).round(6) + 0.0
+    >>> history = PhaseHistory(echo, f, np.full(8, 1 / 8), np.zeros(1), Aperture(tx, tx))
+    >>> form(history, np.zeros((1, 1, 3))).round(6) + 0.0
     array([[1.+0.j]])
     """
     flat = pixels.reshape(-1, 3)
     image = np.zeros(len(flat), np.complex128)
-    for first in range(0, len(spectra.transfer), _PULSES_AT_ONCE):
+    for first in range(0, len(history), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        image += terms(spectra, flat, beams, pulses=pulses).sum(axis=0)
+        image += terms(history[pulses], flat, beams and beams[pulses]).sum(axis=0)
     return image.reshape(pixels.shape[:-1])
 
 
-def terms(
-    spectra: Spectra, pixels: NDArray[np.float64], beams: Beams | None = None, *, pulses: slice = slice(None)
-) -> NDArray[np.complex128]:
+def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | None = None) -> NDArray[np.complex128]:
     """Return what each pulse adds at each pixel: the sum over subcarriers alone.
 
     Parameters
     ----------
-    spectra
+    history, beams
         As `form`.
     pixels
         (pixel, 3) float64, metres.
-    beams
-        As `form`.
-    pulses
-        Which pulses; all by default.
 
     Returns
     -------
@@ -80,18 +99,14 @@ def terms(
     The sum is a polynomial in exp(j2πΔfτ), evaluated by Horner's rule: one rounding per term, 1e-12 for
     thousands of them, and no table or interpolation.
     """
-    frequency = spectra.frequency_hz
+    frequency = history.frequency_hz
     step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)
-    weighted = spectra.transfer[pulses] * spectra.weight
-    path = sum(
-        np.linalg.norm(pixels - centre[pulses, None], axis=-1)
-        for centre in (spectra.tx_position_m, spectra.rx_position_m)
-    )
-    delay = path / SPEED_OF_LIGHT_M_S - spectra.reference_delay_s[pulses, None]
+    weighted = history.transfer * history.weight
+    delay = history.aperture.path(pixels) / SPEED_OF_LIGHT_M_S - history.reference_delay_s[:, None]
     total = _polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
     total *= np.exp(2j * np.pi * (frequency[0] * delay % 1.0))
     if beams is not None:
-        total *= beams.weight(spectra.tx_position_m, spectra.rx_position_m, pixels, pulses=pulses)
+        total *= beams.weight(history.aperture, pixels)
     return np.asarray(total)
 
 

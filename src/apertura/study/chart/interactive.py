@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from apertura.atomic import write_text
+
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>@TITLE@</title>
 <style>
@@ -39,7 +41,7 @@ const make = (name,attributes,text) => {
   if (text!==undefined) node.textContent = text;
   svg.appendChild(node); return node;
 };
-const thin = p => p.pulse_thinning>1 ? `, ${p.pulse_thinning}:1 pulses` : "";
+const thin = p => p.presum>1 ? `, ${p.presum}:1 pulses` : "";
 const words = p => `${p.setting}${thin(p)}: ${p.seconds.toPrecision(3)} s `
   +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db.toFixed(1)} dB (predicted `
   +`${p.predicted_error_db.toFixed(1)}), ${p.pixel_pulses_per_s.toExponential(2)} pixel·pulses/s`
@@ -70,7 +72,7 @@ function draw() {
     mark.addEventListener("pointerenter",()=>{document.getElementById("tip").textContent = words(p);});
   }
 }
-const columns = ["setting","pulse_thinning","seconds","predicted_seconds","error_db","predicted_error_db",
+const columns = ["setting","presum","seconds","predicted_seconds","error_db","predicted_error_db",
   "pixel_pulses_per_s"];
 function table(by="seconds") {
   const rows = document.getElementById("rows"), head = document.createElement("tr"); rows.replaceChildren(head);
@@ -114,6 +116,4 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
     """
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
     page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}").replace("@POINTS@", data)
-    draft = path.with_name(path.name + ".wip")
-    draft.write_text(page, encoding="utf-8")
-    draft.replace(path)
+    write_text(path, page)

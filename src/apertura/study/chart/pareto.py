@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from apertura.atomic import replacement
 from apertura.study.stability.charts import save
 
 LOOKS = {
@@ -23,7 +24,7 @@ class Point:
 
     engine: str
     setting: str
-    pulse_thinning: int
+    presum: int
     seconds: float
     pixel_pulses_per_s: float
     error_db: float
@@ -44,7 +45,7 @@ def with_front(points: Sequence[Point]) -> list[Point]:
 
 def write_points(points: Sequence[Point], path: Path) -> None:
     """Write the points as CSV, one line each."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
         table.writeheader()
         for point in points:
@@ -90,7 +91,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     )
     for point in points:
         if point.planned:
-            thin = f", {point.pulse_thinning}:1 pulses" if point.pulse_thinning > 1 else ""
+            thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
             label = f"planner's choice: {point.setting}{thin}"
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
     axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")

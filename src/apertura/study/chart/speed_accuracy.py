@@ -11,18 +11,16 @@ from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
-from apertura.focus.engines import ENGINES, reference
-from apertura.focus.inputs import Profiles, Spectra
-from apertura.load.inputs import profiles_of
-from apertura.load.pair import campaign_grid, outlook_of
-from apertura.planning.candidates import Setting, candidates
-from apertura.planning.cost import Costs, Load, tile_seconds
-from apertura.planning.plan import Job, Plan
+from apertura.focus.engines import load_engine, reference
+from apertura.focus.engines.engine import Setting
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.imaging.stages import profiles_of
+from apertura.load.pair import open_pair
+from apertura.load.plan import job_of, plan_job
+from apertura.load.scene import OpenScene, open_scene
+from apertura.planning.plan import Plan
+from apertura.planning.search import Search
 from apertura.quality.measures import numerical_error
-from apertura.scene.grid import SceneGrid
-from apertura.steps.costs import campaign_costs
-from apertura.steps.plan import campaign_job, plan_job
-from apertura.steps.terrain import Heights, open_heights
 from apertura.store import open_stage
 from apertura.study.chart.interactive import write_page
 from apertura.study.chart.pareto import Point, draw_points, with_front, write_points
@@ -40,7 +38,7 @@ class Part:
 
     Attributes
     ----------
-    spectra, profiles
+    history, profiles
         Of the block.
     pixels
         (y, x, 3) float64, the window.
@@ -48,20 +46,20 @@ class Part:
         (pixel, 2) int64, rows and columns in the window whose exact values are known.
     exact
         (pixel,) complex128.
-    whole
-        What the whole image is: pixels and pulses.
+    total_pixels
+        Of the whole image.
     reference_seconds
         What the exact values took.
     beams
         Of the antennas over the block, where they have any.
     """
 
-    spectra: Spectra
+    history: PhaseHistory
     profiles: Profiles
     pixels: NDArray[np.float64]
     picked: NDArray[np.int64]
     exact: NDArray[np.complex128]
-    whole: Load
+    total_pixels: int
     reference_seconds: float
     beams: Beams | None = None
 
@@ -81,28 +79,27 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
     adds to the planned error is added to that of every setting.
     """
-    outlook = outlook_of(campaign, flight, pair)
-    grid, processing = campaign_grid(campaign, outlook), campaign.settings.processing
+    opened = open_pair(campaign, flight, pair)
+    scene, processing = open_scene(campaign), campaign.settings.processing
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
-    middle = len(outlook.tx) // 2
+    middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
-    if outlook.spectra is None:
+    if opened.history is None:
         raise ValueError("the echo stage is not there")
-    spectra, beams = outlook.spectra.of_pulses(block), outlook.beams and outlook.beams.at(block)
-    outlook = replace(outlook, tx=outlook.tx[block], rx=outlook.rx[block], spectra=spectra, beams=beams)
-    heights = open_heights(campaign)
-    job = campaign_job(campaign, pair, outlook, grid, heights)
-    plan, costs = plan_job(campaign, job), campaign_costs(campaign)
-    part = _part(spectra, profiles.of_pulses(block), grid, heights, whole=job.load, beams=beams)
+    history, beams = opened.history[block], opened.beams and opened.beams[block]
+    opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
+    job = job_of(campaign, opened, scene)
+    plan, search = plan_job(campaign, job), Search(job)
+    part = _part(history, profiles[block], scene, total_pixels=job.pixels, beams=beams)
     points = [
         replace(
             point,
-            predicted_seconds=point.predicted_seconds - tile_seconds(costs, job.load),
+            predicted_seconds=point.predicted_seconds - search.tile_seconds,
             predicted_error_db=point.predicted_error_db + (0.0 if point.planned else max(0.0, job.content_db or 0.0)),
         )
-        for point in measure(part, plan, _settings(job, costs), seconds=seconds)
+        for point in measure(part, plan, _settings(search), seconds=seconds)
     ]
-    size = f"{grid.shape[0]} × {grid.shape[1]} pixels, {len(outlook.tx)} pulses"
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     paths[0].parent.mkdir(parents=True, exist_ok=True)
@@ -113,25 +110,31 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
 
 
 def _part(
-    spectra: Spectra, profiles: Profiles, grid: SceneGrid, heights: Heights, *, whole: Load, beams: Beams | None
+    history: PhaseHistory,
+    profiles: Profiles,
+    scene: OpenScene,
+    *,
+    total_pixels: int,
+    beams: Beams | None,
 ) -> Part:
     window = []
-    for size in grid.shape:
+    for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
         window.append(slice(first, min(size, first + SIDE_PX)))
-    pixels = grid[window[0], window[1]].positions(heights.of((window[0], window[1])) if heights.of else None)
+    pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
     picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
     begin = perf_counter()
-    exact = reference.form(spectra, pixels[picked[:, 0], picked[:, 1]], beams=beams)
-    return Part(spectra, profiles, pixels, picked, exact, whole, perf_counter() - begin, beams)
+    exact = reference.form(history, pixels[picked[:, 0], picked[:, 1]], beams=beams)
+    return Part(history, profiles, pixels, picked, exact, total_pixels, perf_counter() - begin, beams)
 
 
-def _settings(job: Job, costs: Costs) -> list[Setting]:
-    """Return the settings to measure, cheapest first."""
+def _settings(search: Search) -> list[Setting]:
+    """Return the settings to measure, cheapest first: of each engine, all but the reference."""
     return [
         setting
-        for setting in candidates(job.view, job.signal, job.load, costs)
-        if setting.engine == "numba" or setting.form_options.get("tolerance_rad") in _TOLERANCES_RAD
+        for setting in search.settings(len(search.job.aperture))
+        if setting.engine != "reference"
+        and setting.form_options.get("tolerance_rad", _TOLERANCES_RAD[0]) in _TOLERANCES_RAD
     ]
 
 
@@ -150,11 +153,11 @@ def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: flo
 
 
 def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
-    engine = ENGINES[setting.engine]
+    engine = load_engine(setting.engine)
     thinning = 1 if plan is None or plan.presum is None else plan.presum.factor
 
     def prepare() -> Any:
-        history = part.profiles if plan is None else plan.history(part.profiles)
+        history = part.profiles if plan is None else plan.inputs(part.profiles)
         return engine.prepare(history, **setting.options)
 
     tables_s, prepared = _least(prepare, repeats=2)
@@ -162,7 +165,7 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     if setting.engine == "numba":  # any shape of pixels will do, so errors need not wait for the whole window
         engine.form(prepared, part.pixels[:1, :1], beams=part.beams)
         rows = max(
-            1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.whole.pixels / part.pixels.shape[1]))
+            1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]))
         )
         values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None], beams=part.beams)[0]
         form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows], beams=part.beams), repeats=2)
@@ -172,15 +175,15 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
         )
         values = image[part.picked[:, 0], part.picked[:, 1]]
     pixels = rows * part.pixels.shape[1]
-    taken = tables_s + form_s * part.whole.pixels / pixels
+    taken = tables_s + form_s * part.total_pixels / pixels
     error_db = numerical_error(values.astype(np.complex64), part.exact).rms_db
     predicted_db = setting.error_db if plan is None else plan.predicted_error_db
     return _point(part, setting, thinning, taken, error_db, predicted_db, planned=plan is not None)
 
 
 def _reference_point(part: Part, plan: Plan) -> Point:
-    setting = plan.better[-1] if plan.better else plan.setting
-    taken = part.reference_seconds * part.whole.pixels / PIXELS
+    setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
+    taken = part.reference_seconds * part.total_pixels / PIXELS
     values = part.exact.astype(np.complex64)
     error_db = numerical_error(values, part.exact).rms_db
     return _point(part, setting, 1, taken, error_db, setting.error_db, planned=plan.engine == "reference")
@@ -199,9 +202,9 @@ def _point(
     return Point(
         engine=setting.engine,
         setting=setting.line,
-        pulse_thinning=thinning,
+        presum=thinning,
         seconds=taken,
-        pixel_pulses_per_s=part.whole.pixels * part.whole.pulses / taken,
+        pixel_pulses_per_s=part.total_pixels * len(part.profiles) / taken,
         error_db=error_db,
         predicted_seconds=setting.seconds,
         predicted_error_db=predicted_db,

@@ -1,9 +1,6 @@
-"""A claim of the paper beside what this project computes of it, and how such rows are kept."""
+"""One row of the claims table: what is expected, by whom, what this project computes, and the verdict."""
 
-import csv
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -14,16 +11,23 @@ class Claim:
     ----------
     claim
         What is claimed, in words.
-    claimed, computed
-        Values in `unit`; `computed` may carry a spread.
+    paper
+        Value that the source paper prints; empty where it prints none.
+    independent_model
+        Value of a model that shares no code with this project, or of a closed form; empty where the paper's stands.
+        Both are empty for requirements that this project sets itself.
+    computed
+        Value of this project.
     unit
-        Of both.
+        Of all three.
     verdict
-        Whether they agree, and a note where the paper contradicts itself.
+        How `computed` compares with what is given, and a note where the paper contradicts itself. It begins with
+        "consistency check" where something was fitted to the expected value, so that agreeing proves little.
     """
 
     claim: str
-    claimed: str
+    paper: str
+    independent_model: str
     computed: str
     unit: str
     verdict: str
@@ -31,63 +35,79 @@ class Claim:
 
 def compare(
     claim: str,
-    claimed: float,
     computed: float,
     unit: str,
     *,
+    paper: float | None = None,
+    independent_model: float | None = None,
     within: float,
-    digits: int = 4,
-    note: str = "",
     relative: bool = True,
+    style: str = ".4g",
+    agreement: str = "agrees",
+    note: str = "",
 ) -> Claim:
-    """Return a row whose verdict says whether the two agree.
+    """Return a row whose verdict compares what is computed with the paper or, where it is silent, with a model.
 
     Parameters
     ----------
-    claim, claimed, computed, unit
-        As in `Claim`.
+    claim, computed, unit, paper, independent_model
+        As in `Claim`; one of the last two.
     within
-        Largest difference that still agrees: a share of `claimed`, or in `unit` if not `relative`.
-    digits
-        Significant digits of `computed`.
+        Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`.
+    style
+        Format of `computed`.
+    agreement
+        Verdict where the difference is small enough.
     note
         Appended to the verdict.
 
+    Raises
+    ------
+    ValueError
+        If neither or both expected values are given.
+
     Examples
     --------
-    >>> compare("bandwidth", 409.6, 409.6, "MHz", within=1e-3).verdict
+    >>> compare("bandwidth", 409.6, "MHz", paper=409.6, within=1e-3).verdict
     'agrees'
-    >>> compare("loss", -1.0, -1.7, "dB", within=0.5, relative=False, note="few draws").verdict
-    'differs by -0.7 dB; few draws'
+    >>> row = compare("loss", -1.7, "dB", independent_model=-1.0, within=0.5, relative=False, note="few draws")
+    >>> row.paper, row.independent_model, row.verdict
+    ('', '-1', 'differs by -0.7 dB; few draws')
     """
-    difference = computed - claimed
-    if abs(difference) <= within * (abs(claimed) if relative else 1):
-        verdict = "agrees"
+    expected = [value for value in (paper, independent_model) if value is not None]
+    if len(expected) != 1:
+        raise ValueError(f"{claim}: {paper=}, {independent_model=}: exactly one of them is compared with")
+    difference = computed - expected[0]
+    if abs(difference) <= within * (abs(expected[0]) if relative else 1):
+        verdict = agreement
     elif relative:
-        verdict = f"differs by {100 * difference / abs(claimed):+.1f} %"
+        verdict = f"differs by {100 * difference / abs(expected[0]):+.1f} %"
     else:
         verdict = f"differs by {difference:+.3g} {unit}"
-    words = "; ".join(part for part in (verdict, note) if part)
-    return Claim(claim, f"{claimed:.10g}", f"{computed:.{digits}g}", unit, words)
+    texts = ["" if value is None else f"{value:.10g}" for value in (paper, independent_model)]
+    return Claim(claim, texts[0], texts[1], f"{computed:{style}}", unit, _join(verdict, note))
 
 
-def write_claims(path: Path, claims: Iterable[Claim]) -> None:
-    """Write rows as CSV; a file that is there is complete."""
-    write_rows(path, [field.name for field in fields(Claim)], [asdict(claim) for claim in claims])
+def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, style: str = ".4g", note: str) -> Claim:
+    """Return a row of something that neither the paper nor a model puts a number on, but this project does.
+
+    Parameters
+    ----------
+    claim, computed, unit
+        As in `Claim`.
+    limit, met
+        What the project requires, in words, and whether `computed` meets it.
+    style, note
+        As in `compare`.
+
+    Examples
+    --------
+    >>> require("loss", 0.004, "dB", limit="below 0.01 dB", met=True, note="worst of five").verdict
+    "meets this project's requirement (below 0.01 dB); worst of five"
+    """
+    verdict = f"{'meets' if met else 'misses'} this project's requirement ({limit})"
+    return Claim(claim, "", "", f"{computed:{style}}", unit, _join(verdict, note))
 
 
-def read_claims(path: Path) -> list[Claim]:
-    """Return the rows of a file of `write_claims`."""
-    with path.open(encoding="utf-8", newline="") as lines:
-        return [Claim(**row) for row in csv.DictReader(lines)]
-
-
-def write_rows(path: Path, columns: list[str], rows: Iterable[dict[str, object]]) -> None:
-    """Write a CSV file under another name first, so that a kill leaves none or all of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".wip")
-    with draft.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.DictWriter(lines, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    draft.replace(path)
+def _join(verdict: str, note: str) -> str:
+    return f"{verdict}; {note}" if note else verdict

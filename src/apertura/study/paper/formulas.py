@@ -1,7 +1,6 @@
 """Closed forms of the source paper: waveform, clocks, timing, resolution and coherence.
 
-Every claim that follows from parameters alone is computed here; what needs an image is measured elsewhere.
-Source of all: the paper's equations as DESIGN section 4 settles them, unless a function says otherwise.
+Source of all: docs/theory/study.md, "Closed forms", unless a function says otherwise.
 """
 
 import numpy as np
@@ -16,39 +15,6 @@ HALF_POWER_OF_HANN = 1.441
 
 Source: F. J. Harris, "On the use of windows for harmonic analysis with the DFT", Proc. IEEE 66 (1978), table I.
 """
-
-
-def bandwidth_hz(subcarriers: int, subcarrier_spacing_hz: float) -> float:
-    """Return B = N·Δf.
-
-    Examples
-    --------
-    >>> bandwidth_hz(4096, 100e3)
-    409600000.0
-    """
-    return subcarriers * subcarrier_spacing_hz
-
-
-def duty_cycle(symbol_s: float, cyclic_prefix_s: float, prf_hz: float) -> float:
-    """Return γ = (T + T_cp)·f_prf, the share of the time that is recorded.
-
-    Examples
-    --------
-    >>> round(100 * duty_cycle(12.5e-6, 3.125e-6, 100.0), 6)
-    0.15625
-    """
-    return (symbol_s + cyclic_prefix_s) * prf_hz
-
-
-def data_rate_bit_s(sample_rate_hz: float, bits: int, duty: float) -> float:
-    """Return the mean rate 2·f_s·ν·γ of complex samples, I and Q of ν bits each.
-
-    Examples
-    --------
-    >>> round(data_rate_bit_s(1.024e9, 14, 0.0015625))
-    44800000
-    """
-    return 2 * sample_rate_hz * bits * duty
 
 
 def sfo_limit_hz(sample_rate_hz: float, bandwidth_hz: float, symbol_s: float) -> float:
@@ -71,61 +37,6 @@ def cfo_limit_hz(subcarrier_spacing_hz: float) -> float:
     10000.0
     """
     return subcarrier_spacing_hz / 10
-
-
-def ppm(offset_hz: float, of_hz: float) -> float:
-    """Return an offset in parts per million of a frequency.
-
-    Examples
-    --------
-    >>> round(ppm(10e3, 1.2e9), 2)
-    8.33
-    """
-    return 1e6 * offset_hz / of_hz
-
-
-def timing_requirement_s(range_error_m: float) -> float:
-    """Return 2δR/c: the timing error that displaces an echo as a one-way range error does.
-
-    Examples
-    --------
-    >>> round(timing_requirement_s(0.02) * 1e12, 1)
-    133.4
-    """
-    return 2 * range_error_m / SPEED_OF_LIGHT_M_S
-
-
-def association_requirement_s(prf_hz: float) -> float:
-    """Return 1/f_prf: the error of a time tag that takes a pulse for its neighbour.
-
-    Examples
-    --------
-    >>> association_requirement_s(100.0)
-    0.01
-    """
-    return 1 / prf_hz
-
-
-def time_tag_requirement_s(range_error_m: float, speed_m_s: float) -> float:
-    """Return 2δR/v: the error of a time tag that displaces a platform by twice the range error.
-
-    Examples
-    --------
-    >>> time_tag_requirement_s(0.02, 10.0)
-    0.004
-    """
-    return 2 * range_error_m / speed_m_s
-
-
-def effective_chirp_bandwidth_hz(bandwidth_hz: float, symbol_s: float, delay_spread_s: float) -> float:
-    """Return B(T − Δt_max)/T: what a dechirped pulse keeps of its band for the farthest echo; OFDM keeps all.
-
-    Examples
-    --------
-    >>> effective_chirp_bandwidth_hz(409.6e6, 12.5e-6, 3.125e-6)
-    307200000.0
-    """
-    return bandwidth_hz * (symbol_s - delay_spread_s) / symbol_s
 
 
 def ground_range_resolution_m(

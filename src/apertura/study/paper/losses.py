@@ -1,4 +1,4 @@
-"""The uncorrected-loss table: what each error costs the peaks of the five targets, beside an independent model."""
+"""The table of uncorrected losses: what each error costs the peaks of the five targets, beside an independent model."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,32 +7,34 @@ from functools import lru_cache
 import numpy as np
 
 from apertura.echo.sidelink import divide
+from apertura.focus.inputs import PhaseHistory
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.presets import paper_waveform
-from apertura.study.bench import Bench, Case, Complexes, paper_bench, receive_pair
-from apertura.study.focus import REACH_M, Floats, History, decibels, divided_history, find_peaks, history, range_tables
-from apertura.study.paper.claims import Claim
+from apertura.study import point_response
+from apertura.study.paper.claims import Claim, compare
+from apertura.study.paper_scene import RX_AHEAD_M, Complexes, Disturbance, PaperScene, receive_pair, reduced_scene
+from apertura.study.point_response import REACH_M, Floats, find_peaks, range_tables, undisturbed_tables
 
 DESTROYED_DB = -12.0
 """Beyond it there is no peak to measure: the largest speckle near the target is reported."""
 
 
 @dataclass(frozen=True, eq=False)
-class Error:
+class UncorrectedError:
     """One error of the table.
 
     Attributes
     ----------
     title, unit
         For rows and figures.
-    claimed_db
+    independent_model_db
         Size, in `unit` → mean peak loss of an independent model, dB.
-    case
+    disturbance
         Size → what goes wrong.
-    bench
-        Number of pulses → the scene.
     pulses
         That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
+    subcarriers, rx_ahead_m, qpsk
+        As in `reduced_scene`.
     draws
         Over which the loss is averaged; 1 where nothing is random.
     within_db
@@ -47,87 +49,60 @@ class Error:
 
     title: str
     unit: str
-    claimed_db: Mapping[float, float]
-    case: Callable[[float], Case]
-    bench: Callable[[int], Bench]
+    independent_model_db: Mapping[float, float]
+    disturbance: Callable[[float], Disturbance]
     pulses: int
+    subcarriers: int = 128
+    rx_ahead_m: float = 0.0
+    qpsk: bool = False
     draws: int = 1
     within_db: float = 0.5
     divided: bool = False
     reach_m: tuple[float, float] = REACH_M
     note: str = ""
 
-
-def _few_subcarriers(pulses: int) -> Bench:
-    return paper_bench(pulses=pulses, subcarriers=128)
-
-
-def _all_subcarriers(pulses: int) -> Bench:
-    return paper_bench(pulses=pulses, subcarriers=4096, qpsk=True)
+    def scene(self, pulses: int) -> PaperScene:
+        """Return the scene with so many pulses."""
+        return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=self.qpsk)
 
 
-def _sfo(khz: float) -> Case:
+def _sfo(khz: float) -> Disturbance:
     """Return a sampling rate off by so much, the time error counted from the start of the DFT window."""
     wave, off_hz = paper_waveform(), 1e3 * khz
     start_s = wave.cyclic_prefix_s * off_hz / (wave.sample_rate_hz + off_hz)
-    return Case(Impairments(clock=Clock(sfo_hz=off_hz), timing=Timing(offset_s=start_s)), sampled=True)
+    return Disturbance(Impairments(clock=Clock(sfo_hz=off_hz), timing=Timing(offset_s=start_s)), sampled=True)
 
 
-def _localization(centimetres: float) -> Case:
+def _localization(centimetres: float) -> Disturbance:
     wrong = Impairments(localization=Localization(centimetres / 100))
-    return Case(wrong, wrong)
+    return Disturbance(wrong, wrong)
 
 
-ERRORS: Mapping[str, Error] = {
-    "carrier_phase": Error(
-        "Carrier phase per pulse, uniform ±",
-        "π rad",
-        {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0},
-        lambda size: Case(Impairments(carrier_phase=UniformPhase(size * np.pi))),
-        _few_subcarriers,
-        3000,
-        draws=4,
+ERRORS: Mapping[str, UncorrectedError] = {
+    "carrier_phase": UncorrectedError(
+        "Carrier phase per pulse, uniform ±", "π rad", {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0},
+        lambda size: Disturbance(Impairments(carrier_phase=UniformPhase(size * np.pi))), pulses=3000, draws=4,
     ),
-    "timing": Error(
-        "Timing offset per pulse, uniform ±",
-        "ns",
-        {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0},
-        lambda size: Case(Impairments(timing=Timing(half_width_s=1e-9 * size))),
-        _few_subcarriers,
-        3000,
-        draws=4,
+    "timing": UncorrectedError(
+        "Timing offset per pulse, uniform ±", "ns", {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0},
+        lambda size: Disturbance(Impairments(timing=Timing(half_width_s=1e-9 * size))), pulses=3000, draws=4,
     ),
-    "cfo": Error(
-        "Carrier frequency offset",
-        "kHz",
-        {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5},
-        lambda size: Case(Impairments(clock=Clock(cfo_hz=1e3 * size)), sampled=True),
-        _all_subcarriers,
-        150,
+    "cfo": UncorrectedError(
+        "Carrier frequency offset", "kHz", {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5},
+        lambda size: Disturbance(Impairments(clock=Clock(cfo_hz=1e3 * size)), sampled=True),
+        pulses=150, subcarriers=4096, qpsk=True,
         note="random QPSK code; a quadratic-phase code loses half as much, in dB, and shifts the targets",
     ),
-    "sfo": Error(
-        "Sampling frequency offset",
-        "kHz",
-        {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
-        _sfo,
-        _all_subcarriers,
-        150,
-        reach_m=(0.16, 1.5),
+    "sfo": UncorrectedError(
+        "Sampling frequency offset", "kHz", {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
+        _sfo, pulses=150, subcarriers=4096, qpsk=True, reach_m=(0.16, 1.5),
         note="time error counted from the DFT window; counted from the prefix a third more is lost, by defocusing",
     ),
-    "localization": Error(
-        "Localization error, σ per axis after 1 s, bistatic",
-        "cm",
-        {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
-        _localization,
-        lambda pulses: paper_bench(pulses=pulses, subcarriers=128, rx_ahead_m=4.7),
-        600,
-        draws=40,
-        within_db=1.0,
-        divided=True,
+    "localization": UncorrectedError(
+        "Localization error, σ per axis after 1 s, bistatic", "cm", {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
+        _localization, pulses=600, rx_ahead_m=RX_AHEAD_M, draws=40, within_db=1.0, divided=True,
     ),
-}
+}  # fmt: skip
 
 
 def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[Claim]:
@@ -145,51 +120,51 @@ def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[C
     error = ERRORS[name]
     count = draws or error.draws
     rows = []
-    for size, claimed_db in error.claimed_db.items():
-        found = [peak_losses_db(error, size, np.random.default_rng([seed, draw])).mean() for draw in range(count)]
-        rows.append(_row(error, size, claimed_db, np.array(found)))
+    for size, expected_db in error.independent_model_db.items():
+        losses = [peak_losses_db(error, size, np.random.default_rng([seed, draw])).mean() for draw in range(count)]
+        rows.append(_row(error, size, expected_db, np.array(losses)))
     return rows
 
 
-def peak_losses_db(error: Error, size: float, generator: np.random.Generator) -> Floats:
+def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Generator) -> Floats:
     """Return (target,) loss of the peaks against the undisturbed scene, dB, negative."""
-    bench = _bench(error)
-    targets = bench.scatterers.position_m
-    radar, sidelink, _ = receive_pair(bench, error.case(size), generator)
-    found = observed(bench, radar, sidelink, divided=error.divided)
-    _, peaks = find_peaks(range_tables(found, targets), targets, reach_m=error.reach_m)
-    return decibels(peaks / _undisturbed(error))
+    scene = _scene(error)
+    targets = scene.scatterers.position_m
+    radar, sidelink, _ = receive_pair(scene, error.disturbance(size), generator)
+    history = history_of(scene, radar, sidelink, divided=error.divided)
+    _, peaks = find_peaks(range_tables(history, targets), targets, reach_m=error.reach_m)
+    return point_response.amplitude_db(peaks / _undisturbed_peaks(error))
 
 
-def observed(bench: Bench, radar: Complexes, sidelink: Complexes, *, divided: bool) -> History:
+def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
     """Return what is focused: the radar alone, or divided by the sidelink."""
-    return divided_history(bench, divide(radar, sidelink)) if divided else history(bench, radar)
+    if divided:
+        return point_response.divided_history(scene, divide(radar, sidelink))
+    return point_response.phase_history(scene, radar)
 
 
 @lru_cache(maxsize=2)
-def _bench(error: Error) -> Bench:
-    return error.bench(error.pulses)
+def _scene(error: UncorrectedError) -> PaperScene:
+    return error.scene(error.pulses)
 
 
 @lru_cache(maxsize=2)
-def _undisturbed(error: Error) -> Floats:
-    bench = _bench(error)
-    targets = bench.scatterers.position_m
-    radar, _, _ = receive_pair(bench, Case(), np.random.default_rng(0))
-    return find_peaks(range_tables(history(bench, radar), targets), targets)[1]
+def _undisturbed_peaks(error: UncorrectedError) -> Floats:
+    return find_peaks(undisturbed_tables(_scene(error)), _scene(error).scatterers.position_m)[1]
 
 
-def _row(error: Error, size: float, claimed_db: float, found: Floats) -> Claim:
-    mean, spread = float(found.mean()), float(found.std())
-    both = claimed_db < DESTROYED_DB and mean < DESTROYED_DB
-    if both:
-        verdict = "agrees: destroyed"
-    elif abs(mean - claimed_db) <= error.within_db:
-        verdict = f"agrees within {error.within_db:g} dB"
-    else:
-        verdict = f"differs by {mean - claimed_db:+.2f} dB"
-    over = f"mean of {found.size} draws, spread {spread:.2f} dB" if found.size > 1 else "nothing random"
-    words = "; ".join(part for part in (verdict, over, error.note) if part)
-    return Claim(
-        f"uncorrected loss: {error.title} {size:g} {error.unit}", f"{claimed_db:g}", f"{mean:.2f}", "dB", words
+def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Floats) -> Claim:
+    mean_db, count = float(losses_db.mean()), losses_db.size
+    destroyed = expected_db < DESTROYED_DB and mean_db < DESTROYED_DB
+    over = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "nothing random"
+    return compare(
+        f"uncorrected loss: {error.title} {size:g} {error.unit}",
+        mean_db,
+        "dB",
+        independent_model=expected_db,
+        within=np.inf if destroyed else error.within_db,
+        relative=False,
+        style=".2f",
+        agreement="agrees: destroyed" if destroyed else f"agrees within {error.within_db:g} dB",
+        note="; ".join(filter(None, (over, error.note))),
     )

@@ -1,12 +1,16 @@
 """Claims that follow from the paper's parameters alone."""
 
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.presets import paper_waveform
-from apertura.study.paper import formulas as closed
 from apertura.study.paper.claims import Claim, compare
+from apertura.study.paper.formulas import cfo_limit_hz, sfo_limit_hz
 
 BITS = 14
 ADC_RATE_HZ = 4.096e9
 """Before decimation by 4."""
+
+CLOCK_ERROR = 1e-8
+EXACT = 1e-6
 
 
 def parameter_claims() -> list[Claim]:
@@ -15,75 +19,65 @@ def parameter_claims() -> list[Claim]:
     Examples
     --------
     >>> [claim.claim for claim in parameter_claims() if not claim.verdict.startswith("agrees")]
-    ['OFDM symbol T against 1/Δf', 'effective chirp bandwidth ...']
+    ['OFDM symbol T against 1/Δf', 'effective chirp ...', 'SFO limit in ppm of f_s', 'CFO of a ...', 'SFO of a ...']
     """
     return [*_waveform(), *_clocks(), *_timing()]
 
 
 def _waveform() -> list[Claim]:
     wave = paper_waveform()
-    band_hz = closed.bandwidth_hz(len(wave.codes), wave.subcarrier_spacing_hz)
-    rows = [compare("bandwidth N·Δf", 409.6, band_hz / 1e6, "MHz", within=1e-6)]
-    recorded = "γ from T + T_cp, not T alone"
+    band_mhz = len(wave.codes) * wave.subcarrier_spacing_hz / 1e6
+    rows = [compare("bandwidth N·Δf", band_mhz, "MHz", paper=409.6, within=EXACT)]
     for prf_hz, percent, mbit_s in ((100.0, 0.15625, 44.8), (20.0, 0.03125, 8.96)):
-        duty = closed.duty_cycle(wave.symbol_s, wave.cyclic_prefix_s, prf_hz)
-        rate = closed.data_rate_bit_s(wave.sample_rate_hz, BITS, duty)
-        where = f"at {prf_hz:.0f} Hz"
-        rows.append(compare(f"duty cycle {where}", percent, 100 * duty, "%", within=1e-6, digits=5, note=recorded))
-        counted = "I and Q both counted"
-        rows.append(compare(f"mean data rate {where}", mbit_s, rate / 1e6, "Mbit/s", within=1e-6, note=counted))
-    period_us = 1e6 / wave.subcarrier_spacing_hz
-    rows.append(
-        Claim(
-            "OFDM symbol T against 1/Δf",
-            f"{1e6 * wave.symbol_s:g}",
-            f"{period_us:g}",
-            "µs",
-            f"the paper contradicts itself: T is {1e6 * wave.symbol_s / period_us:g} periods of 1/Δf; the symbol is "
-            f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
-            f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples",
-        )
+        duty = (wave.symbol_s + wave.cyclic_prefix_s) * prf_hz
+        rate_mbit_s, at = 2 * wave.sample_rate_hz * BITS * duty / 1e6, f"at {prf_hz:.0f} Hz"
+        note = "γ = (T + T_cp)·f_prf, not T alone"
+        rows.append(compare(f"duty cycle {at}", 100 * duty, "%", paper=percent, within=EXACT, style=".5g", note=note))
+        note = "2·f_s·ν·γ: I and Q both counted"
+        rows.append(compare(f"mean data rate {at}", rate_mbit_s, "Mbit/s", paper=mbit_s, within=EXACT, note=note))
+    period_us, symbol_us = 1e6 / wave.subcarrier_spacing_hz, 1e6 * wave.symbol_s
+    contradiction = (
+        f"the paper contradicts itself: T is {symbol_us / period_us:g} periods of 1/Δf; the symbol is "
+        f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
+        f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples"
     )
-    chirp_hz = closed.effective_chirp_bandwidth_hz(band_hz, wave.symbol_s, wave.cyclic_prefix_s)
-    rows.append(
-        Claim(
-            "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp",
-            "",
-            f"{chirp_hz / 1e6:g}",
-            "MHz",
-            f"computed: {100 * chirp_hz / band_hz:g} % of B; the paper's formula, which names no delay",
-        )
-    )
-    return rows
+    rows.append(Claim("OFDM symbol T against 1/Δf", f"{symbol_us:g}", "", f"{period_us:g}", "µs", contradiction))
+    kept = (wave.symbol_s - wave.cyclic_prefix_s) / wave.symbol_s
+    share = f"computed: {100 * kept:g} % of B; the paper's formula, which names no delay"
+    name = "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"
+    return [*rows, Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", share)]
 
 
 def _clocks() -> list[Claim]:
     wave = paper_waveform()
-    band_hz = closed.bandwidth_hz(len(wave.codes), wave.subcarrier_spacing_hz)
-    sfo_hz = closed.sfo_limit_hz(wave.sample_rate_hz, band_hz, wave.symbol_s)
-    cfo_hz = closed.cfo_limit_hz(wave.subcarrier_spacing_hz)
-    first = "binds first where one clock feeds both"
-    ten_ppb = 1e-8
+    band_hz = len(wave.codes) * wave.subcarrier_spacing_hz
+    sfo_hz, cfo_hz = sfo_limit_hz(wave.sample_rate_hz, band_hz, wave.symbol_s), cfo_limit_hz(wave.subcarrier_spacing_hz)
+    sfo_ppm, cfo_ppm = 1e6 * sfo_hz / wave.sample_rate_hz, 1e6 * cfo_hz / wave.carrier_hz
+    at_carrier_hz, at_converter_hz = CLOCK_ERROR * wave.carrier_hz, CLOCK_ERROR * ADC_RATE_HZ
+    halved = (
+        f"the paper's 200 kHz are {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s between the two nodes; 100 ppm would be about "
+        f"the half of it that each of two clocks may be off in opposite directions ({sfo_ppm / 2:.1f} ppm)"
+    )
+    first = "is reached first where one clock feeds both"
     swapped = (
-        "the paper contradicts itself: one clock off by 10 ppb has a CFO of 12 Hz at the carrier of 1.2 GHz and an SFO "
-        "of 41 Hz at the converter's 4.096 GS/s; the two values are swapped in print"
+        "the paper contradicts itself: it prints 41 Hz for the CFO at the carrier of 1.2 GHz and 12 Hz for the SFO at "
+        "the converter's 4.096 GS/s; each is computed where the other is printed"
     )
     return [
-        compare("SFO limit f_s(1 − 1/(1 + 1/BT))", 199.96, sfo_hz / 1e3, "kHz", within=1e-4, digits=5),
-        compare("SFO limit", 195, closed.ppm(sfo_hz, wave.sample_rate_hz), "ppm", within=0.005),
-        compare("CFO limit Δf/10", 10, cfo_hz / 1e3, "kHz", within=1e-6),
-        compare("CFO limit", 8.3, closed.ppm(cfo_hz, wave.carrier_hz), "ppm", within=0.005, digits=3, note=first),
-        compare("CFO of a clock off by 10 ppb", 12, ten_ppb * wave.carrier_hz, "Hz", within=0.01, note=swapped),
-        compare("SFO of a clock off by 10 ppb", 41, ten_ppb * ADC_RATE_HZ, "Hz", within=0.01, note=swapped),
+        compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper=200, within=1e-3, style=".5g"),
+        compare("SFO limit in ppm of f_s", sfo_ppm, "ppm", paper=100, within=0.05, note=halved),
+        compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper=10, within=EXACT),
+        compare("CFO limit in ppm of the carrier", cfo_ppm, "ppm", paper=8.3, within=0.005, style=".3g", note=first),
+        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper=41, within=0.01, note=swapped),
+        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper=12, within=0.01, note=swapped),
     ]
 
 
 def _timing() -> list[Claim]:
-    wave = paper_waveform()
-    ps, ms = 1e12 * closed.timing_requirement_s(0.02), 1e3 * closed.time_tag_requirement_s(0.02, 10.0)
-    interval = 1e3 * closed.association_requirement_s(wave.prf_hz)
+    range_error_m, speed_m_s, prf_hz = 0.02, 10.0, 100.0
+    samples_ps, tags_ms = 2e12 * range_error_m / SPEED_OF_LIGHT_M_S, 2e3 * range_error_m / speed_m_s
     return [
-        compare("timing of the samples 2δR/c, δR = 2 cm", 133, ps, "ps", within=0.005),
-        compare("association of pulses 1/f_prf at 100 Hz", 10, interval, "ms", within=1e-6),
-        compare("time tags 2δR/v at 10 m/s", 4, ms, "ms", within=1e-6),
+        compare("timing of the samples 2δR/c, δR = 2 cm", samples_ps, "ps", paper=133, within=0.005),
+        compare("association of pulses 1/f_prf at 100 Hz", 1e3 / prf_hz, "ms", paper=10, within=EXACT),
+        compare("time tags 2δR/v at 10 m/s", tags_ms, "ms", paper=4, within=EXACT),
     ]

@@ -8,12 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from apertura.study.stability.atlas import LEVELS_DB, Edge
+from apertura.atomic import replacement
 from apertura.study.stability.outcomes import Outcome
+from apertura.study.stability.summary import LEVELS_DB, Tolerance
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
 LOSS_RANGE_DB = (-1.0, 25.0)
-_LOOK = {
+_STYLES = {
     "none": ("#000000", "o", "--"),
     "divide": ("#0072b2", "s", "-"),
     "wiener": ("#56b4e9", "^", "-"),
@@ -55,7 +56,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[Outcome], path: Path) ->
 
 
 def _draw_line(axis: Axes, method: str, sizes: list[float], values: list[float]) -> None:
-    colour, marker, style = _LOOK[method]
+    colour, marker, style = _STYLES[method]
     below = method == "auto"  # a broad band under the method it takes
     axis.plot(
         sizes,
@@ -79,16 +80,16 @@ def _mark_losses(axis: Axes) -> None:
         axis.annotate(f"{level:g} dB", (0.01, level + 0.1), xycoords=("axes fraction", "data"), fontsize=7, color="0.4")
 
 
-def draw_summary(edges: Sequence[Edge], path: Path) -> None:
-    """Draw a table of where each correction loses 1 dB and 3 dB, coloured by how much of the sweep it survives."""
+def draw_summary(tolerances: Sequence[Tolerance], path: Path) -> None:
+    """Draw a table of where each correction loses 1 dB and 3 dB, coloured by the share of the sweep below 1 dB."""
     figure = Figure(figsize=(13, 0.42 * len(SWEEPS) + 1.8), layout="constrained")
     axes = figure.subplots()
-    found = {(edge.impairment, edge.method): edge for edge in edges}
-    survived = np.array([[_survived(found[name, method]) for method in CHOICES] for name in SWEEPS])
-    picture = axes.imshow(survived, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto", alpha=0.75)
+    by_key = {(one.impairment, one.method): one for one in tolerances}
+    shares = np.array([[_share(by_key[name, method]) for method in CHOICES] for name in SWEEPS])
+    picture = axes.imshow(shares, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto", alpha=0.75)
     for row, name in enumerate(SWEEPS):
         for column, method in enumerate(CHOICES):
-            axes.text(column, row, _words(found[name, method]), ha="center", va="center", fontsize=8)
+            axes.text(column, row, _words(by_key[name, method]), ha="center", va="center", fontsize=8)
     axes.set_xticks(range(len(CHOICES)), CHOICES)
     units = [f", {sweep.unit}" if sweep.unit != "1" else "" for sweep in SWEEPS.values()]
     axes.set_yticks(range(len(SWEEPS)), [s.title + unit for s, unit in zip(SWEEPS.values(), units, strict=True)])
@@ -98,29 +99,27 @@ def draw_summary(edges: Sequence[Edge], path: Path) -> None:
     save(figure, path)
 
 
-def _survived(edge: Edge) -> float:
+def _share(tolerance: Tolerance) -> float:
     """Return how far along its sweep the impairment gets before the loss passes 1 dB, 0…1."""
-    if np.isnan(edge.size_at_1_db):
+    if np.isnan(tolerance.size_at_1_db):
         return 1.0
-    sweep = SWEEPS[edge.impairment]
-    ends = np.array([sweep.sizes[0], edge.size_at_1_db, sweep.sizes[-1]], np.float64)
+    sweep = SWEEPS[tolerance.impairment]
+    ends = np.array([sweep.sizes[0], tolerance.size_at_1_db, sweep.sizes[-1]], np.float64)
     first, at, last = np.log(ends) if sweep.logarithmic else ends
     return float((at - first) / (last - first))
 
 
-def _words(edge: Edge) -> str:
-    falling = edge.first_size > edge.last_size
+def _words(tolerance: Tolerance) -> str:
+    falling = tolerance.first_size > tolerance.last_size
     sizes = [
-        f"{'<' if falling else '>'} {edge.last_size:g}" if np.isnan(size) else f"{size:.3g}"
-        for size in (edge.size_at_1_db, edge.size_at_3_db)
+        f"{'<' if falling else '>'} {tolerance.last_size:g}" if np.isnan(size) else f"{size:.3g}"
+        for size in (tolerance.size_at_1_db, tolerance.size_at_3_db)
     ]
-    return sizes[0] if sizes[0] == sizes[1] and np.isnan(edge.size_at_1_db) else " | ".join(sizes)
+    return sizes[0] if sizes[0] == sizes[1] and np.isnan(tolerance.size_at_1_db) else " | ".join(sizes)
 
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG that is the same for the same figure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure)
-    draft = path.with_name(path.name + ".wip")
-    figure.savefig(draft, format="png", dpi=110, metadata={"Software": None})
-    draft.replace(path)
+    with replacement(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

@@ -1,7 +1,8 @@
-"""How much of each impairment each correction of the sidelink survives."""
+"""What each size of an impairment does to the image under each correction of the sidelink."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,22 +10,14 @@ from numpy.typing import NDArray
 from apertura.echo.line_of_sight import fit_line_of_sight
 from apertura.echo.sidelink import METHODS, choose, measure
 from apertura.errors import CampaignError
-from apertura.study.bench import Bench, Case, Complexes, receive_pair
-from apertura.study.focus import (
-    Floats,
-    History,
-    coherence_factors,
-    decibels,
-    divided_history,
-    find_peaks,
-    half_power_widths,
-    mean_image,
-    range_tables,
-)
+from apertura.focus.inputs import PhaseHistory
+from apertura.study import point_response
+from apertura.study.paper_scene import Complexes, receive_pair
+from apertura.study.point_response import Floats, find_peaks, mean_image
 from apertura.study.stability.sweeps import SWEEPS, Sweep
 
 REFUSED_DB = 40.0
-"""Loss entered where nothing is imaged, and the largest that is told apart."""
+"""Loss entered where nothing is imaged; larger ones are clipped to it."""
 
 _REACH_M = (0.16, 1.0)
 
@@ -69,16 +62,6 @@ class Outcome:
     seed: int
 
 
-@dataclass(frozen=True)
-class _Draw:
-    loss_db: float
-    coherence: float
-    widths_m: tuple[float, float]
-    floor_db: float
-    used: float
-    chosen: str
-
-
 def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcome]:
     """Yield the outcome at each size of one impairment under one correction.
 
@@ -89,72 +72,75 @@ def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcom
     method
         One of `CHOICES`.
     seed
-        Draws depend on it and on their number alone: every method and size meets the same dice.
+        Draws depend on it and on their number alone: every method and size meets the same random numbers.
     """
     sweep = SWEEPS[impairment]
     for size in sweep.sizes:
-        ideal = _undisturbed(sweep.flown(0.0))
-        found = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
-        losses = np.array([one.loss_db for one in found])
-        chosen = [one.chosen for one in found]
-        ground, cross = np.median([one.widths_m for one in found], axis=0)
+        ideal = _undisturbed(sweep)
+        draws = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
+        measured = [one for one, _ in draws]
+        mean, spread = (_rounded(statistic(measured, axis=0)) for statistic in (np.mean, np.std))
+        width = _rounded(np.median(measured, axis=0))
+        chosen = [one for _, one in draws]
         yield Outcome(
             impairment=impairment,
             unit=sweep.unit,
             size=float(size),
             method=method,
-            loss_db=_rounded(losses.mean()),
-            loss_spread_db=_rounded(losses.std()),
-            coherence_factor=_rounded(np.mean([one.coherence for one in found])),
-            ground_width_m=_rounded(ground),
-            cross_width_m=_rounded(cross),
-            floor_db=_rounded(np.mean([one.floor_db for one in found])),
-            pulses_used=_rounded(np.mean([one.used for one in found])),
+            loss_db=mean.loss_db,
+            loss_spread_db=spread.loss_db,
+            coherence_factor=mean.coherence_factor,
+            ground_width_m=width.ground_width_m,
+            cross_width_m=width.cross_width_m,
+            floor_db=mean.floor_db,
+            pulses_used=mean.pulses_used,
             chosen=max(sorted(set(chosen)), key=chosen.count),
             draws=sweep.draws,
             seed=seed,
         )
 
 
-def _rounded(value: float | np.floating) -> float:
-    return round(float(value), 4) + 0.0
+class _Measured(NamedTuple):
+    loss_db: float
+    coherence_factor: float
+    ground_width_m: float
+    cross_width_m: float
+    floor_db: float
+    pulses_used: float
 
 
-@dataclass(frozen=True)
-class _Ideal:
+def _rounded(values: Floats) -> _Measured:
+    return _Measured(*(round(float(value), 4) + 0.0 for value in values))
+
+
+class _Ideal(NamedTuple):
     peaks: Floats
     pixels_m: Floats
     values: Complexes
 
 
-def _undisturbed(bench: Bench) -> _Ideal:
+def _undisturbed(sweep: Sweep) -> _Ideal:
     """Return the peaks, and the image at random pixels, of the scene with nothing wrong."""
-    targets = bench.scatterers.position_m
-    radar, _, _ = receive_pair(bench, Case(), np.random.default_rng(0))
-    tables = range_tables(_alone(bench, radar, np.ones(len(radar), bool)), targets)
-    dice = np.random.default_rng(0)
-    pixels = np.column_stack([dice.uniform(-6, 6, 256), dice.uniform(5, 25, 256), np.zeros(256)])[None]
-    return _Ideal(find_peaks(tables, targets, reach_m=_REACH_M)[1], pixels, mean_image(tables, pixels))
+    scene = sweep.flown(0.0)
+    tables = point_response.undisturbed_tables(scene)
+    pixels = point_response.random_pixels(np.random.default_rng(0))
+    peaks = find_peaks(tables, scene.scatterers.position_m, reach_m=_REACH_M)[1]
+    return _Ideal(peaks, pixels, mean_image(tables, pixels))
 
 
-def _draw(sweep: Sweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator) -> _Draw:
+def _draw(
+    sweep: Sweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
+) -> tuple[_Measured, str]:
+    """Return what is measured of one draw, and the method applied."""
     flown = sweep.flown(size)
-    radar, sidelink, seen = receive_pair(flown, sweep.case(size), generator)
+    radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
-    kept, transfer, chosen = correct(method, radar, sidelink, seen.hidden.kept)
+    kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
     if not kept.any():
-        return _Draw(REFUSED_DB, 0.0, (np.nan, np.nan), 0.0, 0.0, chosen)
-    image = _alone if chosen == "none" else _divided
-    return _measured(image(logged, transfer, kept), ideal, float(kept.mean()), chosen, flown.scatterers.position_m)
-
-
-def _alone(bench: Bench, transfer: Complexes, kept: NDArray[np.bool_]) -> History:
-    geometry = bench.geometry
-    return History(transfer, bench.frequency_hz, geometry.radar_tx[kept], geometry.radar_rx[kept])
-
-
-def _divided(bench: Bench, transfer: Complexes, kept: NDArray[np.bool_]) -> History:
-    return divided_history(bench, transfer, pulses=kept)
+        return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
+    history_of = point_response.phase_history if chosen == "none" else point_response.divided_history
+    history = history_of(logged, transfer, pulses=kept)
+    return _measured(history, ideal, float(kept.mean()), flown.scatterers.position_m), chosen
 
 
 def correct(
@@ -191,44 +177,12 @@ def correct(
     return kept, METHODS[chosen](radar[kept], sidelink[kept]), chosen
 
 
-def _measured(found: History, ideal: _Ideal, used: float, chosen: str, targets_m: Floats) -> _Draw:
-    tables = range_tables(found, targets_m)
-    places, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
-    loss = float(np.clip(-decibels(peaks / ideal.peaks), -REFUSED_DB, REFUSED_DB).mean())
-    values = mean_image(tables, ideal.pixels_m)
-    gain = np.vdot(ideal.values, values) / np.vdot(ideal.values, ideal.values).real
-    floor = float(decibels(np.sqrt(np.mean(np.abs(values - gain * ideal.values) ** 2)) / peaks.mean()))
-    widths = half_power_widths(tables, places[2])
-    return _Draw(loss, float(coherence_factors(found, places).mean()), widths, floor, used, chosen)
-
-
-def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: bool) -> float:
-    """Return the size at which the loss first passes a level, interpolated; NaN if it never does.
-
-    Parameters
-    ----------
-    sizes
-        (size,) float64 from harmless to ruinous, rising or falling.
-    losses_db
-        (size,) float64.
-    level_db
-        What is passed.
-    logarithmic
-        Interpolate in the logarithm of the size.
-
-    Examples
-    --------
-    >>> crossing(np.array([1.0, 10.0, 100.0]), np.array([0.0, 0.5, 1.5]), 1.0, logarithmic=True)
-    31.6...
-    >>> crossing(np.array([30.0, 0.0]), np.array([0.1, 0.2]), 1.0, logarithmic=False)
-    nan
-    """
-    above = np.flatnonzero(losses_db >= level_db)
-    if not above.size:
-        return float("nan")
-    i = int(above[0])
-    if i == 0:
-        return float(sizes[0])
-    scale: Callable[[Floats], Floats] = np.log if logarithmic else np.asarray
-    place = np.interp(level_db, losses_db[i - 1 : i + 1], scale(sizes[i - 1 : i + 1]))
-    return float(np.exp(place) if logarithmic else place)
+def _measured(history: PhaseHistory, ideal: _Ideal, used: float, targets_m: Floats) -> _Measured:
+    tables = point_response.range_tables(history, targets_m)
+    positions, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
+    gain_db = point_response.amplitude_db(peaks / ideal.peaks)
+    floor_db = point_response.error_floor_db(mean_image(tables, ideal.pixels_m), ideal.values, peaks)
+    widths_m = point_response.half_power_widths(lambda pixels: mean_image(tables, pixels), positions[2])
+    coherence = float(point_response.coherence_factors(history, positions).mean())
+    loss_db = float(np.clip(-gain_db, -REFUSED_DB, REFUSED_DB).mean())
+    return _Measured(loss_db, coherence, *widths_m, floor_db, used)

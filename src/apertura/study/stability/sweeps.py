@@ -1,4 +1,4 @@
-"""Every impairment, from harmless to ruinous: what stability is tried against."""
+"""Every impairment, from negligible to destructive: what stability is tried against."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from apertura.simulation.impairments import (
     UniformPhase,
 )
 from apertura.simulation.presets import paper_waveform
-from apertura.study.bench import Bench, Case, paper_bench
+from apertura.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, reduced_scene
 
 CHOICES = ("none", *METHODS, "auto")
 """Every correction: the radar alone, each method of the sidelink, and the one `auto` takes."""
@@ -42,7 +42,7 @@ class Sweep:
     title, unit
         For charts.
     sizes
-        From harmless to ruinous.
+        From negligible to destructive.
     receiver
         Size → what replaces fields of `ORDINARY` in the receiving node.
     transmitter
@@ -50,7 +50,7 @@ class Sweep:
     subcarriers
         1024 where the band matters, 4096 where the SNR or the spacing of the subcarriers does.
     sampled, quantised
-        As in `Case`.
+        As in `Disturbance`.
     logarithmic
         Whether sizes are drawn and interpolated on a logarithmic axis.
     draws
@@ -72,21 +72,21 @@ class Sweep:
     moving: bool = False
     tagged: bool = False
 
-    def case(self, size: float) -> Case:
+    def disturbance(self, size: float) -> Disturbance:
         """Return what goes wrong at one size."""
         receiver = replace(ORDINARY, **self.receiver(size))  # type: ignore[arg-type]
-        return Case(receiver, self.transmitter(size), self.sampled, self.quantised)
+        return Disturbance(receiver, self.transmitter(size), self.sampled, self.quantised)
 
-    def flown(self, size: float) -> Bench:
+    def flown(self, size: float) -> PaperScene:
         """Return the scene as it is: the receiver 4.7 m ahead of the transmitter, 30 m at 1 m/s."""
         clocked = self.sampled and not self.quantised
-        bench = paper_bench(pulses=PULSES, subcarriers=self.subcarriers, rx_ahead_m=4.7, qpsk=clocked)
+        scene = reduced_scene(pulses=PULSES, subcarriers=self.subcarriers, rx_ahead_m=RX_AHEAD_M, qpsk=clocked)
         if not self.moving:
-            return bench
+            return scene
         velocity = np.tile([size, 0.0, 0.0], (PULSES, 1))
-        return replace(bench, geometry=replace(bench.geometry, tx_velocity=velocity, rx_velocity=velocity))
+        return replace(scene, geometry=replace(scene.geometry, tx_velocity=velocity, rx_velocity=velocity))
 
-    def logged(self, flown: Bench, size: float, generator: np.random.Generator) -> Bench:
+    def logged(self, flown: PaperScene, size: float, generator: np.random.Generator) -> PaperScene:
         """Return the scene as the logs say: the receiver is where it was at its wrong time tags."""
         if not self.tagged:
             return flown

@@ -1,0 +1,111 @@
+// What this build assumes, in words that Python can compare with its own: struct layouts and constants.
+#include <cstddef>
+#include <cstdio>
+#include <string>
+
+#include "job.hpp"
+
+namespace {
+
+struct Field {
+  const char* name;
+  int64_t offset, size;
+};
+#define APERTURA_FIELD(type, name) {#type "." #name, offsetof(type, name), sizeof(type::name)}
+constexpr Field kFields[] = {
+    APERTURA_FIELD(BeamJob, axes),
+    APERTURA_FIELD(BeamJob, gain),
+    APERTURA_FIELD(BeamJob, count),
+    APERTURA_FIELD(BeamJob, first_rad),
+    APERTURA_FIELD(BeamJob, samples_per_rad),
+    APERTURA_FIELD(BeamJob, peak),
+    {"BeamJob", 0, sizeof(BeamJob)},
+    APERTURA_FIELD(ApertureJob, cells),
+    APERTURA_FIELD(ApertureJob, transmitter),
+    APERTURA_FIELD(ApertureJob, receiver),
+    APERTURA_FIELD(ApertureJob, first_path),
+    APERTURA_FIELD(ApertureJob, pixels),
+    APERTURA_FIELD(ApertureJob, image),
+    APERTURA_FIELD(ApertureJob, counts),
+    APERTURA_FIELD(ApertureJob, pulses),
+    APERTURA_FIELD(ApertureJob, padded),
+    APERTURA_FIELD(ApertureJob, width),
+    APERTURA_FIELD(ApertureJob, rows),
+    APERTURA_FIELD(ApertureJob, columns),
+    APERTURA_FIELD(ApertureJob, cells_per_metre),
+    APERTURA_FIELD(ApertureJob, radians_per_cell),
+    APERTURA_FIELD(ApertureJob, tolerance_rad),
+    APERTURA_FIELD(ApertureJob, degree),
+    APERTURA_FIELD(ApertureJob, phase_polynomial),
+    APERTURA_FIELD(ApertureJob, wide_sum),
+    APERTURA_FIELD(ApertureJob, phase_coefficients),
+    APERTURA_FIELD(ApertureJob, beam),
+    {"ApertureJob", 0, sizeof(ApertureJob)},
+    APERTURA_FIELD(TableJob, samples),
+    APERTURA_FIELD(TableJob, taps),
+    APERTURA_FIELD(TableJob, lead),
+    APERTURA_FIELD(TableJob, carrier),
+    APERTURA_FIELD(TableJob, turn),
+    APERTURA_FIELD(TableJob, cells),
+    APERTURA_FIELD(TableJob, pulses),
+    APERTURA_FIELD(TableJob, length),
+    APERTURA_FIELD(TableJob, width),
+    APERTURA_FIELD(TableJob, up),
+    APERTURA_FIELD(TableJob, down),
+    APERTURA_FIELD(TableJob, steps),
+    APERTURA_FIELD(TableJob, margin),
+    APERTURA_FIELD(TableJob, used),
+    APERTURA_FIELD(TableJob, degree),
+    {"TableJob", 0, sizeof(TableJob)},
+};
+
+struct Constant {
+  const char* name;
+  double value;
+};
+constexpr Constant kConstants[] = {
+    {"patch_side", apertura::kPatchSide},
+    {"block_side", apertura::kBlockSide},
+    {"batch", apertura::kBatch},
+    {"taps", apertura::kTaps},
+    {"window", apertura::kWindow},
+    {"window_margin", apertura::kWindowMargin},
+    {"fifth_order", apertura::kFifthOrder},
+    {"third_order", apertura::kThirdOrder},
+    {"shared_curvature_error", apertura::kSharedCurvatureError},
+    {"own_curvature_error", apertura::kOwnCurvatureError},
+    {"curvature_span", apertura::kCurvatureSpan},
+    {"weight_change", apertura::kWeightChange},
+    {"weight_curvature", apertura::kWeightCurvature},
+};
+
+}  // namespace
+
+extern "C" {
+
+// One line for each field, "Struct.field offset size", and one for each struct, "Struct 0 size".
+__attribute__((visibility("default"))) const char* apertura_layout() {
+  static const std::string lines = [] {
+    std::string text;
+    for (const Field& field : kFields)
+      text += std::string(field.name) + ' ' + std::to_string(field.offset) + ' ' + std::to_string(field.size) + '\n';
+    return text;
+  }();
+  return lines.c_str();
+}
+
+// One line for each constant of bounds.hpp, "name value".
+__attribute__((visibility("default"))) const char* apertura_constants() {
+  static const std::string lines = [] {
+    std::string text;
+    for (const Constant& constant : kConstants) {
+      char line[64];
+      std::snprintf(line, sizeof line, "%s %.7g\n", constant.name, constant.value);
+      text += line;
+    }
+    return text;
+  }();
+  return lines.c_str();
+}
+
+}  // extern "C"

@@ -1,0 +1,1 @@
+"""One image: its range profiles, its plan, its tiles and its certificate."""

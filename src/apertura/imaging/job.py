@@ -1,0 +1,106 @@
+"""From what is known of a pair and a scene to the planner's job."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beams
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.compression import centre_frequency
+from apertura.focus.engines import reference
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.job import Job, Signal
+from apertura.geometry.aperture import Aperture
+from apertura.imaging.range_profiles import RangeWindow
+from apertura.quality.measures import content_loss_db
+from apertura.scene.grid import SceneGrid
+from apertura.scene.ground_models import GroundModels
+from apertura.scene.terrain import Terrain
+
+_POINTS = 9
+_CONTENT_PIXELS = 128
+
+
+def imaging_job(
+    aperture: Aperture,
+    frequency_hz: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    grid: SceneGrid,
+    ground: GroundModels,
+    *,
+    history: PhaseHistory | None = None,
+    beams: Beams | None = None,
+) -> Job:
+    """Return the planner's job.
+
+    Parameters
+    ----------
+    aperture
+        Phase centres in the frame of the pixels.
+    frequency_hz, weight
+        (subcarrier,) float64, RF frequency and window.
+    grid, ground
+        The scene: its pixels, its ground and that one's cheaper models.
+    history
+        What was recorded, where it is there: it tells how much errors weigh between the scene's targets.
+    beams
+        Of the antennas, where they have any.
+
+    Returns
+    -------
+    Job
+        With no limit of path or memory, and defaults of tiles and threads, to be replaced.
+    """
+    window = RangeWindow.of(aperture, grid, ground.full, frequency_hz)
+    centre, count = centre_frequency(frequency_hz), len(frequency_hz)
+    return Job(
+        aperture=aperture,
+        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
+        shape=grid.shape,
+        spacing_m=grid.spacing_m,
+        centre_hz=centre,
+        bandwidth_hz=float(frequency_hz[-1] - frequency_hz[0]) * count / (count - 1),
+        subcarriers=count,
+        signal=Signal(centre, window.unambiguous / count, window.step_m, window.samples, weight),
+        frame=grid.frame,
+        terrain=ground,
+        content_db=None if history is None else _content_db(history, grid, ground.full, beams),
+        beams=beams,
+    )
+
+
+def profiles_job(profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None) -> Job:
+    """Return the planner's job of range profiles alone: their band is taken as full and flat, their echo as unseen.
+
+    Parameters
+    ----------
+    profiles
+        In the frame of the pixels.
+    grid, ground, beams
+        As `imaging_job`.
+    """
+    bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
+    centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
+    return Job(
+        aperture=profiles.aperture,
+        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
+        shape=grid.shape,
+        spacing_m=grid.spacing_m,
+        centre_hz=centre,
+        bandwidth_hz=bandwidth_hz,
+        subcarriers=samples,
+        signal=Signal(centre, profiles.oversampling, profiles.step_m, samples),
+        frame=grid.frame,
+        terrain=ground,
+        beams=beams,
+        recorded=False,
+    )
+
+
+def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams: Beams | None) -> float:
+    """Return how much errors weigh at some random pixels of the scene."""
+    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
+    places = terrain.positions_at(grid, rows, columns)
+    parts = [slice(first, first + 64) for first in range(0, len(history), 64)]
+    return content_loss_db(
+        np.concatenate([reference.terms(history[part], places, beams and beams[part]) for part in parts])
+    )

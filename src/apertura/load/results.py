@@ -1,0 +1,97 @@
+"""A campaign from Python: its flights and pairs, and what the workflow made of them, by name."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.load.scene import OpenScene, open_scene
+from apertura.store import open_stage
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class OpenCampaign:
+    """A validated campaign folder with its results; everything is read when it is asked for.
+
+    Attributes
+    ----------
+    campaign
+        Settings, flights and where everything lies.
+    """
+
+    campaign: Campaign
+
+    @property
+    def pairs(self) -> dict[str, tuple[str, ...]]:
+        """Flight that becomes images → its pairs, transmitter-receiver."""
+        return {flight.name: flight.pairs for flight in self.campaign.image_flights}
+
+    @property
+    def scene(self) -> OpenScene:
+        """The grid of every raster and the ground under it."""
+        return open_scene(self.campaign)
+
+    def stage(self, name: str, *where: str) -> "xr.Dataset":
+        """Return a finished stage, read lazily.
+
+        Parameters
+        ----------
+        name
+            A key of `apertura.contracts.STAGES`, such as 'echo'.
+        *where
+            Flight and node (raw, track), flight and pair (echo, profile, image), nothing (cube, terrain).
+
+        Raises
+        ------
+        CampaignError
+            If it is not there, or not as the workflow left it.
+        """
+        return open_stage(self.campaign.stage(name, *where), name)
+
+    def image(self, flight: str, pair: str) -> "xr.DataArray":
+        """Return a pair's focused image, (y, x) complex64, with its CRS in the coordinate spatial_ref."""
+        image: xr.DataArray = self.stage("image", flight, pair).image
+        return image
+
+    def report(self, flight: str, pair: str) -> dict[str, Any]:
+        """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
+        path = self.campaign.results / flight / pair / "image.json"
+        if not path.is_file():
+            raise CampaignError(
+                "no such file", where=path, expected="the report of an image", remedy="Run the workflow first."
+            )
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return document
+
+    def flags(self, flight: str, pair: str) -> dict[str, str]:
+        """Return the limits that an image exceeds: name → what was measured, in one line."""
+        flags: dict[str, str] = self.report(flight, pair)["flags"]
+        return flags
+
+
+def open_campaign(path: str | Path) -> OpenCampaign:
+    """Return a campaign folder with its results.
+
+    Parameters
+    ----------
+    path
+        A campaign folder; its config is read and validated.
+
+    Raises
+    ------
+    CampaignError
+        If the config is wrong.
+
+    Examples
+    --------
+    >>> open_campaign("nowhere")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
+    """
+    return OpenCampaign(Campaign.load(path))

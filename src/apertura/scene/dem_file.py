@@ -1,0 +1,94 @@
+"""A DEM file opened: where its posts lie and what its heights count from, or what is wrong with it."""
+
+from pathlib import Path
+from typing import Any
+
+import rasterio
+from pyproj import CRS
+
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import LOCAL
+from apertura.scene.dem import Dem
+from apertura.scene.geoid import carried_datum, geoid_file, grid_names
+
+
+def open_dem(path: Path, crs: str, *, datum: str, geoid: Path | None = None) -> Dem:
+    """Return a DEM to be read onto grids in `crs`.
+
+    Parameters
+    ----------
+    path
+        A raster that GDAL reads, heights in band 1.
+    crs
+        Of the scene: what pyproj reads, or 'local'.
+    datum
+        What the heights count from: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (the raster's CRS says it; in a local
+        scene: z of the frame).
+    geoid
+        Grid of undulations; looked for on PROJ's search path if None.
+
+    Raises
+    ------
+    CampaignError
+        If the file is no DEM, its CRS says otherwise than `datum`, or the grid of undulations is not here.
+    """
+    with _opened(path) as raster:
+        inverse, shape, unit = ~raster.transform, raster.shape, (raster.units[0] or "metre").lower()
+        system = CRS.from_user_input(raster.crs) if raster.crs else None
+    if min(shape) < 2:
+        raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")
+    pixel_from_map = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
+    if crs == LOCAL:
+        if system is not None and (system.is_geographic or system.is_projected):
+            raise _wrong(path, f"CRS {system.name} under a scene in the local frame", "a DEM in the frame's own axes")
+        return Dem(path, shape, pixel_from_map, "", "", None, 1.0)
+    if system is None or not (system.is_geographic or system.is_projected or system.is_compound):
+        raise _wrong(path, "no CRS on Earth", f"a georeferenced DEM, or scene.crs: {LOCAL}")
+    counted_from = _datum(path, system, datum)
+    metres = _metres_per_unit(path, system, unit)
+    horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
+    earth = counted_from in {"egm96", "egm2008"}
+    geodetic = CRS("EPSG:4979") if earth or horizontal.geodetic_crs is None else horizontal.geodetic_crs.to_3d()
+    undulations = (
+        None
+        if counted_from == "ellipsoid"
+        else geoid_file(counted_from, geoid, names=grid_names(system) if datum == "carried" else ())
+    )
+    return Dem(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), undulations, metres)
+
+
+def _opened(path: Path) -> Any:
+    if not path.is_file():
+        raise CampaignError(
+            "no such file", where=path, expected="the DEM of scene.dem", remedy="Copy it there, or correct scene.dem."
+        )
+    try:
+        return rasterio.open(path)
+    except rasterio.errors.RasterioIOError as error:
+        raise _wrong(path, f"not readable ({error})", "a raster that GDAL reads") from error
+
+
+def _wrong(path: Path, found: str, expected: str) -> CampaignError:
+    return CampaignError(
+        found, where=path, expected=expected, remedy="Correct the DEM or scene.dem and scene.dem_datum."
+    )
+
+
+def _datum(path: Path, system: CRS, stated: str) -> str:
+    carried = carried_datum(system)
+    if stated == "carried":
+        if carried is None:
+            raise _wrong(path, f"a CRS without heights ({system.name})", "dem_datum ellipsoid, egm96 or egm2008")
+        return carried
+    if carried not in {None, stated}:
+        raise _wrong(path, f"heights of {carried} by its own CRS", f"{stated}, as scene.dem_datum says, or carried")
+    return stated
+
+
+def _metres_per_unit(path: Path, system: CRS, unit: str) -> float:
+    axis = system.axis_info[-1]
+    if len(system.axis_info) == 3:
+        return float(axis.unit_conversion_factor * (-1 if axis.direction == "down" else 1))
+    if unit not in {"m", "metre", "meter", "metres", "meters"}:
+        raise _wrong(path, f"heights in {unit}", "metres")
+    return 1.0

@@ -1,0 +1,220 @@
+"""The files of a simulated campaign: SigMF recordings, flight logs, and the truth for those who judge it."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import default_rng
+from numpy.typing import NDArray
+
+from apertura.constants import GPS_UTC_LEAP_S
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.simulation.continuous import pulse_samples
+from apertura.simulation.observation import Observation
+from apertura.simulation.radar import Floats
+from apertura.simulation.recording import full_scale
+from apertura.simulation.scene import Origin, PointTarget, Target, scatterers
+from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
+
+_POS_HEADER = """\
+% program   : RTKPOST ver.2.4.3
+% pos mode  : Kinematic
+%
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
+%  {system:<22}latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) \
+age(s)  ratio
+"""
+_POS_QUALITY = "   1  18   0.0050   0.0050   0.0100   0.0000   0.0000   0.0000   0.00  100.0"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Where a capture begins.
+
+    Attributes
+    ----------
+    sample_start
+        Index into the samples of one channel.
+    time_utc
+        The node's own tag, datetime64[ns].
+    frame
+        Frame number read from the payload, if there is one.
+    """
+
+    sample_start: int
+    time_utc: np.datetime64
+    frame: int | None = None
+
+
+def write_recording(
+    stem: Path,
+    blocks: Iterable[NDArray[np.int16]],
+    segments: Sequence[Segment],
+    *,
+    channels: Sequence[str],
+    sample_rate_hz: float,
+    frequency_hz: float,
+    extra: dict[str, Any],
+) -> None:
+    """Write `stem`.sigmf-data and `stem`.sigmf-meta.
+
+    Parameters
+    ----------
+    stem
+        raw/<flight>/<node>; the file name is the node's name.
+    blocks
+        (sample, channel, 2) int16 counts of I and Q, in order; never held all at once.
+    segments
+        One per trigger.
+    channels
+        Names, in the order of the samples.
+    sample_rate_hz, frequency_hz
+        Nominal sampling rate, and the RF frequency at baseband zero.
+    extra
+        More keys of the `apertura` namespace for the global object.
+
+    Notes
+    -----
+    Source: SigMF specification 1.2.
+    """
+    digest = hashlib.sha512()
+    with stem.with_name(f"{stem.name}.sigmf-data").open("wb") as stream:
+        for block in blocks:
+            data = np.ascontiguousarray(block, "<i2").tobytes()
+            digest.update(data)
+            stream.write(data)
+    header = {
+        "core:datatype": "ci16_le",
+        "core:sample_rate": sample_rate_hz,
+        "core:version": "1.2.5",
+        "core:num_channels": len(channels),
+        "core:sha512": digest.hexdigest(),
+        "core:description": f"{stem.parent.name} {stem.name}",
+        "core:hw": "simulated direct-RF node",
+        "core:extensions": [{"name": "apertura", "version": "0.1.0", "optional": True}],
+        "apertura:channels": list(channels),
+        "apertura:node": stem.name,
+        **extra,
+    }
+    captures = [_capture(segment, frequency_hz) for segment in segments]
+    meta = {"global": header, "captures": captures, "annotations": []}
+    stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+
+
+def _capture(segment: Segment, frequency_hz: float) -> dict[str, Any]:
+    capture: dict[str, Any] = {
+        "core:sample_start": segment.sample_start,
+        "core:frequency": frequency_hz,
+        "core:datetime": f"{np.datetime_as_string(segment.time_utc, 'us')}Z",
+    }
+    return capture if segment.frame is None else capture | {"apertura:frame": segment.frame}
+
+
+def write_csv_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, attitude_rad: Floats) -> None:
+    """Write a flight controller's log: UTC, latitude, longitude, ellipsoidal height, roll, pitch, yaw.
+
+    Parameters
+    ----------
+    path
+        The .csv to write.
+    time_utc
+        (epoch,) datetime64[ns], UTC.
+    geodetic
+        (epoch, 3) float64: degrees, degrees, metres above the ellipsoid.
+    attitude_rad
+        (epoch, 3) float64: roll, pitch, yaw (clockwise from north).
+    """
+    lines = ["time_utc,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,yaw_deg"]
+    turned = np.degrees(attitude_rad)
+    turned[:, 2] %= 360
+    for time, (latitude, longitude, height), (roll, pitch, yaw) in zip(time_utc, geodetic, turned, strict=True):
+        place = f"{latitude:.11f},{longitude:.11f},{height:.5f}"
+        lines.append(f"{np.datetime_as_string(time, 'us')}Z,{place},{roll:.4f},{pitch:.4f},{yaw:.4f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_pos_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, *, system: str = "GPST") -> None:
+    """Write an RTKLIB solution in `system` GPST (18 s ahead of UTC since 2017) or UTC.
+
+    Parameters
+    ----------
+    path
+        The .pos to write.
+    time_utc
+        (epoch,) datetime64[ns], UTC.
+    geodetic
+        (epoch, 3) float64: degrees, degrees, metres above the ellipsoid.
+    system
+        Time system of the columns, named in the header.
+
+    Notes
+    -----
+    Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
+    """
+    ahead = np.timedelta64(GPS_UTC_LEAP_S if system == "GPST" else 0, "s")
+    lines = []
+    for time, (latitude, longitude, height) in zip(time_utc + ahead, geodetic, strict=True):
+        text = np.datetime_as_string(time, "ms").replace("-", "/").replace("T", " ")
+        lines.append(f"{text}   {latitude:14.11f} {longitude:15.11f} {height:11.5f}{_POS_QUALITY}")
+    path.write_text(_POS_HEADER.format(system=system) + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict[str, Any]:
+    """Return point targets in a projected CRS with ellipsoidal heights, and what else there is in words."""
+    points = tuple(target for target in targets if isinstance(target, PointTarget))
+    others = [repr(target) for target in targets if not isinstance(target, PointTarget)]
+    placed = scatterers(origin, points, default_rng(0))
+    listed = [
+        {
+            "x": float(x),
+            "y": float(y),
+            "height_m": float(height),
+            "amplitude": float(abs(amplitude)),
+            "phase_rad": float(np.angle(amplitude)),
+        }
+        for (x, y, height), amplitude in zip(projected_from_ecef(crs, placed.position_m), placed.amplitude, strict=True)
+    ]
+    return {"crs": crs, "targets": listed} | ({"extended": others} if others else {})
+
+
+def flight_truth(
+    campaign: DrawnCampaign, flight: SimulatedFlight, recordings: Mapping[str, Observation]
+) -> dict[str, Any]:
+    """Return everything that was drawn of a flight, node by node."""
+    specification = campaign.specification
+    truth: dict[str, Any] = {"pulses": flight.pulses, "kind": flight.kind, "nodes": {}}
+    if flight.targets is not None:
+        truth |= targets_truth(specification.origin, flight.targets, specification.scene.crs)
+    for name, recording in recordings.items():
+        node, draw, radar = specification.nodes[name], recording.draw, recording.channels["radar"]
+        truth["nodes"][name] = {
+            "kept": None if draw.kept.all() else np.flatnonzero(draw.kept).tolist(),
+            "cfo_hz": radar.cfo_hz,
+            "sfo_hz": radar.sfo_hz,
+            "path_offset_m": dict(node.path_offset_m),
+            "phase_rad": _series(draw.phase_rad),
+            "start_s": _series(draw.start_s),
+            "tag_error_s": _series(draw.tag_error_s),
+            "blocked": np.flatnonzero(draw.blocked).tolist(),
+            "position_error_m": draw.position_error_m.tolist() if draw.position_error_m.any() else 0.0,
+            "channels": {
+                channel_name: {
+                    "noise_variance": channel.noise_variance,
+                    "full_scale": full_scale(channel, node.impairments.adc),
+                }
+                for channel_name, channel in recording.channels.items()
+            },
+            "impairments": repr(node.impairments),
+        }
+        if flight.continuous:
+            truth["nodes"][name]["pulse_start_sample"] = pulse_samples(radar, campaign.pulse_times(flight)).tolist()
+    return truth
+
+
+def _series(values: Floats) -> list[float] | float:
+    """Return a constant as one number, anything else pulse by pulse."""
+    return float(values[0]) if (values == values[0]).all() else values.tolist()

@@ -1,0 +1,248 @@
+"""A campaign before it is simulated: the values that a YAML specification holds, and what is drawn of them first."""
+
+import dataclasses
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import yaml
+from numpy.random import Generator
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic.fields import FieldInfo
+
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.simulation.continuous import Framing
+from apertura.simulation.draw import independent_streams
+from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
+from apertura.simulation.radar import Floats, TransmitWaveform, newman_codes, qpsk_codes
+from apertura.simulation.scene import Origin, Target, Vector
+from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
+from apertura.validation import read_yaml, validated
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class WaveformSpecification:
+    """One OFDM symbol per pulse; docs/theory/simulate.md, eq. 3."""
+
+    subcarriers: int = Field(gt=1, description="number of subcarriers N")
+    carrier_hz: float = Field(gt=0, description="RF frequency of subcarrier n = 0, Hz")
+    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz")
+    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s")
+    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s")
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
+    carrier_is: Literal["band_start", "band_centre"] = Field(
+        default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+    )
+    code: Literal["qpsk", "newman"] = Field(
+        default="qpsk", description="code symbols: random QPSK, or Newman's flat symbol"
+    )
+
+    @model_validator(mode="after")
+    def _dft_fits(self) -> Self:
+        length = self.sample_rate_hz / self.subcarrier_spacing_hz
+        if abs(length - round(length)) > 1e-6 * length or self.subcarriers > round(length):
+            raise ValueError(
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f}, the DFT length, must be an integer "
+                f"not below subcarriers={self.subcarriers}"
+            )
+        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
+            raise ValueError(f"symbol_s={self.symbol_s:g} is shorter than 1/subcarrier_spacing_hz")
+        return self
+
+    def drawn(self, generator: Generator) -> TransmitWaveform:
+        """Return the waveform with its code symbols."""
+        codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
+        sent = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code"}}
+        return TransmitWaveform(codes, **sent)
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class SimulatedNode:
+    """One UAV: what it carries, how it logs, and what is wrong with it."""
+
+    lever_arms_m: Mapping[AntennaPoint, Vector] = Field(
+        default_factory=dict, description="forward, right, down from the logged point to each antenna, m; missing: zero"
+    )
+    path_offset_m: Mapping[ChannelName, float] = Field(
+        default_factory=dict, description="true electrical path beyond geometry as receiver, m; missing: zero"
+    )
+    stated_path_offset_m: Mapping[ChannelName, float] | None = Field(
+        default=None, description="what the config says instead; null: the truth"
+    )
+    attitude: Literal["log", "course", "none"] = Field(default="log", description="what the config says of attitude")
+    log_format: Literal["csv", "pos", "pos_utc"] = Field(
+        default="csv", description="csv with attitude, pos (RTKLIB in GPST) or pos_utc"
+    )
+    log_rate_hz: float = Field(default=10.0, gt=0, description="epochs of the log per second, Hz")
+    impairments: Impairments = Field(default=Impairments(), description="what is wrong with it")
+    antennas: Mapping[RadarPoint, GaussianBeam] = Field(
+        default_factory=dict, description="beams of the radar antennas; missing: the same in all directions"
+    )
+
+
+def _utc_text(value: Any) -> Any:
+    """Return a time that YAML has read as one as ISO 8601 again, in UTC and without saying so."""
+    if not isinstance(value, datetime):
+        return value
+    return (value.astimezone(UTC) if value.tzinfo else value).replace(tzinfo=None).isoformat()
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class SimulatedFlight:
+    """One line of flights.tsv, and what flies."""
+
+    name: Name = Field(description="as in flights.tsv")
+    transmitter: str = Field(description="node that transmits, and receives as the others do")
+    tracks: Mapping[Name, Track] = Field(min_length=1, description="track of each node that records, by its name")
+    pulses: int = Field(gt=0, description="number of pulses")
+    start_utc: Annotated[
+        str, BeforeValidator(_utc_text), Field(pattern=r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:[\d.]+)?)?$")
+    ] = Field(default="2025-05-14T09:30:00", description="UTC of the first pulse, ISO 8601")
+    kind: Literal["image", "calibration"] = Field(default="image", description="as in flights.tsv")
+    framing: Framing | None = Field(default=None, description="preamble and frame counter; null: no frame numbers")
+    first_frame: int = Field(default=0, ge=0, description="number of the first frame")
+    continuous: bool = Field(default=False, description="recorders run through instead of being triggered")
+    targets: tuple[Target, ...] | None = Field(default=None, description="what stands there in this flight only")
+
+    @model_validator(mode="after")
+    def _transmitter_flies(self) -> Self:
+        if self.transmitter not in self.tracks:
+            raise ValueError(f"transmitter {self.transmitter!r} has no track; tracks are of {', '.join(self.tracks)}")
+        return self
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class ImageGrid:
+    """The `scene` section of the config."""
+
+    crs: str = Field(pattern=r"^EPSG:\d+$", description="projected CRS, EPSG:…")
+    half_width_m: float | None = Field(
+        default=None, gt=0, description="half the width of a square about the origin, m, instead of bounds_m"
+    )
+    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
+        default="auto", description="outer pixel edges, m"
+    )
+    spacing_m: float | Literal["auto"] = Field(default="auto", description="pixel spacing, m, or auto")
+    height_m: float | None = Field(default=None, description="ellipsoidal height, m; null: that of the origin")
+
+    @model_validator(mode="after")
+    def _square_has_a_spacing(self) -> Self:
+        if self.half_width_m is not None and (self.spacing_m == "auto" or self.bounds_m != "auto"):
+            raise ValueError("half_width_m needs spacing_m in metres, and no bounds_m")
+        return self
+
+    def bounds(self, origin: Origin) -> tuple[float, ...] | Literal["auto"]:
+        """Return xmin, ymin, xmax, ymax (m); a square is anchored at a multiple of the spacing.
+
+        Examples
+        --------
+        >>> ImageGrid("EPSG:32632", 1.0, spacing_m=0.05).bounds(Origin(48.0, 9.0, 500.0))
+        (499999.0, 5316299.2, 500001.0, 5316301.2)
+        """
+        if self.half_width_m is None or self.spacing_m == "auto":
+            return self.bounds_m
+        centre = projected_from_ecef(self.crs, origin.ecef(np.zeros(3)))
+        x, y = (round(float(value) / self.spacing_m) * self.spacing_m for value in centre[:2])
+        half = self.half_width_m
+        return tuple(round(value, 6) for value in (x - half, y - half, x + half, y + half))
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class CampaignSpecification:
+    """Everything that, with the seed, decides the bytes of a simulated campaign."""
+
+    campaign: str = Field(description="name of the campaign")
+    origin: Origin = Field(description="where east, north and up are counted from")
+    waveform: WaveformSpecification = Field(description="what is transmitted")
+    targets: tuple[Target, ...] = Field(description="what stands in the scene")
+    nodes: Mapping[Name, SimulatedNode] = Field(min_length=1, description="one section per UAV")
+    flights: tuple[SimulatedFlight, ...] = Field(description="who flies what, one after the other")
+    scene: ImageGrid = Field(description="the grid on which the campaign is imaged")
+
+    @model_validator(mode="after")
+    def _nodes_fly(self) -> Self:
+        flown = {name for flight in self.flights for name in flight.tracks}
+        if flown != set(self.nodes):
+            raise ValueError(f"nodes are {', '.join(sorted(self.nodes))}, but tracks are of {', '.join(sorted(flown))}")
+        if not self.flights or len({flight.name for flight in self.flights}) < len(self.flights):
+            raise ValueError("flights must be one or more, each with a name of its own")
+        return self
+
+
+def read_specification(path: Path) -> CampaignSpecification:
+    """Return the specification in a YAML file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, or with every key that is wrong and the nearest valid one.
+    """
+    remedy = "`apertura simulate --print-spec demo` prints one to start from."
+    document = read_yaml(path, expected="a YAML specification of a simulation", remedy=remedy)
+    expected = "keys and values such as `apertura simulate --print-spec demo` prints"
+    return validated(CampaignSpecification, document, where=path, expected=expected)
+
+
+def specification_text(specification: CampaignSpecification) -> str:
+    """Return a specification as YAML, without what is at its default; `read_specification` reads it back exactly."""
+    return yaml.safe_dump(_plain(specification), sort_keys=False, default_flow_style=None, width=120)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        fields: dict[str, FieldInfo] = type(value).__pydantic_fields__  # type: ignore[union-attr]
+        own = {name: getattr(value, name) for name in fields}
+        # keyword-only: `kind`, which tells a reader of YAML what the rest is
+        return {
+            name: _plain(own[name])
+            for name, field in sorted(fields.items(), key=lambda item: not item[1].kw_only)
+            if field.kw_only or own[name] != field.get_default(call_default_factory=True)
+        }
+    if isinstance(value, Mapping):
+        return {key: _plain(own) for key, own in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(own) for own in value]
+    if isinstance(value, complex):
+        return str(value) if value.imag else value.real
+    return value
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnCampaign:
+    """A specification with its code symbols and trajectories drawn.
+
+    Attributes
+    ----------
+    specification
+        What it was drawn from.
+    waveform
+        What is transmitted.
+    trajectories
+        (flight, node) → how the node flies.
+    """
+
+    specification: CampaignSpecification
+    waveform: TransmitWaveform
+    trajectories: Mapping[tuple[str, str], Trajectory]
+
+    def pulse_times(self, flight: SimulatedFlight) -> Floats:
+        """Return (pulse,) float64, seconds from the first pulse."""
+        return np.arange(flight.pulses) / self.waveform.prf_hz
+
+
+def draw_campaign(specification: CampaignSpecification, generator: Generator) -> DrawnCampaign:
+    """Draw code symbols, then the wobble of each track in order, each from its own stream."""
+    tracks = {(flight.name, node): (flight, node) for flight in specification.flights for node in flight.tracks}
+    codes, *streams = independent_streams(generator, 1 + len(tracks))
+    trajectories = {}
+    for (key, (flight, node)), stream in zip(tracks.items(), streams, strict=True):
+        track = flight.tracks[node]
+        path, duration_s = track.intended(), (flight.pulses - 1) / specification.waveform.prf_hz
+        trajectories[key] = path if track.wobble is None else track.wobble.around(path, duration_s, stream)
+    return DrawnCampaign(specification, specification.waveform.drawn(codes), trajectories)

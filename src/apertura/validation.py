@@ -1,0 +1,109 @@
+"""From a YAML document to a validated value, or to the one message that says all that is wrong with it."""
+
+import difflib
+import re
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic_core import ArgsKwargs
+
+from apertura.errors import CampaignError
+
+T = TypeVar("T")
+
+_TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
+"""What pydantic adds to the way to a key where it may hold one of several types."""
+
+
+def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
+    """Return the document in a YAML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    expected, remedy
+        What the message says where there is no such file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there or is not YAML.
+    """
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
+    try:
+        document: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CampaignError(
+            f"not readable as YAML ({' '.join(str(error).split())})",
+            where=path,
+            expected="YAML",
+            remedy="Correct the line named.",
+        ) from error
+    return document
+
+
+def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
+    """Return `document` as a `model`; one message names every wrong key and the nearest valid one.
+
+    Parameters
+    ----------
+    model
+        A pydantic model or dataclass that forbids extra keys.
+    document
+        What YAML made of the file.
+    where, expected
+        File, and what its keys and values should be, for the message.
+
+    Raises
+    ------
+    CampaignError
+        With file, key, what was found and what was expected.
+    """
+    adapter = TypeAdapter(model)
+    try:
+        return adapter.validate_python(document)
+    except ValidationError as error:
+        schema = adapter.json_schema()
+        wrong: dict[str, list[str]] = {}
+        for item in error.errors(include_url=False):
+            key, line = _complaint(dict(item), schema)
+            wrong.setdefault(key, []).append(line)
+        lines = [f"{key}: {' or '.join(complaints)}" for key, complaints in wrong.items()]
+        raise CampaignError(
+            "; ".join(sorted(lines, key=lambda line: "unknown key" not in line)),
+            where=where,
+            expected=expected,
+            remedy="Correct what is named.",
+        ) from error
+
+
+def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
+    """Return the key and what is wrong with it; the names of alternative types are no keys."""
+    tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
+    location = [str(part) for part in item["loc"] if not (re.match(_TYPE, str(part)) or part in tags)]
+    key = ".".join(location) or "the whole file"
+    if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
+        near = difflib.get_close_matches(location[-1], sorted(_collected(schema, _properties)), n=1, cutoff=0.5)
+        return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
+    if item["type"] == "missing":
+        return key, "missing"
+    shown = "" if isinstance(item["input"], dict | BaseModel | ArgsKwargs) else f" (found {item['input']!r})"
+    return key, f"{item['msg'].removeprefix('Value error, ')}{shown}"
+
+
+def _properties(part: dict[str, Any]) -> Any:
+    properties = part.get("properties", {})
+    return properties if isinstance(properties, dict) else {}
+
+
+def _collected(schema: object, names: Any) -> set[str]:
+    """Return the `names` of every part of a JSON schema."""
+    if isinstance(schema, list):
+        return set().union(*(_collected(part, names) for part in schema))
+    if not isinstance(schema, dict):
+        return set()
+    return set(names(schema)).union(*(_collected(part, names) for part in schema.values()))

@@ -1,0 +1,65 @@
+"""Importing apertura is cheap, and its public names come from where they are defined."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import apertura
+from apertura.provenance import code_sha256
+
+HEAVY = {"dask", "matplotlib", "numba", "numpy", "pandas", "pydantic", "pyproj", "rasterio", "scipy", "xarray", "zarr"}
+
+
+def loaded_by(statement):
+    listing = "import json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    output = subprocess.run(
+        [sys.executable, "-c", f"{statement}\n{listing}"], capture_output=True, text=True, check=True
+    ).stdout
+    return set(json.loads(output.splitlines()[-1]))
+
+
+def test_importing_apertura_loads_no_library():
+    assert loaded_by("import apertura") - loaded_by("pass") - sys.stdlib_module_names == {"apertura"}
+
+
+def test_the_command_line_loads_no_library_of_a_step():
+    assert not HEAVY & loaded_by("import apertura.cli")
+    assert "typer" in loaded_by("import apertura.cli")
+
+
+def test_reading_a_config_loads_no_arrays():
+    assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.campaign")
+
+
+@pytest.mark.parametrize(
+    "name",
+    sorted(apertura.__all__),
+)
+def test_a_public_name_is_documented_and_listed(name):
+    assert getattr(apertura, name).__doc__
+    assert getattr(apertura, name) is vars(apertura)[name]
+    assert name in dir(apertura)
+
+
+def test_a_name_that_is_not_public_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="'backprojekt'"):
+        _ = apertura.backprojekt
+
+
+def test_the_public_names_are_no_code_of_a_stage():
+    """Stages import the version from there; that must not tie their hash to every module that is public."""
+    assert code_sha256("apertura") == code_sha256()
+    assert code_sha256("apertura.contracts") != code_sha256()
+
+
+def test_the_version_is_printed_and_is_what_the_build_reads():
+    source = Path(apertura.__file__).read_text(encoding="utf-8")
+    assert re.search(r'^__version__ = "(.+)"$', source, re.MULTILINE)[1] == apertura.__version__
+    for words in (["version"], ["--version"]):
+        command = [sys.executable, "-c", "from apertura.cli import main; main()", *words]
+        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert printed == f"{apertura.__version__}\n"
