@@ -52,8 +52,7 @@ def settle_ground(campaign: Campaign) -> None:
 def ingest_all(campaign: Campaign) -> None:
     """Ingest what both nodes of flight f01 recorded."""
     for node in ("uav1", "uav2"):
-        ingest.raw(campaign, "f01", node)
-        ingest.track(campaign, "f01", node)
+        ingest.ingest(campaign, "f01", node)
 
 
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
@@ -62,8 +61,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     for flight in campaign.image_flights:
         if campaign.settings.waveform.kind == "ofdm":
             for node in flight.nodes:
-                ingest.raw(campaign, flight.name, node)
-                ingest.track(campaign, flight.name, node)
+                ingest.ingest(campaign, flight.name, node)
         for pair in flight.pairs:
             echo.echo(campaign, flight.name, pair)
     settle_ground(campaign)

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from campaigns import compressed, draw
+from scenes import TARGET, TARGET_GRID, point_history
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.imaging.certify import certified, measures
 from apertura.imaging.formation import Formation
+from apertura.imaging.job import imaging_job
+from apertura.imaging.range_profiles import range_compress
 from apertura.planning.planner import make_plan
 from apertura.quality.measures import numerical_error
+from apertura.scene.ground_models import GroundModels
 
 SIDE_PX = 32
 
@@ -75,19 +79,16 @@ def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speck
     }
 
 
-def test_the_brightest_target_is_measured_where_it_stands():
-    drawn = draw(np.random.default_rng(4), pixels=80, pulses=60)
-    flown, grid = drawn.history.aperture, drawn.grid
-    x, y = grid.map_at(41.3, 28.7)
-    path = flown.path(np.array([[x, y, 0.0]], np.float64)) - C * drawn.history.reference_delay_s[:, None]
-    echo = np.exp(-2j * np.pi * drawn.history.frequency_hz * path / C).astype(np.complex64)
-    history = replace(drawn.history, transfer=echo)
-    profiles = compressed(history, grid, "none")
-    weight = np.full(history.frequency_hz.shape, 1 / len(history.frequency_hz))
-    formation = Formation(
-        replace(history, weight=weight), profiles, grid, make_plan(drawn.job, accuracy_db=-60.0), SIDE_PX
-    )
+def test_the_brightest_target_is_measured_where_it_stands_with_its_amplitude_and_width():
+    history, ground = point_history(), GroundModels.flat(0.0)
+    aperture, frequency = history.aperture, history.frequency_hz
+    job = imaging_job(aperture, frequency, history.weight, TARGET_GRID, ground, history=history)
+    plan = make_plan(job, accuracy_db=-60.0)
+    formation = Formation(history, range_compress(history, TARGET_GRID, ground.full), TARGET_GRID, plan, SIDE_PX)
     brightest = measures(formation, formation.image.compute())["brightest"]
-    assert (brightest["x_m"], brightest["y_m"]) == pytest.approx((x, y), abs=0.1 * grid.spacing_m)
-    assert brightest["amplitude"] == pytest.approx(1.0, abs=0.01)
-    assert brightest["coherence_factor"] == pytest.approx(1.0, abs=1e-3)
+    assert (brightest["x_m"], brightest["y_m"]) == pytest.approx(TARGET[0, :2], abs=0.003)
+    assert brightest["amplitude"] == pytest.approx(1.0, abs=0.005)
+    assert brightest["coherence_factor"] == pytest.approx(1.0, abs=1e-4)
+    half_angle = np.arctan2(4.0, np.hypot(20.0 + TARGET[0, 1], 10.0))  # 8 m of track
+    cell_m = C / frequency.mean() / (4 * np.sin(half_angle))
+    assert brightest["cross_range_width_m"] == pytest.approx(0.886 * cell_m, rel=0.03)

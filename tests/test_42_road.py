@@ -63,7 +63,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
     with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
-    monkeypatch.setitem(METHODS, "divide", lambda radar, _: radar)
+    monkeypatch.setitem(METHODS, "divide", lambda radar, *_: radar)
     copy = Campaign.load(copy_writable(finished_sample.root, tmp_path / "campaign"))
     echo.echo(copy, *pair)
     uncorrected = open_stage(copy.stage("echo", *pair), "echo").load()

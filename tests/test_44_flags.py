@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_41_bad_input import complaint, edit_config, ingest_all
+from folders import complaint, edit_config, ingest_all
 
 from apertura.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate

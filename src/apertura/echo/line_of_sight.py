@@ -1,6 +1,6 @@
 """The direct path inside a sidelink: its delay, phase and amplitude in every pulse, and whether it is there at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,10 @@ class LineOfSight:
     amplitude: Floats
     noise_power: Floats
     locked: NDArray[np.bool_]
+
+    def select(self, pulses: NDArray[np.bool_]) -> "LineOfSight":
+        """Return the path of some pulses, (pulse,) bool."""
+        return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
 
 
 def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
@@ -93,8 +97,8 @@ def _fit(sidelink: Complexes) -> tuple[Floats, Floats, Floats, Floats]:
         aligned = symbols * np.exp(2j * np.pi / subcarriers * np.outer(delay, number))
         total, first, second = aligned.sum(1), (aligned @ number), (aligned @ number**2)
         slope = -2 * np.imag(total.conj() * first)
-        bend = 2 * (np.abs(first) ** 2 - np.real(total.conj() * second))
-        step = -slope / np.where(bend < 0, bend, -np.inf) * subcarriers / (2 * np.pi)
+        curvature = 2 * (np.abs(first) ** 2 - np.real(total.conj() * second))
+        step = -slope / np.where(curvature < 0, curvature, -np.inf) * subcarriers / (2 * np.pi)
         delay = delay + np.clip(step, -0.25, 0.25)
     aligned = symbols * np.exp(2j * np.pi / subcarriers * np.outer(delay, number))
     total = aligned.mean(1)
