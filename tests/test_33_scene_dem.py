@@ -90,7 +90,7 @@ def test_a_missing_geoid_grid_is_an_error_that_names_it(shared, monkeypatch, tmp
         open_dem(path, "EPSG:32611", datum="egm96", geoid=tmp_path / "nowhere.gtx")
 
 
-def test_a_geoid_grid_is_found_where_proj_looks(shared, monkeypatch, tmp_path):
+def test_a_geoid_grid_is_taken_from_the_search_path_of_proj(shared, monkeypatch, tmp_path):
     folder = tmp_path / "with space"
     folder.mkdir()
     (folder / "egm96_15.gtx").write_bytes((shared / "dem_isce3" / "egm96_15.gtx").read_bytes())
@@ -150,10 +150,10 @@ def test_a_void_reaches_as_far_as_its_post_counts_and_no_further(tmp_path, void)
     heights[30, 20] = np.nan if void == "nan" else -9999
     nodata = {} if void == "nan" else {"nodata": -9999}
     path = write_dem(tmp_path / "dem.tif", heights, from_origin(500000, 5400100, 2, 2), **nodata)
-    found = open_dem(path, UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
+    heights_m = open_dem(path, UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
     x, y = np.meshgrid(UTM_GRID.x_m, UTM_GRID.y_m)
     near = (np.abs(x - 500041) < 2) & (np.abs(y - 5400039) < 2)
-    np.testing.assert_array_equal(np.isnan(found), near)
+    np.testing.assert_array_equal(np.isnan(heights_m), near)
 
 
 @pytest.mark.parametrize("wild", [-9999.0, -32768.0, 3.4e38, 29029.0])

@@ -50,15 +50,15 @@ def test_a_constant_dem_equals_a_lowered_track():
 
 
 def test_a_raised_target_is_laid_over_on_flat_ground_and_true_on_its_dem():
-    """On flat ground a target h high is found where the ground has its range: √(y² − 2Hh + h²)."""
+    """On flat ground a target h high appears where the ground has its range: √(y² − 2Hh + h²)."""
     spectra = history(track_at(8.0), [0.5, 12.0, 1.2])
     y = np.broadcast_to(LOCAL.y_m[:, None], LOCAL.shape)
     for heights, place in ((0.0, np.sqrt(12.0**2 - 2 * 8 * 1.2 + 1.2**2)), (np.where(y > 10.5, 1.2, 0.0), 12.0)):
         image = focus(spectra, heights)
         peak = find_peak(image, *np.unravel_index(np.abs(image).argmax(), image.shape))
-        found = LOCAL.map_at(peak.row, peak.column)
-        assert found[0] == pytest.approx(0.5, abs=0.02)
-        assert found[1] == pytest.approx(place, abs=0.02)
+        place_m = LOCAL.map_at(peak.row, peak.column)
+        assert place_m[0] == pytest.approx(0.5, abs=0.02)
+        assert place_m[1] == pytest.approx(place, abs=0.02)
 
 
 @pytest.mark.parametrize("facing", [20.0, -20.0])

@@ -77,13 +77,13 @@ def test_shadow_on_random_hills_is_what_dense_sampling_of_every_line_says():
     np.testing.assert_array_equal(mask[clear], margin[clear] > 0)
 
 
-def test_a_pixel_hidden_from_few_looks_is_not_in_shadow_and_either_antenna_counts():
+def test_a_pixel_shaded_at_few_pulses_is_not_in_shadow_and_either_antenna_counts():
     heights = np.zeros(STREET.shape)
     heights[:, 80] = 2.0
     low, high = [-10.0, 1.375, 8.0], [-10.0, 1.375, 200.0]
     behind = (6, 90)
-    for looks, dark in (([low, low, high], 1), ([low, high, high], 0)):
-        assert seen(heights, looks)[0, behind[1]] & 1 == dark
+    for antennas, dark in (([low, low, high], 1), ([low, high, high], 0)):
+        assert seen(heights, antennas)[0, behind[1]] & 1 == dark
     relief = Relief.of(STREET, GridHeights(STREET, heights), 0.0)
     tx, rx = (relief.above(np.array([antenna])) for antenna in (high, low))
     for pair in ((tx, rx), (rx, tx)):
@@ -107,8 +107,8 @@ def test_incidence_counts_from_the_normal_of_the_slope():
     antenna = grid.positions_at([4.0], [4 - 200.0], np.array([700.0]))[0]
     for heights, expected in ((600 + 0 * east, 45.0), (600 + tilt * east, 30.0), (600 - tilt * east, 60.0)):
         position = grid.positions(heights)
-        found = incidence_deg(position, surface_normals(position), antenna)[4, 4]
-        assert found == pytest.approx(expected, abs=0.05)
+        incidence = incidence_deg(position, surface_normals(position), antenna)[4, 4]
+        assert incidence == pytest.approx(expected, abs=0.05)
 
 
 def test_the_bistatic_angle_is_zero_for_one_place_and_right_across_for_two():

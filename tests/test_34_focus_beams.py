@@ -35,7 +35,7 @@ def plain():
     return scene, pixels, scene.profiles(ecef(pixels))
 
 
-def test_engines_weigh_alike(isa, plain):
+def test_engines_apply_the_same_weights(isa, plain):
     scene, pixels, profiles = plain
     beams = Beams(swaying_beam(scene.tx, (12, 0, 0)), swaying_beam(scene.rx, (11.5, 0.4, 0), 60))
     truth, counts = exact(scene, pixels, beams), np.zeros(4, np.int64)
@@ -67,7 +67,7 @@ def test_a_narrow_beam_is_weighed_as_finely_as_it_needs(isa, plain, width_deg):
     assert decibels(image - truth, truth) <= -60
 
 
-def test_pulses_that_look_away_are_as_good_as_dropped(isa, plain):
+def test_pulses_whose_beam_points_away_add_nothing(isa, plain):
     scene, pixels, profiles = plain
     lit = swaying_beam(scene.tx, (12, 0, 0), sway_deg=1)
     axes = lit.axes.copy()

@@ -1,4 +1,4 @@
-"""The compiled engine at the edges of its envelope; benchmarks/envelope.csv has the whole of it."""
+"""The compiled engine at the edges of its envelope; benchmarks/envelope.csv has all of it."""
 
 import numpy as np
 import pytest

@@ -43,7 +43,9 @@ def test_instruction_sets_agree_with_each_other(plain, monkeypatch):
     for name in filter(native_binding.runs, native.INSTRUCTION_SETS):
         monkeypatch.setenv("APERTURA_ISA", name)
         images.append(native.form(native.prepare(profiles), ecef(pixels)))
-    assert all(decibels(image - images[0], images[0]) <= -95 for image in images[1:])
+    if len(images) < 2:
+        pytest.skip("this machine runs one instruction set")
+    assert max(decibels(image - images[0], images[0]) for image in images[1:]) <= -95
 
 
 @pytest.mark.parametrize(("oversampling", "degree"), [(5, 2), (6, 2), (8, 2), (8, 1), (10, 1), (16, 1)])

@@ -15,10 +15,10 @@ from apertura.quality.measures import numerical_error
 @pytest.mark.parametrize(("step_m", "summed"), [(0.002, True), (0.1, False)])
 def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed):
     tx = straight_track(2000, length_m=2000 * step_m)
-    found = plan(aperture=monostatic(tx), shape=(2000, 2000), spacing_m=0.005)
-    assert (found.presum is not None) == summed
+    planned = plan(aperture=monostatic(tx), shape=(2000, 2000), spacing_m=0.005)
+    assert (planned.presum is not None) == summed
     if summed:
-        assert found.presum.factor >= 4
+        assert planned.presum.factor >= 4
         assert plan(aperture=monostatic(tx), overrides={"presum": 1}).presum is None
 
 

@@ -9,7 +9,7 @@ from apertura.quality.point_targets import Patch, cut_through, find_peak
 from apertura.scene.grid import SceneGrid
 
 
-def test_an_error_says_how_far_it_hangs_on_the_choice_of_pixels():
+def test_an_error_says_how_much_it_depends_on_the_choice_of_pixels():
     """The spread over draws of pixels is what leaving out pixels tells: on speckle, and on a few targets."""
     generator = np.random.default_rng(4)
     for targets, least, most in ((0, 0.3, 0.8), (300, 2.0, 8.0)):
@@ -17,10 +17,10 @@ def test_an_error_says_how_far_it_hangs_on_the_choice_of_pixels():
         scene[:targets] *= 100
         noise = 1e-3 * (generator.standard_normal(40_000) + 1j * generator.standard_normal(40_000))
         draws = [generator.integers(0, scene.size, 256) for _ in range(200)]
-        found = [numerical_error((scene + noise)[draw].astype(np.complex128), scene[draw]) for draw in draws]
-        spread = np.std([one.rms_db for one in found])
+        errors = [numerical_error((scene + noise)[draw].astype(np.complex128), scene[draw]) for draw in draws]
+        spread = np.std([one.rms_db for one in errors])
         assert least < spread < most
-        assert np.median([one.std_db for one in found]) == pytest.approx(spread, rel=0.4)
+        assert np.median([one.std_db for one in errors]) == pytest.approx(spread, rel=0.4)
 
 
 def test_the_patch_is_exact_between_pixels_although_the_carrier_folds():
@@ -65,7 +65,7 @@ def test_a_survey_by_windows_is_the_survey_of_the_whole():
     assert whole.entropy == pytest.approx(-(share * np.log(share)).sum(), abs=1e-6)
 
 
-def test_a_tile_that_misses_the_accuracy_is_found_and_the_others_are_not():
+def test_only_the_tile_that_misses_the_accuracy_is_named():
     generator = np.random.default_rng(6)
     image = (generator.standard_normal((64, 64)) + 1j * generator.standard_normal((64, 64))).astype(np.complex64)
     grid = SceneGrid("local", 0, 0, 1, (64, 64))

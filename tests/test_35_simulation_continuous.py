@@ -56,10 +56,10 @@ def test_the_preamble_lies_where_truth_says_and_the_payload_counts_and_wraps():
     expected = (pulse_samples(channels["sidelink"], time_s) + delay * 32e6) - FRAMING.lead_samples
     for pulse, start in enumerate(expected):
         near = slice(int(start) - 2000, int(start) + 2000)
-        found = near.start + int(np.argmax(match[near]))
-        assert abs(found - start) < 1
-        reference = (mixed[found : found + len(chips)] * chips).sum()
-        body = mixed[found + len(chips) : found + len(chips) + 6 * 20].reshape(6, 20).sum(axis=1) / reference
+        at = near.start + int(np.argmax(match[near]))
+        assert abs(at - start) < 1
+        reference = (mixed[at : at + len(chips)] * chips).sum()
+        body = mixed[at + len(chips) : at + len(chips) + 6 * 20].reshape(6, 20).sum(axis=1) / reference
         bits = (body.real > 0).astype(int)
         assert (bits[:3] == 1 - bits[3:]).all()
         assert int("".join(map(str, bits[:3])), 2) == (5 + pulse) % 8

@@ -49,7 +49,14 @@ def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_a_preset_makes_a_campaign_that_loads_and_whose_files_pass_the_check(tmp_path, name):
     root = simulate(tmp_path / "campaign", preset(name, pulses=3))
-    Campaign.load(root).check_files()
+    campaign = Campaign.load(root)
+    campaign.check_files()
+    specification = preset(name)
+    assert [flight.name for flight in campaign.flights] == [flight.name for flight in specification.flights]
+    assert campaign.settings.nodes.keys() == specification.nodes.keys()
+    next((root / "raw").rglob("*.sigmf-data")).unlink()
+    with pytest.raises(CampaignError, match="no such file"):
+        campaign.check_files()
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

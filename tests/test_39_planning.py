@@ -34,13 +34,13 @@ def formed(drawn, setting, profiles):
 
 def certified(drawn) -> tuple[float, int]:
     """Return the certified error and how often a better setting was needed, as the image step goes about it."""
-    found = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
-    error = random_values(drawn.history, drawn.grid, formed(drawn, found.setting, found.inputs(drawn.profiles)))
-    for redone, better in enumerate(found.fallbacks):
+    planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
+    error = random_values(drawn.history, drawn.grid, formed(drawn, planned.setting, planned.inputs(drawn.profiles)))
+    for redone, better in enumerate(planned.fallbacks):
         if error <= drawn.accuracy_db:
             return error, redone
         error = random_values(drawn.history, drawn.grid, formed(drawn, better, drawn.profiles))
-    return error, len(found.fallbacks)
+    return error, len(planned.fallbacks)
 
 
 SETTINGS = (
@@ -114,7 +114,7 @@ def test_predictions_fall_as_more_is_asked_and_cost_does_not():
     assert seconds == sorted(seconds)
 
 
-def test_content_is_paid_for_as_long_as_that_is_cheap():
+def test_weak_content_is_given_a_finer_table_as_long_as_that_is_cheap():
     """Where errors weigh 6 dB more a finer table is taken; where they may weigh 60 dB more, no slower engine."""
     even, sparse, unreachable = (plan(-60.0, content_db=content, shape=(60, 60)) for content in (0.0, 6.0, 60.0))
     assert sparse.setting.error_db <= even.setting.error_db - 3
@@ -124,7 +124,7 @@ def test_content_is_paid_for_as_long_as_that_is_cheap():
     assert unreachable.predicted_error_db > -60
 
 
-def test_what_no_table_can_give_is_left_to_the_double_sum():
+def test_an_accuracy_beyond_every_table_is_left_to_the_double_sum():
     assert plan(-120.0).engine == "reference"
     assert plan(-120.0).presum is None
 
@@ -153,25 +153,25 @@ def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was
 )
 def test_each_choice_can_be_overridden_and_the_plan_says_so(key, value):
     option = key in native.Options.model_fields
-    found = plan(overrides={"engine_options": {"native": {key: value}}} if option else {key: value})
-    decision = next(decision for decision in found.decisions if decision.name == key)
+    planned = plan(overrides={"engine_options": {"native": {key: value}}} if option else {key: value})
+    decision = next(decision for decision in planned.decisions if decision.name == key)
     assert decision.value == value
     assert "asked for" in decision.reason
 
 
 def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
-    found = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
-    assert found.setting.options == {"oversampling": 2}
-    assert found.predicted_error_db > -60
-    assert "does not meet" in found.reasons["engine"]
-    assert found.fallbacks[-1].engine == "reference"
+    planned = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
+    assert planned.setting.options == {"oversampling": 2}
+    assert planned.predicted_error_db > -60
+    assert "does not meet" in planned.reasons["engine"]
+    assert planned.fallbacks[-1].engine == "reference"
 
 
 def test_each_fallback_errs_6_db_less_than_the_last():
-    found = plan()
-    errors = [found.setting.error_db, *(setting.error_db for setting in found.fallbacks)]
+    planned = plan()
+    errors = [planned.setting.error_db, *(setting.error_db for setting in planned.fallbacks)]
     assert all(after <= before - 6 for before, after in pairwise(errors))
-    assert found.fallbacks[-1].engine == "reference"
+    assert planned.fallbacks[-1].engine == "reference"
 
 
 @compiled
@@ -179,7 +179,7 @@ def test_each_fallback_errs_6_db_less_than_the_last():
     ("spacing_m", "range_m", "way"),
     [(0.05, 12, 0), (0.05, 60, 0), (0.05, 4, 1), (0.02, 0.6, 2), (0.6, 60, 2), (2.0, 60, 2)],
 )
-def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeypatch):
+def test_which_path_variants_native_takes_is_predicted(spacing_m, range_m, way, monkeypatch):
     """Shared curvature counts in the kernel's tally whatever its window; own curvature and exact paths apart."""
     pixels = spacing_m * np.stack(np.meshgrid(np.arange(48.0), -np.arange(48.0)), -1)
     places = np.concatenate([pixels - pixels.mean((0, 1)) + [0, range_m], np.zeros((48, 48, 1))], -1)
@@ -203,9 +203,9 @@ def test_the_ways_native_will_take_are_foreseen(spacing_m, range_m, way, monkeyp
 @compiled
 def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
     coarse = planning_job(ground_m=20 * ground_points(), spacing_m=0.35)
-    found = Search(coarse).settings(len(coarse.aperture))
-    cheapest = next(setting for setting in found if setting.engine == "native" and setting.error_db < -50)
-    fine = next(s for s in found if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
+    offered = Search(coarse).settings(len(coarse.aperture))
+    cheapest = next(setting for setting in offered if setting.engine == "native" and setting.error_db < -50)
+    fine = next(s for s in offered if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
     assert cheapest.options["oversampling"] < 6
     assert int(re.search(r"(\d+) % exact paths", fine.reasons["tolerance_rad"])[1]) > 90
     assert cheapest.seconds < fine.seconds / 3
@@ -213,8 +213,8 @@ def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
 
 def test_what_costs_no_more_is_made_more_exact():
     """Of settings within 5 % of the time, the most exact: an estimate of the content may be wrong by some dB."""
-    found = plan(-50.0)
-    within = [s for s in Search(planning_job()).settings(300) if s.seconds <= found.setting.seconds]
-    assert found.setting.error_db == min(setting.error_db for setting in within)
+    planned = plan(-50.0)
+    within = [s for s in Search(planning_job()).settings(300) if s.seconds <= planned.setting.seconds]
+    assert planned.setting.error_db == min(setting.error_db for setting in within)
     cheapest = next(s for s in within if s.error_db <= -56)
-    assert found.setting.seconds <= 1.05 * cheapest.seconds
+    assert planned.setting.seconds <= 1.05 * cheapest.seconds

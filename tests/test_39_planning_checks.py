@@ -43,8 +43,8 @@ def test_an_aperture_sampled_below_the_scenes_doppler_band_is_flagged(spread, fl
     fine, _ = monostatic(straight_track()).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
     apart = straight_track(300, length_m=6.0 * spread / fine)
     for _ in range(3):  # a longer track sees steeper angles too
-        found, _ = monostatic(apart).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
-        apart[:, 0] *= spread / found
+        rate, _ = monostatic(apart).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
+        apart[:, 0] *= spread / rate
     assert ("pulses_sparse" in plan(aperture=monostatic(apart)).flags) == flagged
 
 

@@ -11,12 +11,12 @@ from apertura.planning.memory import memory_limit
 
 
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():
-    found = plan(shape=(20000, 20000))
-    check_fits(found, free_disk=found.disk_bytes, where="f01/a-b", memory=found.memory_bytes)
+    planned = plan(shape=(20000, 20000))
+    check_fits(planned, free_disk=planned.disk_bytes, where="f01/a-b", memory=planned.memory_bytes)
     with pytest.raises(CampaignError, match=r"f01/a-b: imaging needs .* of memory; expected at most the 1.0 MB"):
-        check_fits(found, free_disk=None, where="f01/a-b", memory=1_000_000)
+        check_fits(planned, free_disk=None, where="f01/a-b", memory=1_000_000)
     with pytest.raises(CampaignError, match=r"the results need 24.0 GB on disk; expected at most the 5.0 GB"):
-        check_fits(found, free_disk=5_000_000_000, where="f01/a-b", memory=found.memory_bytes)
+        check_fits(planned, free_disk=5_000_000_000, where="f01/a-b", memory=planned.memory_bytes)
 
 
 LONG = {"aperture": monostatic(straight_track(20_000, length_m=600)), "subcarriers": 128}
@@ -36,6 +36,7 @@ def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
     assert (
         replace(split.setting, pulse_blocks=1, form_seconds=one.setting.form_seconds) == one.setting
     )  # nothing else changes
+    assert len(split.fallbacks) > 1
     assert all(setting.pulse_blocks > 1 for setting in split.fallbacks[:-1])  # finer tables outgrow it as well
     assert split.fallbacks[-1].pulse_blocks == 1
     check_fits(split, free_disk=None, where="f01/a-b", memory=split.memory_bytes)

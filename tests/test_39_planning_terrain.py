@@ -19,7 +19,7 @@ def terrain(height_m: float, *, slope: float = 0.0, wobble_m: float = 0.1, spaci
     return decide_terrain(asked).value
 
 
-def test_ground_is_flat_as_long_as_focus_bears_it():
+def test_ground_is_taken_as_flat_as_long_as_focus_allows():
     """4πd·Δθ/(√2λ) < 0.4 with d the wobble's amplitude 0.1 m and Δθ = δh/20 m: δh < 2.25 m."""
     limit_m = 0.4 * np.sqrt(2) * WAVELENGTH * 20 / (4 * np.pi * 0.1)
     assert terrain(0.97 * limit_m) == "plane"
@@ -27,7 +27,7 @@ def test_ground_is_flat_as_long_as_focus_bears_it():
     assert terrain(1.1 * limit_m, wobble_m=0.05) == "plane"
 
 
-def test_ground_is_flat_as_long_as_places_bear_it():
+def test_ground_is_taken_as_flat_as_long_as_positions_allow():
     """Half a pixel of 0.2 m at height 10 m over ground range 20 m: δh < 0.2 m."""
     assert terrain(0.15, wobble_m=0.0, spacing_m=0.2) == "plane"
     assert terrain(0.25, wobble_m=0.0, spacing_m=0.2) == "dem"
@@ -65,5 +65,5 @@ def test_flat_ground_and_rough_ground_are_taken_as_they_are():
         plan(overrides={"terrain": "dem"})
 
 
-def test_without_a_dem_the_plan_says_what_height_error_is_borne():
+def test_without_a_dem_the_plan_says_what_height_error_is_tolerated():
     assert "no DEM; height may be wrong by" in plan().reasons["terrain"]

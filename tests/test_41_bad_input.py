@@ -39,7 +39,7 @@ def test_a_missing_node_file_is_named(tiny):
     assert "node uav2" in message
 
 
-def test_truncated_samples_are_found_by_their_captures(tiny):
+def test_truncated_samples_are_noticed_by_their_captures(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))

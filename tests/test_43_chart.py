@@ -29,6 +29,7 @@ def charted(finished_tiny, tmp_path_factory):
 def test_the_front_holds_what_nothing_faster_beats(charted):
     rows = charted[1]
     seconds = [float(row["seconds"]) for row in rows]
+    assert {row["on_front"] for row in rows} == {"True", "False"}
     assert seconds == sorted(seconds)
     for number, row in enumerate(rows):
         beaten = any(float(faster["error_db"]) <= float(row["error_db"]) for faster in rows[:number])

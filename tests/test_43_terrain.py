@@ -76,9 +76,9 @@ def hillside(tmp_path_factory):
 
 
 def test_every_target_on_a_hillside_is_where_it_stands(hillside):
-    found = verify(hillside)
-    assert len(found) == 9
-    assert max(finding.error_m for finding in found) < 0.03
+    findings = verify(hillside)
+    assert len(findings) == 9
+    assert max(finding.error_m for finding in findings) < 0.03
 
 
 @pytest.mark.slow
@@ -86,8 +86,8 @@ def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
     root = copy_writable(hillside.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     edit_scene(root, dem=None, dem_datum=None)
-    found = verify(run_steps(root))
-    off = [finding.error_m for finding in found if finding.target and finding.image == "uav1-uav1"]
+    findings = verify(run_steps(root))
+    off = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
     assert min(off) > 0.1
 
 
@@ -152,7 +152,7 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
 
 
 @pytest.mark.parametrize("made", [True, False])
-def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
+def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
     """Samples and bytes of tables are those of its ground, whether stage `terrain` is made or only its DEM is there."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
     if not made:
@@ -206,7 +206,7 @@ def test_a_void_in_the_scene_is_counted_and_placed(tiny):
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
-    write_plane(tiny)  # mended: the work in progress of the old DEM is not taken up
+    write_plane(tiny)  # corrected: the work in progress of the old DEM is not taken up
     settle_ground(campaign)
     assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
 
@@ -243,7 +243,7 @@ def under(grid, seen):
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, "auto"])
-def test_plan_and_run_say_alike_which_half_of_the_scene_a_dem_misses(tiny, spacing_m):
+def test_plan_and_run_give_the_same_message_about_half_a_scene_without_dem(tiny, spacing_m):
     write_plane(tiny, keep=(slice(None), slice(20, None)))
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
