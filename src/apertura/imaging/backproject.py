@@ -105,10 +105,6 @@ def backproject(
     compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
     job = _job(compressed, history, grid, models, beams, tile_px)
     overrides = {**choices, "engine": engine, "terrain": terrain_model}
-        **{name: value for name, value in choices.items() if name != "terrain_model"},
-        "engine": engine,
-        "terrain": choices.get("terrain_model"),
-    }
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where="backproject")
     formation = Formation(history, compressed, grid, plan, tile_px, beams)
     attributes: dict[str, Any] = {

@@ -55,7 +55,8 @@ class OpenCampaign:
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":
         """Return a pair's focused image, (y, x) complex64, with its CRS in the coordinate spatial_ref."""
-        return self.stage("image", flight, pair).image
+        image: "xr.DataArray" = self.stage("image", flight, pair).image
+        return image
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
