@@ -8,17 +8,24 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config/README.md"])
+DOCUMENTS = sorted(
+    [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config/README.md"]
+)
 GUIDE = ROOT / "docs/finding_your_way.md"
-PLACES = (ROOT, ROOT / "src/apertura", ROOT / "docs")
+PLACES = (ROOT, ROOT / "src/apertura")
+SOURCES = ("src", "native", "tests", "workflow", "benchmarks")
 
 _FILE = re.compile(r"(?<![\w/<>.*-])((?:[\w.*-]+/)*[\w*-]+\.(?:py|hpp|cpp|smk|md|toml|yml|rst))\b(?![\w/])")
-_FOLDER = re.compile(r"(?<![\w/<>.-])((?:src|docs|tests|native|workflow|benchmarks|profiles|requirements)/[\w./-]*)")
+_FOLDER = re.compile(r"(?<![\w/<>.-])((?:src|docs|tests|native|workflow|benchmarks|profiles|requirements)/[\w./*-]*)")
 _LINK = re.compile(r"\]\(([^)#:]+)\)")
-_TEST = re.compile(r"\btest_\w+(?!\.py|\w)")
+_TEST = re.compile(r"\btest_\w+(?![\w*]|\.py)")
 _DOTTED = re.compile(r"`((?:apertura|ap)\.[\w.]+(?::\w+)?)(?:\([^`]*)?`")
 _COMMAND = re.compile(r"\bapertura (step |study )?([a-z]+(?:-[a-z]+)*)\b")
-_KEY = re.compile(r"`((?:waveform|nodes|scene|processing|calibration)\.[\w.<>]+)`")
+_KEY = re.compile(r"`((?:waveform|nodes|scene|processing|calibration)\.(?!py)[\w.<>]+)`")
+
+_CITED = re.compile(r"(docs/[\w/]+\.md)((?:[,;]? (?:and )?(?:eqs?\. [\w]+|\"[^\"]+\"))+)")
+
+_NAME_IN_FILE = re.compile(r"`(\w+)` (?:of `\w+` )?in `([\w/.]+\.(?:py|hpp|cpp|smk))`")
 
 ENTRY_POINTS = {"apertura.exports"}
 """Groups of entry points: names, but not of modules."""
@@ -31,7 +38,10 @@ def text_of(document):
 
 
 def is_there(name, document):
-    return any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent))
+    """A path counts from the root, src/apertura or the document; a name alone may stand anywhere in the code."""
+    if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
+        return True
+    return "/" not in name and any(any((ROOT / folder).rglob(name)) for folder in SOURCES)
 
 
 @parametrized
@@ -76,9 +86,35 @@ def test_every_key_of_the_config_that_a_document_names_exists(document):
     assert sorted(named - keys) == []
 
 
-def test_every_name_in_the_guide_stands_in_the_file_beside_it():
+@parametrized
+def test_a_name_that_a_document_puts_in_a_file_stands_there(document):
+    for name, file in _NAME_IN_FILE.findall(text_of(document)):
+        path = next(place / file for place in PLACES if (place / file).is_file())
+        assert re.search(rf"\b{name}\b", text_of(path)), f"{file} has no {name}"
+
+
+def test_the_first_name_of_every_answer_of_the_guide_stands_in_its_file():
     rows = re.findall(r"^\| (.+\?) \| `([^`]+)` \|(.*)\|$", text_of(GUIDE), re.M)
     assert len(rows) >= 20
-    for question, file, names in rows:
-        for name in re.findall(r"`([\w.]+)`", names):
-            assert re.search(rf"\b{re.escape(name)}\b", text_of(ROOT / file)), f"{question} {file} has no {name}"
+    for question, file, answer in rows:
+        names = re.match(r"(?: `\w+`,?)*", answer)[0]
+        for name in re.findall(r"\w+", names):
+            assert re.search(rf"\b{name}\b", text_of(ROOT / file)), f"{question} {file} has no {name}"
+
+
+def test_every_heading_that_the_code_cites_stands_in_its_document():
+    cited = 0
+    for source in [*ROOT.glob("src/**/*.py"), *ROOT.glob("native/*.?pp"), *ROOT.glob("tests/*.py")]:
+        for document, what in _CITED.findall(re.sub(r"\s+(?:// )?", " ", text_of(source))):
+            text = text_of(ROOT / document)
+            for heading in re.findall(r"\"([^\"]+)\"", what):
+                assert re.search(rf"^(#+ (\d\. )?|\*\*){re.escape(heading)}\b", text, re.M), (
+                    f"{source}: {document}, {heading}"
+                )
+                cited += 1
+            for number in re.findall(r"eqs?\. (\w+)", what):
+                assert re.search(rf"\({number}\)|eqs?\. {number}\b|to {number}\)", text), (
+                    f"{source}: {document}, eq. {number}"
+                )
+                cited += 1
+    assert cited > 50
