@@ -236,11 +236,10 @@ def test_bounds_that_are_no_multiple_of_the_spacing_propose_the_nearest(tiny):
 
 
 def test_a_value_of_no_alternative_is_named_by_its_key_alone(tiny):
-    edit_config(tiny, lambda document: document.setdefault("processing", {}).update(table_degree=5))
+    edit_config(tiny, lambda document: document.setdefault("processing", {}).update(presum=0))
     message = complaint(lambda: Campaign.load(tiny))
     assert (
-        "processing.table_degree: Input should be less than or equal to 2 (found 5) or Input should be 'auto'"
-        in message
+        "processing.presum: Input should be greater than or equal to 1 (found 0) or Input should be 'auto'" in message
     )
 
 

@@ -1,14 +1,19 @@
 """The speed-accuracy chart: what is on the front, what is marked, and that its page needs nothing from elsewhere."""
 
 import csv
+import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from conftest import copy_writable
 
 from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.focus.engines import ENGINES
+from apertura.steps import image
 from apertura.steps.plan import expected_plan
 from apertura.study.chart.pareto import Point, with_front, write_points
 from apertura.study.chart.speed_accuracy import speed_accuracy
@@ -64,3 +69,25 @@ def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
     assert [one.on_front for one in marked] == [True, False, True]
     write_points(marked, tmp_path / "points.csv")
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tiny, tmp_path, monkeypatch):
+    """One file and one row: the config knows its name and options, the plan its prediction, the product its report."""
+    monkeypatch.setitem(ENGINES, "toy", "toy_engine")
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    config = root / "config" / "config.yaml"
+    document = yaml.safe_load(config.read_text())
+    asked = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}, "accuracy_db": -20.0}
+    config.write_text(yaml.safe_dump(document | {"processing": asked}))
+    campaign = Campaign.load(root)
+    assert expected_plan(campaign, "f01", "uav1-uav2").setting.line == "toy refine=2"
+    image.image(campaign, "f01", "uav1-uav2")
+    report = json.loads((root / "results/f01/uav1-uav2/image.json").read_text())
+    assert report["engine"] == "toy"
+    assert report["numerical_error_db"] < -20
+    paths = speed_accuracy(campaign, "f01", "uav1-uav2", seconds=5.0)
+    assert {"toy refine=2"} <= {row["setting"] for row in csv.DictReader(paths[0].open(encoding="utf-8"))}
+    document["processing"] = {"engine_options": {"toy": {"refined": 2}}}
+    config.write_text(yaml.safe_dump(document))
+    with pytest.raises(CampaignError, match=r"engine_options\.toy\.refined: .*its options: refine"):
+        Campaign.load(root)

@@ -55,7 +55,7 @@ class OpenCampaign:
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":
         """Return a pair's focused image, (y, x) complex64, with its CRS in the coordinate spatial_ref."""
-        image: "xr.DataArray" = self.stage("image", flight, pair).image
+        image: xr.DataArray = self.stage("image", flight, pair).image
         return image
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from apertura.atomic import write_text
+from apertura.focus.engines import ENGINES
 
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>@TITLE@</title>
@@ -27,7 +28,8 @@ against the double sum. The line is the Pareto front, the star the planner's cho
 <p id="tip">Point at a mark to read it.</p><table id="rows"></table>
 <script>
 const points = @POINTS@, asked = @ASKED@;
-const colours = {native:"#0072b2",numba:"#e69f00",reference:"#000"}, shown = {};
+const palette = ["#0072b2","#e69f00","#000","#cc79a7","#56b4e9","#009e73"], shown = {};
+const colours = Object.fromEntries(@ENGINES@.map((name,i)=>[name,palette[i%palette.length]]));
 const box = {left:70,right:930,top:20,bottom:510}, svg = document.getElementById("chart");
 const lo = v => Math.floor(Math.log10(Math.min(...v))), hi = v => Math.ceil(Math.log10(Math.max(...v)));
 const x0 = lo(points.map(p=>p.seconds)), x1 = Math.max(x0+1,hi(points.map(p=>p.seconds)));
@@ -115,5 +117,5 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
         What the campaign asks for.
     """
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
-    page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}").replace("@POINTS@", data)
-    write_text(path, page)
+    page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}")
+    write_text(path, page.replace("@ENGINES@", json.dumps(list(ENGINES))).replace("@POINTS@", data))

@@ -3,19 +3,18 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from apertura.atomic import replacement
+from apertura.focus.engines import ENGINES
 from apertura.study.stability.charts import save
 
-LOOKS = {
-    "native": ("#0072b2", "o"),
-    "numba": ("#e69f00", "s"),
-    "reference": ("#000000", "D"),
-}
+_COLOURS = ("#0072b2", "#e69f00", "#000000", "#cc79a7", "#56b4e9", "#009e73")
+_MARKERS = "osD^vP"
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     """
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
-    for engine, (colour, marker) in LOOKS.items():
+    for engine, colour, marker in zip(ENGINES, cycle(_COLOURS), cycle(_MARKERS), strict=False):
         some = [point for point in points if point.engine == engine and not point.planned]
         axes.plot(
             [point.seconds for point in some],

@@ -1,0 +1,55 @@
+"""An engine from outside: one file and one row, and every room knows it. Nearest sample, no interpolation."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from apertura.focus.engines.engine import EngineOptions, Setting
+from apertura.focus.inputs import Profiles
+from apertura.focus.job import Job
+
+READS = "profiles"
+
+
+class Options(EngineOptions):
+    """What may be asked of it."""
+
+    refine: int | None = None
+
+
+def available() -> bool:
+    return True
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+    """Yield a setting per refinement: so cheap that the planner takes it wherever -20 dB are enough."""
+    for refine in (asked.get("refine"),) if asked.get("refine") else (1, 4):
+        yield Setting(
+            "toy",
+            {"refine": refine},
+            {},
+            -26.0 - 6.0 * np.log2(refine),
+            1e-15 * job.pixels * pulses,
+            reasons={"refine": "nearest sample of a refined profile"},
+        )
+
+
+def prepare(profiles: Profiles, *, refine: int) -> tuple[Profiles, int]:
+    return profiles, refine
+
+
+def form(prepared: tuple[Profiles, int], pixels: np.ndarray, *, beams: Any = None) -> np.ndarray:
+    """Return the sum over the pulses of the nearest of refined samples, the carrier turned back."""
+    profiles, refine = prepared
+    length = profiles.samples.shape[1]
+    spectrum = np.fft.fft(profiles.samples, axis=1)
+    middle = np.zeros((len(profiles), refine * length), complex)
+    half = length // 2
+    middle[:, :half], middle[:, -(length - half) :] = spectrum[:, :half], spectrum[:, half:]
+    fine = refine * np.fft.ifft(middle, axis=1)
+    flat, k = pixels.reshape(-1, 3), 2 * np.pi * profiles.centre_frequency_hz / 299792458.0
+    path = profiles.aperture.path(flat)
+    place = np.rint((path - profiles.start_m[:, None]) / (profiles.step_m / refine)).astype(int)
+    values = np.take_along_axis(fine, np.clip(place, 0, fine.shape[1] - 1), axis=1) * np.exp(1j * k * path)
+    return values.sum(axis=0).reshape(pixels.shape[:-1])
