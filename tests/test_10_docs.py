@@ -3,6 +3,7 @@
 import json
 import pkgutil
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -118,3 +119,10 @@ def test_every_heading_that_the_code_cites_stands_in_its_document():
                 )
                 cited += 1
     assert cited > 50
+
+
+def test_the_floors_told_to_contributors_are_those_that_imports_are_checked_against():
+    contract = tomllib.loads(text_of(ROOT / "pyproject.toml"))["tool"]["importlinter"]["contracts"][0]
+    checked = [set(re.findall(r"apertura\.(\w+)", floor)) for floor in contract["layers"]]
+    told = re.findall(r"^\| \d+ \| ([^|]+) \|", text_of(ROOT / "CONTRIBUTING.md"), re.M)
+    assert [set(re.findall(r"`(\w+)(?:/|\.py)`", floor)) for floor in told] == checked
