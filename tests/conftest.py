@@ -52,8 +52,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     for flight in campaign.image_flights:
         if campaign.settings.waveform.kind == "ofdm":
             for node in flight.nodes:
-                ingest.raw(campaign, flight.name, node)
-                ingest.track(campaign, flight.name, node)
+                ingest.ingest(campaign, flight.name, node)
         for pair in flight.pairs:
             echo.echo(campaign, flight.name, pair)
     ground(campaign)

@@ -5,12 +5,25 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.contracts import check
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import PHASE_HISTORIES, TRACKS, read_sigmf
+from apertura.ingest import TRACKS, open_recording, read_phase_history, read_track
+from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.track import make_track
+
+QUICK = settings(max_examples=30, deadline=None, derandomize=True)
+EPOCHS = st.lists(
+    st.tuples(st.floats(-89.9, 89.9), st.floats(-179.9, 179.9), st.floats(-400, 9000), st.integers(1, 10**9)),
+    min_size=2,
+    max_size=12,
+)
+"""Latitude, longitude (deg), height (m), nanoseconds since the epoch before."""
 
 HEADER = (
     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  {}                  latitude(deg) longitude(deg)  height(m)   Q\n"
@@ -19,7 +32,7 @@ HEADER = (
 
 def pos(path, system, *lines):
     path.write_text(HEADER.format(system) + "\n".join(lines) + "\n")
-    return TRACKS[".pos"](path, node="a")
+    return read_track(path, node="a")
 
 
 def test_gpst_is_eighteen_seconds_ahead_of_utc(tmp_path):
@@ -48,7 +61,7 @@ def test_gps_weeks_and_calendar_dates_are_the_same_times(tmp_path):
 def test_a_solution_that_does_not_say_what_it_holds_is_refused(tmp_path, text, expected):
     (tmp_path / "a.pos").write_text(text)
     with pytest.raises(CampaignError, match=expected):
-        TRACKS[".pos"](tmp_path / "a.pos", node="a")
+        read_track(tmp_path / "a.pos", node="a")
 
 
 def test_a_csv_log_keeps_position_and_attitude(tmp_path):
@@ -57,7 +70,7 @@ def test_a_csv_log_keeps_position_and_attitude(tmp_path):
         "time_utc,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,yaw_deg\n"
         "2025-05-14T09:30:00Z,48.0,9.0,600.0,1,2,359\n2025-05-14T09:30:01.5Z,48.0,9.0,601.0,1,2,1\n"
     )
-    track = check(TRACKS[".csv"](path, node="a"), "track")
+    track = check(read_track(path, node="a"), "track")
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values[1]), [48.0, 9.0, 601.0], atol=1e-9)
     np.testing.assert_allclose(np.degrees(track.attitude.values[0]), [1, 2, 359])
     assert track.time.values[1] - track.time.values[0] == np.timedelta64(1500, "ms")
@@ -66,7 +79,13 @@ def test_a_csv_log_keeps_position_and_attitude(tmp_path):
 def test_a_csv_log_without_a_column_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("time_utc,latitude_deg,longitude_deg\n2025-05-14T09:30:00Z,48,9\n")
     with pytest.raises(CampaignError, match="no column height_m"):
-        TRACKS[".csv"](tmp_path / "a.csv", node="a")
+        read_track(tmp_path / "a.csv", node="a")
+
+
+def raw_of(*files):
+    opened = open_recording(files)
+    opened.check_hash()
+    return opened.cut(opened.captures, node="a")
 
 
 def recording(folder, samples, captures, **header):
@@ -86,7 +105,7 @@ def recording(folder, samples, captures, **header):
         "annotations": [],
     }
     (folder / "a.sigmf-meta").write_text(json.dumps(meta))
-    return read_sigmf(folder / "a.sigmf-meta", data, node="a")
+    return raw_of(folder / "a.sigmf-meta", data)
 
 
 def capture(start, second, **more):
@@ -121,7 +140,7 @@ def test_another_datatype_is_refused(shared, tmp_path):
 def test_a_real_recording_of_another_maker_is_read(shared):
     folder = shared / "sigmf_nbiot"
     names = [folder / f"V16-beacon-NB-IoT-uplink.sigmf-{kind}" for kind in ("meta", "data")]
-    raw = check(read_sigmf(*names, node="beacon"), "raw")
+    raw = check(raw_of(*names), "raw")
     assert raw.iq.shape == (1, 1, 512000, 2)
     assert raw.attrs["sample_rate_hz"] == 640000
 
@@ -129,8 +148,125 @@ def test_a_real_recording_of_another_maker_is_read(shared):
 def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
     """The antenna's distance to the scene centre is r0, so an echo from there has no phase left."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))
-    echo = check(PHASE_HISTORIES["afrl_mat"](files, pair="a-a"), "echo")
+    echo = check(read_phase_history("afrl_mat", files, pair="a-a"), "echo")
     assert echo.transfer.shape == (234, 424)
     distance = np.linalg.norm(echo.tx_position.values, axis=1)
     np.testing.assert_allclose(echo.reference_delay.values * SPEED_OF_LIGHT_M_S / 2, distance, atol=2e-3)
     assert echo.attrs["frame"] == "local"
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ("cut,angle_deg\nazimuth,0\n", "no column gain_db"),
+        ("cut,angle_deg,gain_db\nazimut,0,0\n", "a cut called 'azimut'"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,0\nazimuth,9,-9\n", "0 samples of the elevation cut"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,x\nazimuth,9,-9\n", "could not convert string"),
+        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,nan\nazimuth,9,-9\n", "azimuth cut holds a cell that is no"),
+        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,0,0\nazimuth,9,-9\n", "angles of the azimuth cut do not grow"),
+        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,90,0\nazimuth,270,-9\n", "0° to 270°, beyond ±180°"),
+    ],
+)
+def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):
+    path = tmp_path / "horn.csv"
+    path.write_text(rows)
+    with pytest.raises(CampaignError, match=rf"horn.csv: .*{expected}.*expected columns cut"):
+        read_beam_pattern(path)
+
+
+def epochs_of(logged, start="2025-05-14T09:30:00", grain_ns=1):
+    """Return geodetic positions as written with nine decimals, and times."""
+    values = np.array([epoch[:3] for epoch in logged]).round(9)
+    elapsed = np.cumsum([epoch[3] for epoch in logged]) * grain_ns
+    return values, np.datetime64(start, "ns") + elapsed.astype("timedelta64[ns]")
+
+
+@QUICK
+@given(logged=EPOCHS)
+def test_any_csv_log_comes_back_as_it_was_written(tmp_path_factory, logged):
+    geodetic, time = epochs_of(logged)
+    path = tmp_path_factory.mktemp("log") / "a.track.csv"
+    rows = (f"{t}Z,{lat:.9f},{lon:.9f},{h:.9f}" for t, (lat, lon, h) in zip(time, geodetic, strict=True))
+    path.write_text("\n".join(["time_utc,latitude_deg,longitude_deg,height_m", *rows]) + "\n")
+    track = check(read_track(path, node="a"), "track")
+    np.testing.assert_array_equal(track.time.values, time)
+    expected = make_track(time, geodetic, node="a", where=path)
+    np.testing.assert_allclose(track.position.values, expected.position.values, atol=1e-6)
+
+
+@QUICK
+@given(logged=EPOCHS, weeks=st.booleans())
+def test_any_rtklib_log_comes_back_as_it_was_written(tmp_path_factory, logged, weeks):
+    geodetic, time = epochs_of(logged, grain_ns=10**6)
+    path = tmp_path_factory.mktemp("log") / "a.track.pos"
+
+    def stamp(gpst):
+        if not weeks:
+            return str(gpst).replace("-", "/").replace("T", " ")
+        week, rest = divmod((gpst - np.datetime64("1980-01-06", "ns")).astype(int), 7 * 86_400 * 10**9)
+        return f"{week} {rest / 1e9:.3f}"
+
+    gpst = time + np.timedelta64(18, "s")
+    lines = [f"{stamp(t)} {lat:.9f} {lon:.9f} {h:.9f} 1" for t, (lat, lon, h) in zip(gpst, geodetic, strict=True)]
+    track = pos(path, "GPST", *lines)
+    np.testing.assert_array_equal(track.time.values, time)
+    expected = make_track(time, geodetic, node="a", where=path)
+    np.testing.assert_allclose(track.position.values, expected.position.values, atol=1e-6)
+
+
+@QUICK
+@given(gaps=st.lists(st.integers(0, 3), min_size=1, max_size=9), channels=st.integers(1, 3), data=st.data())
+def test_captures_hold_their_own_samples_whatever_lies_between_them(tmp_path_factory, gaps, channels, data):
+    """Every capture is as long as the median one; samples that a recorder kept beyond it belong to none."""
+    length = 6
+    gaps = sorted(gaps)[: (len(gaps) + 1) // 2] if np.median(gaps) else gaps
+    gaps = [0] * (len(gaps) + 1) + gaps  # most captures follow each other
+    order = data.draw(st.permutations(gaps))
+    starts = np.cumsum([0, *(length + gap for gap in order)])
+    samples = np.arange(1, starts[-1] * channels * 2 + 1).reshape(starts[-1], channels, 2) % 30_000 + 1
+    names = ["radar", "sidelink", "spare"][:channels]
+    captures = [
+        {"core:sample_start": int(start), "core:datetime": f"2025-01-01T00:00:{index:02d}Z"}
+        for index, start in enumerate(starts[:-1])
+    ]
+    raw = recording(tmp_path_factory.mktemp("sigmf"), samples, captures, **{"apertura:channels": names})
+    assert raw.sizes["sample"] == length
+    for pulse, start in enumerate(starts[:-1]):
+        for channel in range(channels):
+            np.testing.assert_array_equal(raw.iq.values[channel, pulse], samples[start : start + length, channel])
+
+
+def test_a_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
+    """Read through the table, and named in the message about a node without a log."""
+    monkeypatch.setitem(TRACKS, ".toy", f"{__name__}:read_toy_track")
+    (tmp_path / "a.track.toy").write_text("48 9 600\n48 9 601\n")
+    track = read_track(tmp_path / "a.track.toy", node="a")
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values[1]), [48, 9, 601], atol=1e-8)
+    with pytest.raises(CampaignError, match=r"<node>\.track\.<csv\|pos\|toy>"):
+        Campaign(tmp_path, None, ()).track_file("f01", "b")
+
+
+def read_toy_track(path, *, node):
+    geodetic = np.loadtxt(path)
+    time = np.datetime64("2025-05-14T09:30", "ns") + np.arange(len(geodetic)) * np.timedelta64(1, "s")
+    return make_track(time, geodetic, node=node, where=path)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"core:datetime": "2025-01-01T00:00:00"}, "captures.0.core:datetime"),
+        ({"core:datetime": "yesterdayZ"}, "core:datetime: "),
+        ({"core:sample_start": -1}, "captures.0.core:sample_start: .*not -1"),
+    ],
+)
+def test_metadata_that_are_not_sigmf_are_refused_by_key(tmp_path, change, expected):
+    with pytest.raises(CampaignError, match=rf"a\.sigmf-meta: .*{expected}"):
+        recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 0) | change], **{"apertura:channels": ["radar"]})
+
+
+def test_metadata_that_are_not_json_are_refused(tmp_path):
+    (tmp_path / "a.sigmf-meta").write_text('{"global": ')
+    (tmp_path / "a.sigmf-data").write_bytes(b"1234")
+    with pytest.raises(CampaignError, match="not valid SigMF: Invalid JSON"):
+        open_recording((tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"))

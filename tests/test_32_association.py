@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from apertura.echo.association import associate, detect_wrong_association
 from apertura.errors import CampaignError
@@ -175,3 +177,22 @@ def test_one_wild_sidelink_measurement_is_no_wrong_association():
     measured[[77, 200]] += 9.0
     measured[300:320] = np.nan
     assert detect_wrong_association(measured, predicted) is None
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    offset=st.floats(-0.4, 0.4),
+    reach=st.floats(0, 0.2),
+    lost=st.tuples(st.floats(0, 0.4), st.floats(0, 0.4)),
+    drift_ppm=st.floats(-100, 100),
+)
+def test_no_jitter_that_leaves_tags_nearest_their_own_pulse_confuses_the_pairs(seed, offset, reach, lost, drift_ppm):
+    """Two nodes' tags scatter by up to 0.4 of an interval against each other, about an offset of up to 0.4."""
+    rng, interval_ns = np.random.default_rng(seed), 50_000_000
+    numbers = [np.flatnonzero(rng.random(150) >= share) for share in lost]
+    tags = [n * interval_ns + (rng.uniform(-reach, reach, n.size) * interval_ns).astype(np.int64) for n in numbers]
+    tags[1] = tags[1] + (offset * interval_ns + tags[1] * drift_ppm * 1e-6).astype(np.int64)
+    pairs = associate(*tags, repetition_interval_s=0.05)
+    assert share_right(pairs, numbers) == 1.0
+    assert pairs.tx_index.size == np.intersect1d(*numbers).size

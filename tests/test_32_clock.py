@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 
 from apertura.echo.clock import AMBIGUOUS_SHARE, ClockOffset, decide_clock, estimate_clock, interference_floor_db
-from apertura.echo.resampling import Waveform, correct_clock
+from apertura.echo.demodulate import Numerology
+from apertura.echo.resampling import correct_clock
 
 NUMBERS = np.arange(512)
-WAVEFORM = Waveform(1.2e9, 102.4e6, NUMBERS, prefix_samples=320, dft_samples=1024)  # Δf = 100 kHz, B = 51.2 MHz
+NUMEROLOGY = Numerology(1.2e9, 102.4e6, NUMBERS, prefix_samples=320, dft_samples=1024)  # Δf = 100 kHz, B = 51.2 MHz
 SYMBOL = 1600  # T = 1.25/Δf, with the prefix before it
 CODES = np.exp(2j * np.pi * np.random.default_rng(0).random(512))
 ECHOES_S = np.array([0.2e-6, 0.53e-6, 1.4e-6])
 
 
-def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None, waveform=WAVEFORM):
+def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None, waveform=NUMEROLOGY):
     """Return (pulse, sample) what a receiver digitises whose oscillator and sampling run fast by so much."""
     t = np.arange(SYMBOL) / (waveform.sample_rate_hz + sfo_hz) - waveform.prefix_samples / waveform.sample_rate_hz
     tones = np.exp(2j * np.pi * np.outer(t, waveform.numbers * waveform.spacing_hz))
@@ -28,7 +29,7 @@ def record(delays_s, *, cfo_hz=0.0, sfo_hz=0.0, pulses=1, snr_db=None, rng=None,
     return captures.astype(np.complex64)
 
 
-def transfer(samples, waveform=WAVEFORM):
+def transfer(samples, waveform=NUMEROLOGY):
     """Return R/S-ready symbols: DFT after the prefix, code removed."""
     window = samples[:, waveform.prefix_samples : waveform.prefix_samples + waveform.dft_samples]
     return (np.fft.fft(window, axis=1) / waveform.dft_samples)[:, waveform.numbers] / CODES
@@ -37,7 +38,7 @@ def transfer(samples, waveform=WAVEFORM):
 def floor_db(radar, sidelink):
     """Return the RMS error of the divided range profile beside what it should be, relative to its peak."""
     ratio = (transfer(radar) / transfer(sidelink))[0]
-    frequency = WAVEFORM.carrier_hz + NUMBERS * WAVEFORM.spacing_hz
+    frequency = NUMEROLOGY.carrier_hz + NUMBERS * NUMEROLOGY.spacing_hz
     ideal = np.exp(-2j * np.pi * np.outer(ECHOES_S - 0.1e-6, frequency)).sum(0)
     gain = np.vdot(ideal, ratio) / np.vdot(ideal, ideal)
     profile, error = np.fft.ifft(ideal), np.fft.ifft(ratio / gain - ideal)
@@ -50,12 +51,12 @@ def both(**clock):
 
 def corrected(offset, *captures):
     cfo_hz = offset.cfo_of_pulses_hz(1)
-    return [correct_clock(samples, WAVEFORM, cfo_hz=cfo_hz, sfo_ppm=offset.sfo_ppm) for samples in captures]
+    return [correct_clock(samples, NUMEROLOGY, cfo_hz=cfo_hz, sfo_ppm=offset.sfo_ppm) for samples in captures]
 
 
 def test_correction_lowers_the_floor_of_an_8_ppm_clock_by_20_db_and_more():
     radar, sidelink = both(cfo_hz=9600.0, sfo_hz=819.2)
-    offset = estimate_clock(sidelink, WAVEFORM)
+    offset = estimate_clock(sidelink, NUMEROLOGY)
     before, after = floor_db(radar, sidelink), floor_db(*corrected(offset, radar, sidelink))
     assert before > -45
     assert after < before - 40
@@ -63,7 +64,7 @@ def test_correction_lowers_the_floor_of_an_8_ppm_clock_by_20_db_and_more():
 
 def test_one_correction_serves_a_sampling_clock_far_from_the_carriers():
     radar, sidelink = both(cfo_hz=-3000.0, sfo_hz=200 * 102.4)
-    offset = estimate_clock(np.repeat(sidelink, 4, 0), WAVEFORM)
+    offset = estimate_clock(np.repeat(sidelink, 4, 0), NUMEROLOGY)
     assert not offset.one_clock
     assert offset.sfo_ppm == pytest.approx(200, abs=0.5)
     assert offset.cfo_hz == pytest.approx(-3000, abs=20)
@@ -74,7 +75,7 @@ def test_one_correction_serves_a_sampling_clock_far_from_the_carriers():
 def test_a_clock_is_measured_in_noise_as_well_as_theory_allows(ppm):
     rng = np.random.default_rng(1)
     captures = record(0.7e-6, cfo_hz=1200 * ppm, sfo_hz=102.4 * ppm, pulses=64, snr_db=0, rng=rng)
-    offset = estimate_clock(captures, WAVEFORM)
+    offset = estimate_clock(captures, NUMEROLOGY)
     # 64 pulses, two copies 10 µs apart of 128 in-band samples at 3 dB: variance of the phase 1/SNR + 1/(2·SNR²)
     theory_hz = np.sqrt((1 / 2 + 1 / 8) / (64 * 128)) / (2 * np.pi * 10e-6)
     assert offset.one_clock
@@ -88,9 +89,9 @@ def test_a_clock_that_drifts_over_the_flight_is_followed():
     drift_hz = np.linspace(-600, 600, 128)
     captures = record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng)
     captures = captures * np.exp(-2j * np.pi * np.outer(drift_hz, np.arange(SYMBOL) / 102.4e6)).astype(np.complex64)
-    offset = estimate_clock(captures, WAVEFORM)
+    offset = estimate_clock(captures, NUMEROLOGY)
     assert offset.cfo_of_pulses_hz(128) == pytest.approx(5000 + drift_hz, abs=40)
-    still = estimate_clock(record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng), WAVEFORM)
+    still = estimate_clock(record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng), NUMEROLOGY)
     assert still.cfo_slope_hz == 0
 
 
@@ -98,12 +99,12 @@ def test_blocked_pulses_do_no_harm():
     rng = np.random.default_rng(3)
     captures = record(0.7e-6, cfo_hz=5000, pulses=128, snr_db=20, rng=rng)
     captures[40:64] = record(0.7e-6, pulses=24, snr_db=20, rng=rng) * 1e-3
-    assert estimate_clock(captures, WAVEFORM).cfo_hz == pytest.approx(5000, abs=40)
+    assert estimate_clock(captures, NUMEROLOGY).cfo_hz == pytest.approx(5000, abs=40)
 
 
 @pytest.mark.parametrize(("cfo_hz", "sfo_hz"), [(10e3, 0.0), (2e3, 0.0), (0.0, 200 * 102.4), (9600.0, 819.2)])
 def test_the_predicted_floor_is_the_one_that_is_found(cfo_hz, sfo_hz):
-    predicted = interference_floor_db(cfo_hz, sfo_hz / 102.4, WAVEFORM)
+    predicted = interference_floor_db(cfo_hz, sfo_hz / 102.4, NUMEROLOGY)
     # what an echo shares with the sidelink divides out; the rest grows with the delay between them
     turn = 2 * np.pi * 100e3 * (ECHOES_S - 0.1e-6)
     apart = ((np.pi * turn / 2 - turn**2 / 4) / (np.pi**2 / 6)).sum()
@@ -112,7 +113,7 @@ def test_the_predicted_floor_is_the_one_that_is_found(cfo_hz, sfo_hz):
 
 def decision(ppm, *, std_hz=1.0, accuracy_db=-60.0, cfo_hz=None):
     offset = ClockOffset(1200 * ppm if cfo_hz is None else cfo_hz, 0.0, ppm, std_hz, 0.1, one_clock=True)
-    return decide_clock(offset, WAVEFORM, accuracy_db=accuracy_db)
+    return decide_clock(offset, NUMEROLOGY, accuracy_db=accuracy_db)
 
 
 @pytest.mark.parametrize(
@@ -143,14 +144,14 @@ def test_an_offset_close_to_where_it_wraps_is_flagged(share, flagged, sign):
 
 def test_a_true_clock_passes_the_correction_unchanged():
     radar, sidelink = both()
-    offset = estimate_clock(sidelink, WAVEFORM)
+    offset = estimate_clock(sidelink, NUMEROLOGY)
     assert abs(offset.cfo_hz) < 1
-    again = correct_clock(radar, WAVEFORM, cfo_hz=np.zeros(1), sfo_ppm=0.0)
+    again = correct_clock(radar, NUMEROLOGY, cfo_hz=np.zeros(1), sfo_ppm=0.0)
     assert np.abs(again - radar[:, :1344]).max() < 1e-5 * np.abs(radar).max()
 
 
 def test_a_band_around_the_carrier_is_measured_and_corrected_alike():
-    centred = Waveform(1.2e9, 102.4e6, NUMBERS - 256, prefix_samples=320, dft_samples=1024)
+    centred = Numerology(1.2e9, 102.4e6, NUMBERS - 256, prefix_samples=320, dft_samples=1024)
     capture = record(0.1e-6, cfo_hz=9600.0, sfo_hz=819.2, waveform=centred)
     offset = estimate_clock(capture, centred)
     assert offset.cfo_hz == pytest.approx(9600, abs=5)
@@ -161,11 +162,11 @@ def test_a_band_around_the_carrier_is_measured_and_corrected_alike():
 
 def test_a_clock_whose_scatter_is_unknown_is_not_trusted():
     _, sidelink = both(cfo_hz=9600.0, sfo_hz=819.2)
-    decided = decide_clock(estimate_clock(sidelink, WAVEFORM), WAVEFORM, accuracy_db=-60)
+    decided = decide_clock(estimate_clock(sidelink, NUMEROLOGY), NUMEROLOGY, accuracy_db=-60)
     assert not decided.correct
     assert "clock_uncertain" in decided.flags
 
 
 def test_captures_without_a_repetition_are_refused():
     with pytest.raises(ValueError, match="repeat only 20"):
-        estimate_clock(np.ones((3, 1024 + 160 + 20), np.complex64), WAVEFORM)
+        estimate_clock(np.ones((3, 1024 + 160 + 20), np.complex64), NUMEROLOGY)

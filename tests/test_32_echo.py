@@ -2,12 +2,20 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.echo.demodulate import demodulate, remove_path, subcarrier_numbers
+from apertura.echo.demodulate import Numerology, demodulate, remove_path, subcarrier_numbers
 from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.geometry.geodesy import (
+    ecef_from_geodetic,
+    ecef_from_projected,
+    geodetic_from_ecef,
+    ned_axes,
+    projected_from_ecef,
+)
 from apertura.geometry.phase_centres import phase_centres
 
 RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
@@ -29,7 +37,7 @@ def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
     codes = np.exp(2j * np.pi * np.random.default_rng(1).random(COUNT))
     delay = delay_samples / RATE
     captured = np.round(symbol(delay, codes, numbers) * 3).astype(np.complex64)
-    transfer = demodulate(captured, numbers=numbers, prefix_samples=PREFIX, dft_samples=64)[0] / codes / 600
+    transfer = demodulate(captured, Numerology(1e9, RATE, numbers, PREFIX, 64))[0] / codes / 600
     expected = np.exp(-2j * np.pi * (1e9 + numbers * SPACING) * delay)
     np.testing.assert_allclose(transfer, expected, atol=2e-3)
 
@@ -37,13 +45,13 @@ def test_an_echo_turns_every_subcarrier_by_its_delay(carrier_is, delay_samples):
 def test_an_echo_beyond_the_prefix_is_no_longer_a_pure_delay():
     numbers, codes = subcarrier_numbers(COUNT, carrier_is="band_start"), np.ones(COUNT, complex)
     late = symbol(30 / RATE, codes, numbers).astype(np.complex64)
-    transfer = demodulate(late, numbers=numbers, prefix_samples=PREFIX, dft_samples=64)[0] / 200
+    transfer = demodulate(late, Numerology(1e9, RATE, numbers, PREFIX, 64))[0] / 200
     assert np.abs(np.abs(transfer) - 1).max() > 0.1
 
 
 def test_the_dft_needs_prefix_and_one_period():
     with pytest.raises(ValueError, match="needs 80"):
-        demodulate(np.ones((1, 79), np.complex64), numbers=np.arange(4), prefix_samples=16, dft_samples=64)
+        demodulate(np.ones((1, 79), np.complex64), Numerology(1e9, RATE, np.arange(4), 16, 64))
 
 
 def band():
@@ -200,3 +208,17 @@ def test_a_track_must_cover_the_pulses():
             attitude_from="log",
             where="log",
         )
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(latitude=st.floats(-80, 80), longitude=st.floats(6, 12), height_m=st.floats(-400, 9000))
+def test_every_place_comes_back_from_ecef_to_a_micrometre(latitude, longitude, height_m):
+    """Geodetic and UTM zone 32 both ways; up is where the height grows."""
+    place = np.array([latitude, longitude, height_m])
+    position = ecef_from_geodetic(*place)
+    returned = geodetic_from_ecef(position)
+    np.testing.assert_allclose(returned * [111_200, 111_200, 1], place * [111_200, 111_200, 1], atol=1e-6)
+    projected = projected_from_ecef("EPSG:32632", position)
+    np.testing.assert_allclose(ecef_from_projected("EPSG:32632", *projected), position, atol=1e-6)
+    higher = ecef_from_geodetic(latitude, longitude, height_m + 1)
+    np.testing.assert_allclose(ned_axes(position) @ [0, 0, -1], higher - position, atol=1e-6)

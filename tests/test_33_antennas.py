@@ -9,8 +9,7 @@ from test_33_planner import compiled, mono, net, plan, track
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.antenna.illumination import illuminate
-from apertura.antenna.pattern import antenna_axes, gaussian_cut, read_pattern, sampled_cut
-from apertura.errors import CampaignError
+from apertura.antenna.pattern import antenna_axes, gaussian_cut, sampled_cut
 from apertura.focus.engines import load_engine, native, reference
 from apertura.focus.engines.native_prediction import pixel_seconds
 from apertura.focus.engines.native_weights import NO_BEAMS, PatchWeights, patch_weights
@@ -57,25 +56,6 @@ def test_a_sampled_cut_keeps_its_main_lobe_alone():
     found, gain = sampled_cut(angle, np.array([-5.0, -13, -60, 0, -60, -13, -5]), cutoff_db=-20)
     assert np.degrees(found[-1]) == pytest.approx(20 / 3, abs=0.05)
     assert gain.min() >= 0.1
-
-
-@pytest.mark.parametrize(
-    ("rows", "expected"),
-    [
-        ("cut,angle_deg\nazimuth,0\n", "no column gain_db"),
-        ("cut,angle_deg,gain_db\nazimut,0,0\n", "a cut called 'azimut'"),
-        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,0\nazimuth,9,-9\n", "0 samples of the elevation cut"),
-        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,x\nazimuth,9,-9\n", "could not convert string"),
-        ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,nan\nazimuth,9,-9\n", "azimuth cut holds a cell that is no"),
-        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,0,0\nazimuth,9,-9\n", "angles of the azimuth cut do not grow"),
-        ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,90,0\nazimuth,270,-9\n", "0° to 270°, beyond ±180°"),
-    ],
-)
-def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):
-    path = tmp_path / "horn.csv"
-    path.write_text(rows)
-    with pytest.raises(CampaignError, match=rf"horn.csv: .*{expected}.*expected columns cut"):
-        read_pattern(path, cutoff_db=-20.0)
 
 
 def test_pulses_that_see_a_place_are_counted():

@@ -56,8 +56,7 @@ def nothing_half_written(root):
 
 def ingest_all(campaign):
     for node in ("uav1", "uav2"):
-        ingest.raw(campaign, "f01", node)
-        ingest.track(campaign, "f01", node)
+        ingest.ingest(campaign, "f01", node)
 
 
 def test_a_misspelt_key_is_named_with_the_nearest_valid_one(tiny):
@@ -84,7 +83,7 @@ def test_a_missing_node_file_is_named(tiny):
 def test_truncated_samples_are_found_by_their_captures(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
-    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "holds 3000 samples" in message
     assert "expected 4000" in message
     assert nothing_half_written(tiny)
@@ -93,7 +92,7 @@ def test_truncated_samples_are_found_by_their_captures(tiny):
 def test_a_file_cut_inside_a_sample_is_truncated(tiny):
     path = tiny / "raw" / "f01" / "uav2.sigmf-data"
     path.write_bytes(path.read_bytes()[:-3])
-    assert "truncated" in complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav2"))
+    assert "truncated" in complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav2"))
 
 
 def test_a_wrong_hash_is_shown_beside_the_promised_one(tiny):
@@ -101,14 +100,14 @@ def test_a_wrong_hash_is_shown_beside_the_promised_one(tiny):
     samples = bytearray(path.read_bytes())
     samples[1000] ^= 1
     path.write_bytes(samples)
-    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "uav1.sigmf-data" in message
     assert hashlib.sha512(samples).hexdigest()[:12] in message
 
 
 def test_a_capture_past_the_end_is_named(tiny):
     edit_meta(tiny, "uav1", lambda meta: meta["captures"][-1].update({"core:sample_start": 10**9}))
-    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "starts at sample 1000000000" in message
     assert "uav1.sigmf-meta" in message
 
@@ -136,14 +135,14 @@ def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
 
 def test_a_doubled_epoch_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
-    message = complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "epoch 9" in message
     assert "the same time" in message
 
 
 def test_an_unsorted_log_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], *lines[12:14], *lines[10:12]])
-    assert "an earlier time" in complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+    assert "an earlier time" in complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
 
 
 def test_a_lever_arm_without_attitude_is_refused(tiny):
@@ -250,7 +249,7 @@ def test_swapped_bounds_are_refused_and_put_in_order(tiny):
 
 def test_a_silent_capture_is_named(tiny):
     edit_data(tiny, "uav1", lambda samples: samples.reshape(-1, 8000)[5].fill(0))
-    message = complaint(lambda: ingest.raw(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "first capture 5" in message
     assert "only zeros" in message
 
@@ -258,19 +257,19 @@ def test_a_silent_capture_is_named(tiny):
 def test_nan_in_phase_history_is_named(shared, tmp_path):
     from scipy.io import loadmat, savemat
 
-    from apertura.ingest import PHASE_HISTORIES
+    from apertura.ingest import read_phase_history
 
     source = loadmat(shared / "gotcha_afrl" / "data_3dsar_pass1_az001_HH.mat")
     source["data"]["fp"][0, 0][3, 7] = np.nan
     savemat(tmp_path / "a.mat", {"data": source["data"]})
-    message = complaint(lambda: PHASE_HISTORIES["afrl_mat"]([tmp_path / "a.mat"], pair="a-a"))
+    message = complaint(lambda: read_phase_history("afrl_mat", [tmp_path / "a.mat"], pair="a-a"))
     assert "fp is not a number at index [3, 7]" in message
     assert "a.mat" in message
 
 
 def test_a_position_that_is_not_a_number_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:6], lines[6].replace("48.4", "nan", 1), *lines[7:]])
-    message = complaint(lambda: ingest.track(Campaign.load(tiny), "f01", "uav1"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "uav1.track.csv" in message
 
 

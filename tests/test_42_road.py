@@ -65,7 +65,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
     grid, ground = scene.grid, scene.terrain
     with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
     uncorrected: list[xr.Dataset] = []
-    monkeypatch.setitem(METHODS, "divide", lambda radar, _: radar)
+    monkeypatch.setitem(METHODS, "divide", lambda radar, *_: radar)
     monkeypatch.setattr(echo, "save_stage", lambda dataset, _: uncorrected.append(dataset))
     echo.echo(finished_sample, *pair)
     peaks = []

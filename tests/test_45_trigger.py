@@ -28,7 +28,7 @@ def flown(tmp_path_factory):
         )
         root = tmp_path_factory.mktemp("trigger") / str(continuous)
         roots[continuous] = Campaign.load(simulate(root, plan, seed=4))
-        ingest.raw(roots[continuous], "f01", "b")
+        ingest.ingest(roots[continuous], "f01", "b")
     return roots
 
 
@@ -62,7 +62,7 @@ def test_a_recording_of_noise_alone_says_so(flown, tmp_path):
     root = copy_writable(flown[True].root, tmp_path / "noise")
     noise = np.random.default_rng(9)
     edit_data(root, "b", lambda samples: samples.__setitem__(slice(None), noise.normal(0, 300, samples.size)))
-    message = complaint(lambda: ingest.raw(Campaign.load(root), "f01", "b"))
+    message = complaint(lambda: ingest.ingest(Campaign.load(root), "f01", "b"))
     assert "no preamble in" in message
     assert "b.sigmf-data" in message
 
@@ -71,7 +71,7 @@ def test_a_lost_preamble_file_is_named(flown):
     campaign = flown[True]
     path = campaign.root / "raw" / "f01" / "preamble.npy"
     moved = path.rename(path.with_suffix(".away"))
-    message = complaint(lambda: ingest.raw(campaign, "f01", "b"))
+    message = complaint(lambda: ingest.ingest(campaign, "f01", "b"))
     moved.rename(path)
     assert "preamble.npy: no such file" in message
 
@@ -84,5 +84,5 @@ def test_the_false_alarm_rate_is_a_setting(flown):
             update={"processing": campaign.settings.processing.model_copy(update={"false_alarms_per_s": 1e-9})}
         ),
     )
-    ingest.raw(strict, "f01", "b")
+    ingest.ingest(strict, "f01", "b")
     assert raw_of(strict).attrs["trigger"]["false_alarms_per_s"] == 1e-9

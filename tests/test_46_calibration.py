@@ -35,8 +35,7 @@ def flown(folder, *, reflector=True):
     campaign = Campaign.load(root)
     for flight in ("c01", "f01"):
         for node in ("uav1", "uav2"):
-            ingest.raw(campaign, flight, node)
-            ingest.track(campaign, flight, node)
+            ingest.ingest(campaign, flight, node)
     for pair in PAIRS:
         echo.echo(campaign, "c01", pair)
     return campaign

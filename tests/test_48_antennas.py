@@ -84,8 +84,7 @@ def stated(root, antenna, **processing):
 
 
 def imaged(campaign):
-    ingest.raw(campaign, "f01", "uav1")
-    ingest.track(campaign, "f01", "uav1")
+    ingest.ingest(campaign, "f01", "uav1")
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav1")
@@ -224,8 +223,7 @@ def test_only_the_image_depends_on_what_the_beam_is(beamed):
 
 def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     def axes(campaign):
-        ingest.raw(campaign, "f01", "uav1")
-        ingest.track(campaign, "f01", "uav1")
+        ingest.ingest(campaign, "f01", "uav1")
         echo.echo(campaign, "f01", "uav1-uav1")
         found = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo")
         return {name: found[name].values for name in ("tx_axes", "rx_axes") if name in found}

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from apertura.errors import CampaignError
+from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS
 from apertura.settings import CONFIG, FLIGHTS, Antenna, Flight, OfdmWaveform, Settings, read_flights, read_settings
 
 
@@ -164,7 +165,7 @@ class Campaign:
         """Return the flight called `name`."""
         return next(flight for flight in self.flights if flight.name == name)
 
-    def raw_file(self, flight: str, node: str, suffix: str) -> Path:
+    def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
         """Return raw/<flight>/<node><suffix>, which must exist."""
         path = self.root / "raw" / flight / f"{node}{suffix}"
         if not path.is_file():
@@ -179,32 +180,39 @@ class Campaign:
     def raw_files(self, flight: str, node: str) -> dict[str, Path]:
         """Return role → file of everything recorded by `node` in `flight`."""
         if not isinstance(self.settings.waveform, OfdmWaveform):
-            return {f"history.{path.name}": path for path in self._history_files(flight, node)}
+            suffix, _ = PHASE_HISTORIES[self.settings.waveform.format]
+            return {f"history.{path.name}": path for path in self._history_files(flight, node, suffix)}
         return {
-            "meta": self.raw_file(flight, node, ".sigmf-meta"),
-            "data": self.raw_file(flight, node, ".sigmf-data"),
+            **{path.suffix: path for path in self.recording_files(flight, node)},
             "track": self.track_file(flight, node),
         }
 
+    def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
+        """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
+        folder = self.root / "raw" / flight
+        begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
+        row = next(begun, next(iter(RECORDERS)))
+        return tuple(self._raw_file(flight, node, suffix) for suffix in row)
+
     def track_file(self, flight: str, node: str) -> Path:
         """Return the one raw/<flight>/<node>.track.* file."""
-        found = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
-        if len(found) == 1:
-            return found[0]
+        logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
+        if len(logs) == 1:
+            return logs[0]
         raise CampaignError(
-            f"{len(found)} track files {[path.name for path in found]}",
+            f"{len(logs)} track files {[path.name for path in logs]}",
             where=self.root / "raw" / flight / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
-            remedy="Copy the log there, named <node>.track.<csv|pos>.",
+            remedy=f"Copy the log there, named <node>.track.<{'|'.join(suffix[1:] for suffix in TRACKS)}>.",
         )
 
-    def _history_files(self, flight: str, node: str) -> list[Path]:
-        found = sorted((self.root / "raw" / flight).glob(f"{node}.*.mat"))
-        if not found:
+    def _history_files(self, flight: str, node: str, suffix: str) -> list[Path]:
+        files = sorted((self.root / "raw" / flight).glob(f"{node}.*{suffix}"))
+        if not files:
             raise CampaignError(
                 "no such file",
-                where=self.root / "raw" / flight / f"{node}.*.mat",
+                where=self.root / "raw" / flight / f"{node}.*{suffix}",
                 expected=f"the phase history of node {node} in flight {flight}",
-                remedy="Copy the .mat files there, named <node>.<anything>.mat.",
+                remedy=f"Copy the {suffix} files there, named <node>.<anything>{suffix}.",
             )
-        return found
+        return files

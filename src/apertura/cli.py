@@ -162,15 +162,9 @@ def simulate(
 
 
 @step.command()
-def raw(flight: str, node: str, campaign: Directory = HERE) -> None:
-    """Read a node's recording into raw.zarr."""
-    _run("apertura.steps.ingest:raw", campaign, flight, node)
-
-
-@step.command()
-def track(flight: str, node: str, campaign: Directory = HERE) -> None:
-    """Read a node's flight log into track.zarr."""
-    _run("apertura.steps.ingest:track", campaign, flight, node)
+def ingest(flight: str, node: str, campaign: Directory = HERE) -> None:
+    """Read a node's recording and flight log into raw.zarr and track.zarr."""
+    _run("apertura.steps.ingest:ingest", campaign, flight, node)
 
 
 @step.command()

@@ -1,12 +1,7 @@
 """Patterns of antennas: a Gaussian beam of given width or sampled cuts, and the axes they are counted from."""
 
-from pathlib import Path
-
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
-
-from apertura.errors import CampaignError
 
 Cut = tuple[NDArray[np.float64], NDArray[np.float64]]
 """One cut through a pattern: equally spaced angles (rad) and field relative to its peak."""
@@ -16,7 +11,6 @@ LIMITS_RAD = {"azimuth": np.pi, "elevation": np.pi / 2}
 
 _SAMPLES = 513  # linear between them errs by -100 dB with a cutoff of -20 dB
 _FINE = 4097  # 0.09° of a whole turn
-_COLUMNS = ["cut", "angle_deg", "gain_db"]
 
 
 def antenna_axes(body_axes: NDArray[np.float64], boresight_deg: tuple[float, float]) -> NDArray[np.float64]:
@@ -111,52 +105,3 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
     first = int(low[low < peak].max(initial=-1)) + 1
     last = int(low[low > peak].min(initial=_FINE))
     return np.radians(fine[first:last]), 10 ** (level[first:last] / 20)
-
-
-def read_pattern(path: Path, *, cutoff_db: float) -> tuple[Cut, Cut]:
-    """Return the azimuth and elevation cuts of a CSV file.
-
-    Parameters
-    ----------
-    path
-        Columns cut (azimuth or elevation), angle_deg (growing within each cut, from boresight) and gain_db.
-    cutoff_db
-        Gain at which a cut ends, dB relative to its peak.
-
-    Raises
-    ------
-    CampaignError
-        If a column or a cut is missing, a cell is not a number, or angles do not grow or reach too far.
-    """
-    try:
-        table = pd.read_csv(path, skipinitialspace=True)
-        missing = [name for name in _COLUMNS if name not in table.columns]
-        if missing:
-            raise ValueError(f"no column {missing[0]} among {list(table.columns)}")
-        unknown = sorted(set(table["cut"].astype(str)) - LIMITS_RAD.keys())
-        if unknown:
-            raise ValueError(f"a cut called {unknown[0]!r}")
-        cuts = [_samples(table[table["cut"] == name], name) for name in LIMITS_RAD]
-    except (ValueError, UnicodeDecodeError) as error:
-        raise CampaignError(
-            str(error).splitlines()[0],
-            where=path,
-            expected="columns cut (azimuth, elevation), angle_deg and gain_db, with growing angles in both cuts",
-            remedy="Mend the table: one line per sample, first one cut, then the other.",
-        ) from error
-    azimuth, elevation = (sampled_cut(angle, gain, cutoff_db=cutoff_db) for angle, gain in cuts)
-    return azimuth, elevation
-
-
-def _samples(cut: pd.DataFrame, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    angle, gain = (cut[column].to_numpy(np.float64) for column in ("angle_deg", "gain_db"))
-    limit = np.degrees(LIMITS_RAD[name])
-    if len(angle) < 3:
-        raise ValueError(f"{len(angle)} samples of the {name} cut, at least 3 are needed")
-    if not (np.isfinite(angle).all() and np.isfinite(gain).all()):
-        raise ValueError(f"the {name} cut holds a cell that is not a number")
-    if not (np.diff(angle) > 0).all():
-        raise ValueError(f"angles of the {name} cut do not grow")
-    if angle[0] < -limit or angle[-1] > limit:
-        raise ValueError(f"angles of the {name} cut go from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
-    return angle, gain

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from apertura.echo.frame_counter import pairs_by_frame
 from apertura.echo.framing import ABSENT
@@ -98,8 +97,8 @@ def associate(
     --------
     >>> transmitter = np.arange(5) * 50_000_000
     >>> receiver = np.delete(transmitter, 2) + 2_000_000
-    >>> found = associate(transmitter, receiver, repetition_interval_s=0.05)
-    >>> found.tx_index, found.rx_index, found.offset_s
+    >>> association = associate(transmitter, receiver, repetition_interval_s=0.05)
+    >>> association.tx_index, association.rx_index, association.offset_s
     (array([0, 1, 3, 4]), array([0, 1, 2, 3]), 0.002)
     """
     interval_ns = repetition_interval_s * 1e9
@@ -118,7 +117,7 @@ def associate(
     if pairs[0].size == 0:
         raise _nothing_in_common(tags, repetition_interval_s, where)
     line = fit_pairs(tags, pairs, interval_ns)
-    found = Association(
+    association = Association(
         tx_index=pairs[0],
         rx_index=pairs[1],
         offset_s=line.offset_ns * 1e-9,
@@ -129,7 +128,7 @@ def associate(
         rx_dropped=tags[1].size - pairs[0].size,
         flags={},
     )
-    return replace(found, flags=_flags(found, repetition_interval_s, conflicts))
+    return replace(association, flags=_flags(association, repetition_interval_s, conflicts))
 
 
 def detect_wrong_association(
@@ -150,7 +149,7 @@ def detect_wrong_association(
     tolerance_m
         Largest movement that positions alone may explain, metres.
     window
-        Pulses of the running median that tells movement from jitter.
+        Pulses of the running median that tells movement from jitter, an odd number.
 
     Notes
     -----
@@ -169,7 +168,8 @@ def detect_wrong_association(
     if pulse.size < 2 * window:
         return None
     residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
-    smooth = median_filter(residual, window, mode="nearest")
+    padded = np.pad(residual, window // 2, mode="edge")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1)
     smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
     jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
     noise = 1.2533 * jitter / np.sqrt(window)  # standard deviation of a median of `window` Gaussian samples
@@ -224,26 +224,26 @@ def _agreed_pairs(
     return (tx[ascending], rx[ascending]), int((~agreed).sum())
 
 
-def _flags(found: Association, interval_s: float, conflicts: int) -> dict[str, str]:
+def _flags(association: Association, interval_s: float, conflicts: int) -> dict[str, str]:
     flags = {}
-    share = abs(found.offset_s) / interval_s
-    by_tags = found.method == "time tags"
+    share = abs(association.offset_s) / interval_s
+    by_tags = association.method == "time tags"
     if by_tags and share > NEAR_HALF:
         flags["association_ambiguous"] = (
-            f"tags are {found.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
+            f"tags are {association.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
             "every pair may be off by one pulse"
         )
     if not by_tags and share > 0.5:
-        flags["time_tags_apart"] = f"frame counters agree while time tags are {found.offset_s:+.4f} s apart"
+        flags["time_tags_apart"] = f"frame counters agree while time tags are {association.offset_s:+.4f} s apart"
     if conflicts:
         flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
-    if by_tags and found.residual_s > interval_s * LARGEST_JITTER:
+    if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
         flags["time_tag_jitter"] = (
-            f"time tags scatter by {found.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
+            f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
             "single pulses may be paired with a neighbour"
         )
-    pairs = found.tx_index.size
-    shorter = pairs + min(found.tx_dropped, found.rx_dropped)
+    pairs = association.tx_index.size
+    shorter = pairs + min(association.tx_dropped, association.rx_dropped)
     if pairs < shorter / 2:
         flags["association_sparse"] = f"{pairs} pulses paired of {shorter} in the shorter recording"
     return flags

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.stats import gamma
+from scipy.special import gammainccinv, gammaincinv
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
@@ -90,27 +90,27 @@ def estimate_path_offset(
     --------
     >>> frequency, path = 1e9 + 1e6 * np.arange(200), np.hypot(20, np.linspace(-5, 5, 64)) * 2
     >>> echo = np.exp(-2j * np.pi * frequency * (path[:, None] + 1.374) / SPEED_OF_LIGHT_M_S)
-    >>> found = estimate_path_offset(echo.astype(np.complex64), frequency, path_m=path)
-    >>> round(found.offset_m, 3), found.std_m < 0.001
+    >>> calibration = estimate_path_offset(echo.astype(np.complex64), frequency, path_m=path)
+    >>> round(calibration.offset_m, 3), calibration.std_m < 0.001
     (1.374, True)
     """
     groups = _aligned_groups(transfer, frequency_hz, path_m)
     offset_m, power = _offset_profile(groups, frequency_hz, search_m)
     peak = int(np.argmax(power))
-    surroundings = float(np.median(power)) * len(groups) / float(gamma.median(len(groups)))  # mean of clutter
+    surroundings = float(np.median(power)) * len(groups) / float(gammaincinv(len(groups), 0.5))  # mean of clutter
     _require_visible(power, peak, surroundings, len(groups), search_m, where)
     parts = _refine(groups, frequency_hz, offset_m[peak])
-    found, std_m = float(parts.mean()), _deviation_of_mean(parts)
+    mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
     contrast_db = 10 * float(np.log10(power[peak] / max(surroundings, 1e-30)))
     flags = {}
     if std_m > NEEDED_STD_M:
-        flags["calibration_uncertain"] = f"path offset {found:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
+        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
     rival_db, rival_m = _rival(offset_m, power, peak, frequency_hz)
     if rival_db > RIVAL_DB:
         flags["calibration_ambiguous"] = (
-            f"a second reflector {rival_db:.1f} dB beside the first, which is at {found:.2f} m, at {rival_m:.2f} m"
+            f"a second reflector {rival_db:.1f} dB beside the first, which is at {mean_m:.2f} m, at {rival_m:.2f} m"
         )
-    return PathOffset(found, std_m, contrast_db, len(transfer), flags)
+    return PathOffset(mean_m, std_m, contrast_db, len(transfer), flags)
 
 
 def reflector_history(transfer: Complexes, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
@@ -166,7 +166,7 @@ def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search
 def _require_visible(power: Floats, peak: int, surroundings: float, groups: int, search_m: float, where: str) -> None:
     """Raise unless the peak is higher than the highest of as many cells of clutter would be, and inside."""
     cells = power.size / _OVERSAMPLING
-    highest = gamma.isf(FALSE_REFLECTOR / cells, groups) / groups
+    highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
     ratio_db, needed_db = (
         10 * float(np.log10(max(r, 1e-30))) for r in (power[peak] / max(surroundings, 1e-30), highest)
     )

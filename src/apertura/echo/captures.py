@@ -1,8 +1,12 @@
 """What captured samples tell before anything is computed from them: saturation, and whether the code fits."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+
+from apertura.echo.demodulate import Numerology
 
 SATURATED_SHARE = 1e-4
 """Share of the samples at the converter's end stops; a symbol 12 dB below them reaches its extremes once or twice."""
@@ -12,7 +16,7 @@ CODE_SIGMA = 4.0
 
 
 def saturated_share(iq: NDArray[np.int16]) -> float:
-    """Return the share of I and Q samples that repeat the largest or the smallest value found.
+    """Return the share of I and Q samples that repeat the largest or the smallest value that occurs.
 
     Parameters
     ----------
@@ -65,3 +69,24 @@ def code_contrast_sigma(transfer: NDArray[np.complex64], *, prefix_cells: int) -
     expected = inside / cells
     spread = np.sqrt(expected * (1 - expected) / (pulses * cells))
     return float((power[:, :inside].sum() / power.sum() - expected) / spread)
+
+
+def saturation_flags(iq: Mapping[str, NDArray[np.int16]]) -> dict[str, str]:
+    """Return a flag for each channel, name → (pulse, sample, 2) int16, whose converter clipped."""
+    shares = {name: saturated_share(samples) for name, samples in iq.items()}
+    return {
+        f"saturated_{name}": f"{100 * share:.2f} % of the samples of channel {name} sit at the converter's end stops"
+        for name, share in shares.items()
+        if share > SATURATED_SHARE
+    }
+
+
+def code_flags(transfer: NDArray[np.complex64], numerology: Numerology) -> dict[str, str]:
+    """Return a flag if the code does not gather the energy of (pulse, subcarrier) `transfer` inside the prefix."""
+    if numerology.prefix_cells == 0:  # every echo lies beyond
+        return {}
+    sigma = code_contrast_sigma(transfer, prefix_cells=numerology.prefix_cells)
+    if sigma >= CODE_SIGMA:
+        return {}
+    line = f"energy inside the prefix stands {sigma:.1f} σ out of an even spread, {CODE_SIGMA} σ expected: "
+    return {"code_unconfirmed": line + "the codes file is wrong, or no echo rises above the noise"}

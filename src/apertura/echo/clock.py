@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.echo.resampling import Complexes, Floats, Waveform
+from apertura.echo.demodulate import Numerology
+from apertura.echo.resampling import Complexes, Floats
 
 AMBIGUOUS_SHARE = 0.4
 """Offsets beyond this share of Δf could as well be of the other sign: half of Δf is where they wrap."""
@@ -60,7 +61,7 @@ class ClockDecision:
     flags: dict[str, str]
 
 
-def estimate_clock(sidelink: Complexes, waveform: Waveform) -> ClockOffset:
+def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
     """Measure the clock of a receiver on its sidelink.
 
     Parameters
@@ -68,8 +69,8 @@ def estimate_clock(sidelink: Complexes, waveform: Waveform) -> ClockOffset:
     sidelink
         (pulse, sample) complex64, captures from the start of the cyclic prefix to the end of the symbol
         (T_cp + T), no longer; pulses without signal do no harm.
-    waveform
-        As transmitted.
+    numerology
+        Of the symbol.
 
     Raises
     ------
@@ -82,21 +83,21 @@ def estimate_clock(sidelink: Complexes, waveform: Waveform) -> ClockOffset:
 
     Examples
     --------
-    >>> waveform = Waveform(1e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
+    >>> numerology = Numerology(1e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
     >>> tones = np.exp(2j * np.pi * np.outer(np.arange(32), np.arange(120) / 64) + 1j * np.arange(32)[:, None] ** 2)
     >>> turning = tones.sum(0) * np.exp(-2j * np.pi * 5e3 * np.arange(120) / 64e6)
-    >>> clock = estimate_clock(np.tile(turning, (4, 1)).astype(np.complex64), waveform)
+    >>> clock = estimate_clock(np.tile(turning, (4, 1)).astype(np.complex64), numerology)
     >>> round(clock.cfo_hz), round(clock.sfo_ppm), clock.one_clock
     (5000, 0, False)
     """
-    period_s = 1 / waveform.spacing_hz
-    frequency_hz, groups = _repetition(sidelink, waveform)
+    period_s = 1 / numerology.spacing_hz
+    frequency_hz, groups = _repetition(sidelink, numerology)
     phase, slope, centre_hz = _phase_and_slope(groups.sum(0), frequency_hz, start=(0.0, 0.0))
     parts = np.array([_phase_and_slope(group, frequency_hz, start=(phase, slope))[:2] for group in groups])
     growth, phase_std = _line(parts[:, 0])
     ppm = 1e6 / (2 * np.pi * period_s)
     sfo_ppm, sfo_std_ppm = -slope * ppm, _line(parts[:, 1])[1] * ppm
-    joint_ppm = -phase * ppm / (waveform.carrier_hz + centre_hz)  # if one clock feeds both
+    joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock feeds both
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
     return ClockOffset(
@@ -109,41 +110,41 @@ def estimate_clock(sidelink: Complexes, waveform: Waveform) -> ClockOffset:
     )
 
 
-def decide_clock(offset: ClockOffset, waveform: Waveform, *, accuracy_db: float) -> ClockDecision:
+def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: float) -> ClockDecision:
     """Say whether a clock needs correction for images whose floor may lie at `accuracy_db`.
 
     Parameters
     ----------
     offset
-        What `estimate_clock` found.
-    waveform
-        As transmitted.
+        From `estimate_clock`.
+    numerology
+        Of the symbol.
     accuracy_db
         Level below the peak that errors may reach, dB.
 
     Examples
     --------
-    >>> waveform = Waveform(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
+    >>> numerology = Numerology(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
     >>> for ppm in (0.5, 8.0):
     ...     clock = ClockOffset(1200 * ppm, 0.0, ppm, cfo_std_hz=1.0, sfo_std_ppm=0.1, one_clock=True)
-    ...     print(decide_clock(clock, waveform, accuracy_db=-60).reason)
+    ...     print(decide_clock(clock, numerology, accuracy_db=-60).reason)
     clock 0.50 ppm fast (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB asked: left alone
     clock 8.00 ppm fast (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB asked: samples corrected
     """
-    floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, waveform)
-    sfo_std_ppm = offset.cfo_std_hz / waveform.carrier_hz * 1e6 if offset.one_clock else offset.sfo_std_ppm
+    floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, numerology)
+    sfo_std_ppm = offset.cfo_std_hz / numerology.carrier_hz * 1e6 if offset.one_clock else offset.sfo_std_ppm
     unknown = not np.isfinite(offset.cfo_std_hz)
-    left_db = 0.0 if unknown else interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, waveform)
+    left_db = 0.0 if unknown else interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
     correct = floor_db > max(accuracy_db, left_db)
     what = "samples corrected" if correct else "left alone"
     reason = (
-        f"clock {offset.cfo_hz / waveform.carrier_hz * 1e6:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
+        f"clock {offset.cfo_hz / numerology.carrier_hz * 1e6:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
         f"SFO {offset.sfo_ppm:.2f} ppm): floor {floor_db:.1f} dB, {accuracy_db:g} dB asked: {what}"
     )
     flags = {}
-    if abs(offset.cfo_hz) > AMBIGUOUS_SHARE * waveform.spacing_hz:
+    if abs(offset.cfo_hz) > AMBIGUOUS_SHARE * numerology.spacing_hz:
         flags["clock_ambiguous"] = (
-            f"CFO {offset.cfo_hz:+.0f} Hz is close to half a subcarrier ({waveform.spacing_hz / 2:.0f} Hz): "
+            f"CFO {offset.cfo_hz:+.0f} Hz is close to half a subcarrier ({numerology.spacing_hz / 2:.0f} Hz): "
             "it may be another by whole subcarriers"
         )
     if left_db > accuracy_db:
@@ -153,7 +154,7 @@ def decide_clock(offset: ClockOffset, waveform: Waveform, *, accuracy_db: float)
     return ClockDecision(correct, reason, floor_db, flags)
 
 
-def interference_floor_db(cfo_hz: float, sfo_ppm: float, waveform: Waveform) -> float:
+def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology) -> float:
     """Return the floor that a clock leaves in a range profile, dB below its peak.
 
     Notes
@@ -163,26 +164,28 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, waveform: Waveform) -> 
 
     Examples
     --------
-    >>> waveform = Waveform(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
-    >>> round(interference_floor_db(10e3, 0.0, waveform), 1)
+    >>> numerology = Numerology(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
+    >>> round(interference_floor_db(10e3, 0.0, numerology), 1)
     -48.0
     """
-    off_bin = (cfo_hz + waveform.numbers * waveform.spacing_hz * sfo_ppm * 1e-6) / waveform.spacing_hz
+    off_bin = (cfo_hz + numerology.numbers * numerology.spacing_hz * sfo_ppm * 1e-6) / numerology.spacing_hz
     lost = float(np.mean(1 - np.sinc(off_bin) ** 2))
-    return float(10 * np.log10(max(2 * lost / waveform.numbers.size, 1e-30)))
+    return float(10 * np.log10(max(2 * lost / numerology.numbers.size, 1e-30)))
 
 
-def _repetition(sidelink: Complexes, waveform: Waveform) -> tuple[Floats, NDArray[np.complex128]]:
+def _repetition(sidelink: Complexes, numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
     """Return occupied frequencies and, per group of pulses, the cross-spectrum of the end with its first copy."""
-    period, prefix, count = waveform.dft_samples, waveform.prefix_samples, sidelink.shape[1]
+    period, prefix, count = numerology.dft_samples, numerology.prefix_samples, sidelink.shape[1]
     start = prefix if count - period - prefix >= prefix // 2 else prefix // 2
     length = count - period - start
     if length < _SMALLEST_REPEAT:
         raise ValueError(f"captures of {count} samples repeat only {length} of them; {_SMALLEST_REPEAT} are needed")
     size = fft.next_fast_len(length)
-    lowest_hz = waveform.middle_hz - waveform.sample_rate_hz / 2
-    frequency_hz = (fft.fftfreq(size, 1 / waveform.sample_rate_hz) - lowest_hz) % waveform.sample_rate_hz + lowest_hz
-    occupied = np.abs(frequency_hz - waveform.middle_hz) <= waveform.numbers.size * waveform.spacing_hz / 2
+    lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
+    frequency_hz = (
+        fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
+    ) % numerology.sample_rate_hz + lowest_hz
+    occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
     groups = []
     for pulses in np.array_split(sidelink, min(_GROUPS, len(sidelink))):
         cross = np.zeros(size, np.complex128)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.interpolation import kaiser_window
 
 _PULSES_AT_ONCE = 32  # which the caches hold
 
@@ -163,14 +164,11 @@ def _decimation(subcarriers: int, length: int, count: int) -> _Decimation:
     factor, reach = factors[-1], _TAPS // 2
     beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
 
-    def bell(place: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.i0(beta * np.sqrt(1 - (2 * place / _TAPS) ** 2)) / np.i0(beta))
-
     within = (np.arange(factor) - (factor - 1) / 2) / factor
-    taps = bell(within[:, None] - np.arange(-reach, reach + 1))
+    taps = kaiser_window((within[:, None] - np.arange(-reach, reach + 1)) / (_TAPS / 2), beta)
     nodes, weights = np.polynomial.legendre.leggauss(64)
     wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
-    response = 1 / (wave @ (weights * _TAPS / 2 * bell(nodes * _TAPS / 2)))
+    response = 1 / (wave @ (weights * _TAPS / 2 * kaiser_window(nodes, beta)))
     delay = (factor - 1) / 2 - middle - factor * reach
     return _Decimation(taps.astype(np.complex64), _turned(response, delay * after / length))
 

@@ -4,11 +4,56 @@ A subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) that travelled 
 c_n·exp(-j2π(f_c+nΔf)τ), as long as τ stays inside the cyclic prefix (docs/theory.md, eq. 1 and 2).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 _PULSES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Numerology:
+    """How a receiver samples an OFDM symbol.
+
+    Attributes
+    ----------
+    carrier_hz, sample_rate_hz
+        Nominal RF frequency at baseband zero and complex samples per second.
+    numbers
+        (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier, ascending.
+    prefix_samples
+        T_cp·f_s, where the DFT window begins.
+    dft_samples
+        f_s/Δf, the length of the DFT window.
+    """
+
+    carrier_hz: float
+    sample_rate_hz: float
+    numbers: NDArray[np.int64]
+    prefix_samples: int
+    dft_samples: int
+
+    @property
+    def spacing_hz(self) -> float:
+        """Δf."""
+        return self.sample_rate_hz / self.dft_samples
+
+    @property
+    def middle_hz(self) -> float:
+        """Baseband frequency at the middle of the occupied band."""
+        return float(self.numbers[0] + self.numbers[-1]) / 2 * self.spacing_hz
+
+    @property
+    def frequency_hz(self) -> NDArray[np.float64]:
+        """(subcarrier,) float64, RF frequency of each subcarrier."""
+        return np.asarray(self.carrier_hz + self.numbers * self.spacing_hz, np.float64)
+
+    @property
+    def prefix_cells(self) -> int:
+        """Delay cells of 1/B inside the cyclic prefix."""
+        return round(self.prefix_samples * self.numbers.size / self.dft_samples)
 
 
 def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
@@ -22,21 +67,15 @@ def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
     return np.arange(count) - (count // 2 if carrier_is == "band_centre" else 0)
 
 
-def demodulate(
-    captures: NDArray[np.complex64], *, numbers: NDArray[np.int64], prefix_samples: int, dft_samples: int
-) -> NDArray[np.complex64]:
+def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArray[np.complex64]:
     """Return the received code symbols c_n·H_n of captures.
 
     Parameters
     ----------
     captures
         (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
-    numbers
-        (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier.
-    prefix_samples
-        T_cp·f_s, where the DFT window begins.
-    dft_samples
-        f_s/Δf, the length of the DFT window.
+    numerology
+        Of the symbol.
 
     Returns
     -------
@@ -50,23 +89,23 @@ def demodulate(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 2; the DFT length is f_s/Δf, not N (DESIGN section 4).
+    Source: docs/theory.md, eq. 2; the DFT length is f_s/Δf, not N.
 
     Examples
     --------
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(16) / 16).astype(np.complex64)
-    >>> symbols = demodulate(tone[None], numbers=np.arange(8), prefix_samples=0, dft_samples=16)
+    >>> symbols = demodulate(tone[None], Numerology(1e9, 16e6, np.arange(8), prefix_samples=0, dft_samples=16))
     >>> abs(symbols[0]).round().astype(int).tolist()
     [0, 0, 0, 1000, 0, 0, 0, 0]
     """
     pulses, samples = captures.shape
-    if samples < prefix_samples + dft_samples:
-        raise ValueError(f"{samples=}: a capture needs {prefix_samples + dft_samples} (prefix and DFT window)")
-    symbols = np.empty((pulses, len(numbers)), np.complex64)
+    start, stop = numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples
+    if samples < stop:
+        raise ValueError(f"{samples=}: a capture needs {stop} (prefix and DFT window)")
+    symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
     for first in range(0, pulses, _PULSES_AT_ONCE):
-        block = captures[first : first + _PULSES_AT_ONCE, prefix_samples : prefix_samples + dft_samples]
-        spectrum = fft.fft(block, axis=1, norm="forward")
-        symbols[first : first + len(block)] = spectrum[:, numbers % dft_samples]
+        spectrum = fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
+        symbols[first : first + len(spectrum)] = spectrum[:, numerology.numbers % numerology.dft_samples]
     return symbols
 
 

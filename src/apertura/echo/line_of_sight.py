@@ -1,6 +1,6 @@
 """The direct path inside a sidelink: its delay, phase and amplitude in every pulse, and whether it is there at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,10 @@ class LineOfSight:
     amplitude: Floats
     noise_power: Floats
     locked: NDArray[np.bool_]
+
+    def select(self, pulses: NDArray[np.bool_]) -> "LineOfSight":
+        """Return the path of some pulses, (pulse,) bool."""
+        return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
 
 
 def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:

@@ -23,10 +23,10 @@ FIT_SNR_DB = 13.4
 """Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
-_Reference = Callable[[Complexes, LineOfSight, slice], NDArray[np.complex128]]
+_Inverse = Callable[[Complexes, LineOfSight, slice], NDArray[np.complex128]]
 
 
-def divide(radar: Complexes, sidelink: Complexes) -> Complexes:
+def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A/S.
 
     Where |S| falls more than 20 dB below A, in a spectral null or by noise, S is taken as 20 dB below A: a null
@@ -36,6 +36,8 @@ def divide(radar: Complexes, sidelink: Complexes) -> Complexes:
     ----------
     radar, sidelink
         (pulse, subcarrier) complex64 of the same captures.
+    path
+        The sidelink's direct path, where `measure` has fitted it already.
 
     Returns
     -------
@@ -59,10 +61,10 @@ def divide(radar: Complexes, sidelink: Complexes) -> Complexes:
         weakest = _weakest(amplitude)
         return np.asarray(symbols.conj() * amplitude / np.maximum(np.abs(symbols), weakest) ** 2, np.complex128)
 
-    return _correct(radar, sidelink, inverse)
+    return _correct(radar, sidelink, path, inverse)
 
 
-def wiener(radar: Complexes, sidelink: Complexes) -> Complexes:
+def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A·S*/(|S|² + σ²), rescaled so that the direct path keeps its amplitude.
 
     Parameters and result as `divide`; σ² is the noise per subcarrier, measured beside the direct path.
@@ -81,10 +83,10 @@ def wiener(radar: Complexes, sidelink: Complexes) -> Complexes:
         kept = np.abs((regular * phasor(path, symbols.shape[1], pulses)).mean(1, keepdims=True))
         return np.asarray(np.where(path.locked[pulses, None], regular / np.maximum(kept, 1e-30), regular))
 
-    return _correct(radar, sidelink, inverse)
+    return _correct(radar, sidelink, path, inverse)
 
 
-def gated(radar: Complexes, sidelink: Complexes) -> Complexes:
+def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R·A/S with S cleaned of all that arrives more than 16 cells from the direct path.
 
     Parameters and result as `divide`.
@@ -104,10 +106,10 @@ def gated(radar: Complexes, sidelink: Complexes) -> Complexes:
         weakest = _weakest(amplitude)
         return np.asarray(clean.conj() * amplitude / np.maximum(np.abs(clean), weakest) ** 2, np.complex128)
 
-    return _correct(radar, sidelink, inverse)
+    return _correct(radar, sidelink, path, inverse)
 
 
-def two_parameter(radar: Complexes, sidelink: Complexes) -> Complexes:
+def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
     """Return R turned back by the delay and the phase of the direct path, one of each per pulse.
 
     Parameters and result as `divide`.
@@ -116,10 +118,14 @@ def two_parameter(radar: Complexes, sidelink: Complexes) -> Complexes:
     -----
     Source: docs/theory/echo_methods.md, "Two parameters of a pulse".
     """
-    return _correct(radar, sidelink, lambda symbols, path, pulses: phasor(path, symbols.shape[1], pulses).conj())
+
+    def inverse(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.complex128]:
+        return phasor(path, symbols.shape[1], pulses).conj()
+
+    return _correct(radar, sidelink, path, inverse)
 
 
-METHODS: Mapping[str, Callable[[Complexes, Complexes], Complexes]] = {
+METHODS: Mapping[str, Callable[..., Complexes]] = {
     "divide": divide,
     "wiener": wiener,
     "two_parameter": two_parameter,
@@ -136,7 +142,7 @@ def edges(method: str, state: SidelinkState) -> dict[str, str]:
     method
         A key of `METHODS`.
     state
-        What `measure` found.
+        From `measure`.
 
     Notes
     -----
@@ -149,9 +155,9 @@ def edges(method: str, state: SidelinkState) -> dict[str, str]:
         "two_parameter": (_gain_db(state, 1), FIT_SNR_DB, "of the whole pulse"),
     }
     crossed = {}
-    found, needed, of_what = snr_db[method]
-    if found < needed:
-        crossed["sidelink_noisy"] = f"SNR of the sidelink {found:.1f} dB {of_what}: {method} needs {needed:.1f} dB"
+    measured, needed, of_what = snr_db[method]
+    if measured < needed:
+        crossed["sidelink_noisy"] = f"SNR of the sidelink {measured:.1f} dB {of_what}: {method} needs {needed:.1f} dB"
     reach = {"divide": state.subcarriers, "wiener": state.subcarriers, "gated": GATE_CELLS, "two_parameter": 0}[method]
     if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= reach:
         crossed["sidelink_echo"] = (
@@ -171,7 +177,7 @@ def choose(state: SidelinkState) -> tuple[str, str]:
     Parameters
     ----------
     state
-        What `measure` found.
+        From `measure`.
 
     Examples
     --------
@@ -208,8 +214,8 @@ def _weakest(amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-30)
 
 
-def _correct(radar: Complexes, sidelink: Complexes, inverse: _Reference) -> Complexes:
-    path = fit_line_of_sight(sidelink)
+def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, inverse: _Inverse) -> Complexes:
+    path = path or fit_line_of_sight(sidelink)
     corrected = np.empty(radar.shape, np.complex64)
     for first in range(0, len(radar), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)

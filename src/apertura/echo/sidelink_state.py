@@ -1,4 +1,4 @@
-"""What a sidelink is like: how far above the noise, with which echoes and which ripple, and in which pulses."""
+"""State of a sidelink: its SNR, echoes and ripple, and the pulses in which it locks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.stats import gamma
+from scipy.special import gammainccinv
 
 from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_line_of_sight, phasor
 from apertura.errors import CampaignError
@@ -48,8 +48,8 @@ class SidelinkState:
         Share of the subcarriers below `NULL_DB`.
     locked
         (pulse,) bool, whether the direct path stands out of the noise.
-    delay_cells
-        (pulse,) float64, its delay in cells of 1/B; NaN where not locked.
+    path
+        The direct path as fitted to each pulse.
     flags
         Edge crossed → what was measured, in one line.
     """
@@ -62,8 +62,13 @@ class SidelinkState:
     fine_ripple_db: float
     null_share: float
     locked: NDArray[np.bool_]
-    delay_cells: Floats
+    path: LineOfSight
     flags: Mapping[str, str]
+
+    @property
+    def delay_cells(self) -> Floats:
+        """(pulse,) float64, delay of the direct path in cells of 1/B; NaN where it did not lock."""
+        return np.where(self.path.locked, self.path.delay_cells, np.nan)
 
 
 def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
@@ -98,13 +103,15 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     """
     path = fit_line_of_sight(sidelink)
     if not path.locked.any():
-        return _measure_without_code(sidelink, where)
-    found = _average(sidelink, path)
+        return _measure_without_code(sidelink, path, where)
+    average = _average(sidelink, path)
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
-    echo_db, echo_cells = _strongest_echo(found)
+    echo_db, echo_cells = _strongest_echo(average)
     # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
-    ripple_db, fine_ripple_db = _ripple(found, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB))
-    flat = found.spectrum - found.noise * sidelink.shape[1]
+    ripple_db, fine_ripple_db = _ripple(
+        average, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB)
+    )
+    flat = average.spectrum - average.noise * sidelink.shape[1]
     state = SidelinkState(
         subcarriers=sidelink.shape[1],
         snr_db=_db(snr),
@@ -115,7 +122,7 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
         # a null is seen only where the noise lies well below it
         null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
         locked=path.locked,
-        delay_cells=np.where(path.locked, path.delay_cells, np.nan),
+        path=path,
         flags={},
     )
     return replace(state, flags=_flags(state))
@@ -157,37 +164,37 @@ def _average(sidelink: Complexes, path: LineOfSight) -> _Average:
     return _Average(count, noise, power / count, mean / count, spectrum / count, second_cell, float(level[typical]))
 
 
-def _strongest_echo(found: _Average) -> tuple[float, int]:
+def _strongest_echo(average: _Average) -> tuple[float, int]:
     """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
 
     Ripple answers on both sides of the direct path alike, an echo on one; only the excess of one side counts.
     """
-    cells = np.arange(2, found.power.size - 1)
-    excess = found.power - found.noise
+    cells = np.arange(2, average.power.size - 1)
+    excess = average.power - average.noise
     one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
     best = int(np.argmax(one_sided))
     level, cell = float(one_sided[best]), int(cells[best])
     # what the highest of N averages of exponential noise passes with the chance of a false lock
-    highest = gamma.isf(LOCK_FALSE_ALARM / found.power.size, found.pulses) / found.pulses
-    seen = found.noise * (float(highest) - 1)
+    highest = gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
+    seen = average.noise * (float(highest) - 1)
     # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
-    highest_noise = found.noise * np.log(found.power.size / LOCK_FALSE_ALARM)
-    if found.second_power > max(4 * found.power[found.second_cell], highest_noise, level):
-        level, cell = found.second_power, found.second_cell
+    highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
+    if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
+        level, cell = average.second_power, average.second_cell
     if level <= seen:
         return _db(seen), 0
-    return _db(level), cell if cell < found.power.size / 2 else cell - found.power.size
+    return _db(level), cell if cell < average.power.size / 2 else cell - average.power.size
 
 
-def _ripple(found: _Average, *, one_sided: bool) -> tuple[float, float]:
+def _ripple(average: _Average, *, one_sided: bool) -> tuple[float, float]:
     """Return peak-to-peak ripple (dB) inside and outside the gate, from echoes that all pulses have in common.
 
     cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
     inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
     """
-    power = np.abs(found.mean / found.mean[0]) ** 2
+    power = np.abs(average.mean / average.mean[0]) ** 2
     cells = np.arange(1, power.size // 2)
-    noise = found.noise / found.pulses
+    noise = average.noise / average.pulses
     sides = np.stack([power[cells], power[-cells]]) - noise
     single = np.sqrt(np.where(sides > 9 * noise, sides, 0.0)).sum(0)
     paired = np.sqrt(np.where(sides.min(0) > 5 * noise, sides.min(0), 0.0)) * 2
@@ -205,24 +212,23 @@ def _db(power: float) -> float:
     return float(10 * np.log10(max(power, 1e-30)))
 
 
-def _measure_without_code(sidelink: Complexes, where: str) -> SidelinkState:
+def _measure_without_code(sidelink: Complexes, path: LineOfSight, where: str) -> SidelinkState:
     """Tell a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink at all."""
-    alike = fit_line_of_sight(np.asarray(sidelink[1:] * sidelink[:-1].conj(), np.complex64))
-    if alike.locked.mean() < 0.5 or not alike.locked.size:
+    common = fit_line_of_sight(np.asarray(sidelink[1:] * sidelink[:-1].conj(), np.complex64))
+    if common.locked.mean() < 0.5 or not common.locked.size:
         raise CampaignError(
             f"a sidelink that locks in none of {len(sidelink)} pulses",
             where=where,
             expected="the direct path of the transmitter above the noise",
             remedy="Check antenna and gain of the sidelink and which channel it was recorded on.",
         )
-    product = float(np.median((alike.amplitude**2 / np.maximum(alike.noise_power, 1e-30))[alike.locked]))
+    product = float(np.median((common.amplitude**2 / np.maximum(common.noise_power, 1e-30))[common.locked]))
     locked = np.zeros(len(sidelink), bool)
-    locked[1:] |= alike.locked
-    locked[:-1] |= alike.locked
+    locked[1:] |= common.locked
+    locked[:-1] |= common.locked
     snr_db = _db(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
     line = f"the sidelink ({snr_db:.0f} dB) does not carry the given code: monostatic images will not focus"
-    nowhere = np.full(len(sidelink), np.nan)
-    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, 0.0, 0.0, 0.0, locked, nowhere, {"wrong_code": line})
+    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, 0.0, 0.0, 0.0, locked, path, {"wrong_code": line})
 
 
 def _flags(state: SidelinkState) -> dict[str, str]:

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import theilslopes
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -26,7 +25,7 @@ class TagLine(NamedTuple):
 def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
     """Return the offset line under which the receiver's tags best fall on the transmitter's, modulo the interval."""
     tx, rx = tags
-    some = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse: all are alike modulo the interval
+    some = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse: modulo the interval all give the same
     cycles = (rx - tx[some]) / interval_ns
     elapsed_ns = (rx - rx[0]).astype(np.float64)
     reach = LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] / interval_ns
@@ -60,8 +59,14 @@ def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
     drift = 0.0
     if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would pose as drift
         some = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
-        drift = float(theilslopes(offset_ns[some], elapsed_ns[some]).slope)
+        drift = _theil_sen_slope(elapsed_ns[some], offset_ns[some])
     return TagLine(float(np.median(offset_ns - drift * elapsed_ns)), drift, int(rx_tag[0]))
+
+
+def _theil_sen_slope(x: Floats, y: Floats) -> float:
+    """Return the median of the slopes between all pairs of points, x ascending; scipy.stats imports for a second."""
+    first, second = np.triu_indices(x.size, 1)
+    return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
 
 
 def residual_ns(tags: Pairs, pairs: Pairs, line: TagLine) -> Floats:

@@ -34,22 +34,6 @@ class Detection:
     snr_db: float
 
 
-@dataclass(frozen=True)
-class TriggeredRate:
-    """What a triggered recorder would have kept of a recording.
-
-    Attributes
-    ----------
-    duty_cycle
-        γ, share of the time that is captured.
-    mean_rate_bit_s
-        C = 2·f_s·ν·γ, of one channel: I and Q of ν bits.
-    """
-
-    duty_cycle: float
-    mean_rate_bit_s: float
-
-
 def find_preambles(
     blocks: Iterable[Samples], framing: Framing, *, symbol_samples: int, false_alarms_per_s: float
 ) -> Iterator[Detection]:
@@ -81,8 +65,8 @@ def find_preambles(
     >>> framing = Framing(np.array([1, 1, 1, -1, 1, -1, -1] * 9), 2, 0.0, 1e6, counter_bits=0, bit_chips=0)
     >>> noise = np.random.default_rng(1).normal(0, 50, (5000, 2))
     >>> noise[1234 : 1234 + 126, 0] += 100 * framing.template().real
-    >>> found = find_preambles([noise.astype(np.int16)], framing, symbol_samples=200, false_alarms_per_s=0.1)
-    >>> [detection.sample for detection in found]
+    >>> detections = find_preambles([noise.astype(np.int16)], framing, symbol_samples=200, false_alarms_per_s=0.1)
+    >>> [detection.sample for detection in detections]
     [1234]
     """
     template = framing.template()
@@ -107,20 +91,6 @@ def score_threshold(template_samples: int, false_alarm: float) -> float:
     if not 0 < false_alarm < 1:
         raise ValueError(f"{false_alarm=}: must lie between 0 and 1 per sample")
     return float(-np.expm1(np.log(false_alarm) / (template_samples - 1)))
-
-
-def triggered_rate(
-    captures: int, symbol_samples: int, *, recorded_samples: int, sample_rate_hz: float, bits: int
-) -> TriggeredRate:
-    """Return duty cycle and mean data rate of captures cut from a recording.
-
-    Examples
-    --------
-    >>> triggered_rate(100, 16000, recorded_samples=1_024_000_000, sample_rate_hz=1.024e9, bits=14)
-    TriggeredRate(duty_cycle=0.0015625, mean_rate_bit_s=44800000.0)
-    """
-    duty = captures * symbol_samples / recorded_samples
-    return TriggeredRate(duty, 2 * sample_rate_hz * bits * duty)
 
 
 def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[int, NDArray[np.float32]]]:

@@ -6,14 +6,17 @@ virtual pulses equals the sum over all (docs/theory/planner.md, "Pulses").
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 PRESUM_S = 8.0e-8
 """Seconds per pulse and range sample, on one core."""
@@ -38,7 +41,7 @@ class Presum:
 
     factor: int
     at: NDArray[np.float64]
-    weight: sparse.csr_array
+    weight: "sparse.csr_array"
 
 
 def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = -72.0) -> Presum | None:
@@ -66,6 +69,8 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     room = 1 / factor - 2 * widest_cycles
     if factor < 2 or room <= 0.4 / factor:
         return None
+    from scipy import sparse
+
     stop_db = 12.0 - error_db
     beta = 0.1102 * (stop_db - 8.7)
     half = int(np.ceil((stop_db - 7.95) / (14.36 * room) / 2))

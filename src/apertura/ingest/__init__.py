@@ -1,14 +1,66 @@
-"""Recorders and flight logs: bytes in, `raw`, `track` or `echo` out; one file and one row per format."""
+"""Recorders and flight logs: bytes in, `raw`, `track` or `echo` out; one file and one row per format.
 
-from apertura.ingest.afrl import read_afrl_mat
-from apertura.ingest.csv_track import read_csv_track
-from apertura.ingest.rtklib import read_rtklib_pos
-from apertura.ingest.sigmf import cut, open_sigmf, read_sigmf
+Rows name their readers and do not import them: a step pays for the formats that it meets.
+"""
 
-TRACKS = {".csv": read_csv_track, ".pos": read_rtklib_pos}
+import pkgutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apertura.errors import CampaignError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apertura.ingest.recording import Recording
+
+RECORDERS: Mapping[tuple[str, ...], str] = {(".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf:open_sigmf"}
+"""Suffixes of the files of a recording, <node><suffix> → opener(*files) → `Recording`."""
+
+TRACKS: Mapping[str, str] = {
+    ".csv": "apertura.ingest.csv_track:read_csv_track",
+    ".pos": "apertura.ingest.rtklib:read_rtklib_pos",
+}
 """Suffix of <node>.track.* → reader(path, node=) → `track`."""
 
-PHASE_HISTORIES = {"afrl_mat": read_afrl_mat}
-"""waveform.format → reader(paths, pair=) → `echo`."""
+PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura.ingest.afrl:read_afrl_mat")}
+"""waveform.format → suffix of <node>.*, reader(paths, pair=) → `echo`."""
 
-__all__ = ["PHASE_HISTORIES", "TRACKS", "cut", "open_sigmf", "read_sigmf"]
+
+def open_recording(files: Sequence[Path]) -> "Recording":
+    """Open a recording; metadata and sizes are checked, samples are memory-mapped and not read.
+
+    Parameters
+    ----------
+    files
+        In the order of a row of `RECORDERS`.
+    """
+    row = next(row for row in RECORDERS if all(file.name.endswith(end) for file, end in zip(files, row, strict=True)))
+    opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
+    return opened
+
+
+def read_track(path: Path, *, node: str) -> "xr.Dataset":
+    """Return the `track` stage of a flight log.
+
+    Raises
+    ------
+    CampaignError
+        If there is no reader for the file's suffix, or the log is not what its format promises.
+    """
+    if path.suffix not in TRACKS:
+        raise CampaignError(
+            f"a flight log of kind {path.suffix!r}",
+            where=path,
+            expected=f"one of {sorted(TRACKS)}",
+            remedy="Convert the log, or write a reader for it.",
+        )
+    track: xr.Dataset = pkgutil.resolve_name(TRACKS[path.suffix])(path, node=node)
+    return track
+
+
+def read_phase_history(kind: str, paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
+    """Return the `echo` stage of phase-history files; `kind` is a key of `PHASE_HISTORIES`."""
+    echo: xr.Dataset = pkgutil.resolve_name(PHASE_HISTORIES[kind][1])(paths, pair=pair)
+    return echo

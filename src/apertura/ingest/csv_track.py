@@ -42,6 +42,6 @@ def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
             str(error).splitlines()[0],
             where=path,
             expected=f"columns time_utc (ISO 8601), {', '.join(_POSITION)}, optionally {', '.join(_ATTITUDE)}",
-            remedy="Mend the log or export it again.",
+            remedy="Correct the log or export it again.",
         ) from error
     return make_track(time.astype("datetime64[ns]"), geodetic, attitude_deg=attitude, node=node, where=path)

@@ -1,84 +1,55 @@
-"""SigMF recordings: one capture segment per trigger, channels interleaved per sample."""
+"""SigMF recordings: one capture segment per trigger, channels interleaved per sample.
 
-import hashlib
-import json
-import warnings
-from dataclasses import dataclass
+Only what is read of the metadata is checked: the schema of the sigmf package takes jsonschema, which costs more to
+import than a recording to open.
+"""
+
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
-from sigmf.validate import validate as validate_schema
+from pydantic import BaseModel, Field, ValidationError
 
 from apertura.errors import CampaignError
+from apertura.ingest.recording import Captures, Recording
 
-_BYTES_PER_SAMPLE = 4  # ci16_le: two int16
-
-
-@dataclass(frozen=True)
-class Recording:
-    """An opened SigMF recording.
-
-    Attributes
-    ----------
-    samples
-        (sample, channel, 2) int16, memory-mapped.
-    channels
-        Names of the channels.
-    meta, meta_path, data_path
-        Metadata and files.
-    """
-
-    samples: NDArray[np.int16]
-    channels: list[str]
-    meta: dict[str, Any]
-    meta_path: Path
-    data_path: Path
-
-    @property
-    def sample_rate_hz(self) -> float:
-        """Complex samples per second."""
-        return float(self.meta["global"]["core:sample_rate"])
-
-    @property
-    def framing(self) -> dict[str, Any] | None:
-        """What was sent before each symbol, where the recorder ran through instead of being triggered; else None."""
-        described = self.meta["global"].get("apertura:framing")
-        return dict(described) if described and len(self.meta["captures"]) == 1 else None
-
-    def captures(self) -> "Captures":
-        """Return the capture segments that the metadata describe."""
-        starts, length = _segments(self.meta["captures"], len(self.samples), self.meta_path)
-        numbers = np.array([capture.get("apertura:frame", -1) for capture in self.meta["captures"]], np.int64)
-        return Captures(np.array(starts), length, _times(self.meta["captures"], self.meta_path), numbers)
-
-    def captures_at(self, starts: NDArray[np.int64], length: int, frame: NDArray[np.int64]) -> "Captures":
-        """Return capture segments of a recording that never stopped, timed by their first samples."""
-        begun = _times(self.meta["captures"], self.meta_path)[0]
-        elapsed = np.round(starts / self.sample_rate_hz * 1e9).astype(np.int64).astype("timedelta64[ns]")
-        return Captures(starts, length, begun + elapsed, frame)
+_DATATYPE = "ci16_le"
+_BYTES_PER_SAMPLE = 4  # of one channel: two int16
 
 
-@dataclass(frozen=True)
-class Captures:
-    """Segments of a recording: first samples, one length, UTC time tags, frame numbers (-1 without)."""
+class _Framing(BaseModel):
+    preamble: str
+    chip_samples: int
+    centre_hz: float
+    counter_bits: int
+    bit_chips: int
+    guard_samples: int
 
-    starts: NDArray[np.int64]
-    length: int
-    time: NDArray[np.datetime64]
-    frame: NDArray[np.int64]
+
+class _Global(BaseModel):
+    datatype: str = Field(alias="core:datatype")
+    version: str = Field(alias="core:version")
+    sample_rate_hz: float = Field(alias="core:sample_rate", gt=0)
+    num_channels: int = Field(1, alias="core:num_channels", ge=1)
+    sha512: str | None = Field(None, alias="core:sha512", pattern="^[0-9a-fA-F]{128}$")
+    channels: list[str] | None = Field(None, alias="apertura:channels")
+    framing: _Framing | None = Field(None, alias="apertura:framing")
 
 
-def read_sigmf(meta_path: Path, data_path: Path, *, node: str) -> xr.Dataset:
-    """Return the `raw` stage of a triggered SigMF recording: `open_sigmf`, then `cut` at its captures."""
-    recording = open_sigmf(meta_path, data_path)
-    return cut(recording, recording.captures(), node=node)
+class _Capture(BaseModel):
+    start: int = Field(alias="core:sample_start", ge=0)
+    datetime: str = Field(alias="core:datetime", pattern="Z$")
+    frequency_hz: float = Field(0.0, alias="core:frequency")
+    frame: int = Field(-1, alias="apertura:frame")
+
+
+class _Meta(BaseModel):
+    header: _Global = Field(alias="global")
+    captures: list[_Capture] = Field(min_length=1)
 
 
 def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
-    """Open a SigMF recording after checking its metadata, size and hash.
+    """Open a SigMF recording after checking its metadata and size.
 
     Parameters
     ----------
@@ -88,103 +59,75 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
     Raises
     ------
     CampaignError
-        If the metadata break the SigMF schema, the data are truncated, not those hashed, or a capture lies past
-        their end.
+        If the metadata are not SigMF, the data are truncated, or a capture lies past their end.
 
     Notes
     -----
     Source: SigMF specification 1.2, section "Captures Array".
     """
     meta = _read_meta(meta_path)
-    channels = _channels(meta["global"], meta_path)
-    recording = Recording(_map(data_path, len(channels), meta, meta_path), channels, meta, meta_path, data_path)
-    recording.captures()
-    _check_hash(meta["global"], data_path)
-    return recording
-
-
-def cut(recording: Recording, captures: Captures, *, node: str) -> xr.Dataset:
-    """Return the `raw` stage of some captures of a recording.
-
-    Parameters
-    ----------
-    recording
-        From `open_sigmf`.
-    captures
-        Where to cut.
-    node
-        Name of the node that recorded.
-
-    Returns
-    -------
-    xarray.Dataset
-        iq (channel, pulse, sample, component) int16 counts, time (pulse) UTC, frame (pulse).
-
-    Raises
-    ------
-    CampaignError
-        If a capture holds only zeros.
-    """
-    iq = np.stack([recording.samples[start : start + captures.length] for start in captures.starts])
-    _check_alive(iq, recording.channels, recording.data_path)
-    return xr.Dataset(
-        {
-            "iq": (("channel", "pulse", "sample", "component"), np.moveaxis(iq, 2, 0)),
-            "time": ("pulse", captures.time),
-            "frame": ("pulse", captures.frame),
-        },
-        attrs={
-            "node": node,
-            "channels": recording.channels,
-            "sample_rate_hz": recording.sample_rate_hz,
-            "frequency_hz": float(recording.meta["captures"][0].get("core:frequency", 0.0)),
-        },
+    header, captures = meta.header, meta.captures
+    channels = _channels(header, meta_path)
+    samples = _map(data_path, len(channels), captures, meta_path)
+    return Recording(
+        samples=samples,
+        channels=channels,
+        sample_rate_hz=header.sample_rate_hz,
+        frequency_hz=captures[0].frequency_hz,
+        captures=Captures(
+            np.array([capture.start for capture in captures], np.int64),
+            _length(captures, len(samples), meta_path),
+            _times(captures, meta_path),
+            np.array([capture.frame for capture in captures], np.int64),
+        ),
+        framing=header.framing.model_dump() if header.framing and len(captures) == 1 else None,
+        files=(meta_path, data_path),
+        sha512=header.sha512,
     )
 
 
-def _read_meta(path: Path) -> dict[str, Any]:
+def _read_meta(path: Path) -> _Meta:
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-        with warnings.catch_warnings():  # the library warns of extensions that are used but not declared
-            warnings.simplefilter("ignore", DeprecationWarning)
-            validate_schema(meta)
-    except Exception as error:  # the library raises jsonschema's, json's and its own errors
-        reason = str(getattr(error, "message", error)).splitlines()[0]
-        raise CampaignError(f"not valid SigMF: {reason}", path, "SigMF metadata", "Mend it.") from error
-    datatype = meta["global"]["core:datatype"]
-    if datatype != "ci16_le":
-        raise CampaignError(f"core:datatype {datatype}", path, "ci16_le", "Convert the recording.")
-    if "core:sample_rate" not in meta["global"] or not meta["captures"]:
-        raise CampaignError("no core:sample_rate or no captures", path, "both", "One capture segment per trigger.")
-    return dict(meta)
-
-
-def _channels(header: dict[str, Any], path: Path) -> list[str]:
-    count = int(header.get("core:num_channels", 1))
-    names = header.get("apertura:channels", ["radar", "sidelink"][:count])
-    if len(names) != count or "radar" not in names:
+        meta = _Meta.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        given = f", not {first['input']!r}" if isinstance(first["input"], (str, int, float)) and key else ""
         raise CampaignError(
-            f"apertura:channels {names} for core:num_channels {count}",
+            f"not valid SigMF: {f'{key}: ' if key else ''}{first['msg']}{given}",
+            path,
+            "SigMF metadata with one capture segment per trigger, ISO 8601 UTC in the core:datetime of each",
+            "Correct the metadata or record again.",
+        ) from error
+    if meta.header.datatype != _DATATYPE:
+        raise CampaignError(f"core:datatype {meta.header.datatype}", path, _DATATYPE, "Convert the recording.")
+    return meta
+
+
+def _channels(header: _Global, path: Path) -> list[str]:
+    names = ["radar", "sidelink"][: header.num_channels] if header.channels is None else header.channels
+    if len(names) != header.num_channels or "radar" not in names:
+        raise CampaignError(
+            f"apertura:channels {names} for core:num_channels {header.num_channels}",
             path,
             "one name per channel, 'radar' among them",
             "Correct the metadata.",
         )
-    return list(names)
+    return names
 
 
-def _map(path: Path, channels: int, meta: dict[str, Any], meta_path: Path) -> NDArray[np.int16]:
+def _map(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -> NDArray[np.int16]:
     size, frame = path.stat().st_size, channels * _BYTES_PER_SAMPLE
-    last = meta["captures"][-1]["core:sample_start"]
     if size % frame or size == 0:
         raise CampaignError(
-            f"{size} bytes, not a whole number of {channels}-channel samples",
+            f"{size} bytes, not a multiple of {channels}-channel samples",
             path,
             f"a multiple of {frame} bytes",
             "The file is truncated; copy it again.",
         )
-    if last >= size // frame:
+    if captures[-1].start >= size // frame:
         raise CampaignError(
-            f"capture {len(meta['captures']) - 1} starts at sample {last}, the data end at {size // frame}",
+            f"capture {len(captures) - 1} starts at sample {captures[-1].start}, the data end at {size // frame}",
             meta_path,
             f"captures inside {path.name}",
             "The data are truncated or the metadata belong to another file; copy both again.",
@@ -192,9 +135,8 @@ def _map(path: Path, channels: int, meta: dict[str, Any], meta_path: Path) -> ND
     return np.memmap(path, np.dtype("<i2"), "r", shape=(size // frame, channels, 2))
 
 
-def _segments(captures: list[dict[str, Any]], total: int, path: Path) -> tuple[list[int], int]:
-    starts = [int(capture["core:sample_start"]) for capture in captures]
-    lengths = np.diff([*starts, total])
+def _length(captures: list[_Capture], total: int, path: Path) -> int:
+    lengths = np.diff([*(capture.start for capture in captures), total])
     length = int(np.median(lengths))
     short = np.flatnonzero(lengths < length)
     if short.size:
@@ -205,39 +147,13 @@ def _segments(captures: list[dict[str, Any]], total: int, path: Path) -> tuple[l
             f"{length}, as most captures do",
             "The data are truncated (copy them again) or core:sample_start is wrong.",
         )
-    return starts, length
+    return length
 
 
-def _check_hash(header: dict[str, Any], path: Path) -> None:
-    if "core:sha512" not in header:
-        return
-    with path.open("rb") as stream:
-        found = hashlib.file_digest(stream, "sha512").hexdigest()
-    if found != header["core:sha512"]:
-        raise CampaignError(
-            f"sha512 {found[:12]}…",
-            path,
-            f"{header['core:sha512'][:12]}… (core:sha512 of the metadata)",
-            "The data were changed or damaged; copy them again.",
-        )
-
-
-def _check_alive(iq: NDArray[np.int16], channels: list[str], path: Path) -> None:
-    for index, name in enumerate(channels):
-        dead = np.flatnonzero(~iq[:, :, index].any(axis=(1, 2)))
-        if dead.size:
-            raise CampaignError(
-                f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
-                path,
-                "samples",
-                "The receiver or the copy failed; record or copy again, or remove those captures.",
-            )
-
-
-def _times(captures: list[dict[str, Any]], path: Path) -> NDArray[np.datetime64]:
+def _times(captures: list[_Capture], path: Path) -> NDArray[np.datetime64]:
     try:
-        tags = np.array([capture["core:datetime"].removesuffix("Z") for capture in captures], "datetime64[ns]")
-    except (KeyError, ValueError) as error:
+        tags = np.array([capture.datetime.removesuffix("Z") for capture in captures], "datetime64[ns]")
+    except ValueError as error:
         raise CampaignError(
             f"core:datetime: {error}", path, "ISO 8601 UTC on every capture", "Write the time tags."
         ) from error

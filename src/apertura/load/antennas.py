@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.antenna.illumination import Illumination, illuminate
-from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, read_pattern
+from apertura.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, sampled_cut
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
+from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.load.scene import OpenScene
 from apertura.settings import Antenna
 
@@ -44,7 +45,8 @@ def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float6
 
 def _beam(campaign: Campaign, antenna: Antenna, axes: NDArray[np.float64]) -> Beam:
     if antenna.beamwidth_deg is None:
-        cuts = read_pattern(campaign.root / str(antenna.pattern), cutoff_db=antenna.cutoff_db)
+        sampled = read_beam_pattern(campaign.root / str(antenna.pattern))
+        cuts = tuple(sampled_cut(*samples, cutoff_db=antenna.cutoff_db) for samples in sampled)
     else:
         widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
         azimuth, elevation = (

@@ -1,9 +1,6 @@
 """A pair, opened once: from its echo, or before that is formed from what the flight logs promise."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,7 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
-from apertura.ingest import PHASE_HISTORIES, TRACKS
+from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import Flown
 from apertura.settings import OfdmWaveform
@@ -70,7 +67,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = PHASE_HISTORIES[waveform.format](files, pair=pair)
+        echo = read_phase_history(waveform.format, files, pair=pair)
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
@@ -81,10 +78,11 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
     tx, rx = pair.split("-")
     logs = {node: campaign.track_file(flight, node) for node in (tx, rx)}
-    tracks = {node: TRACKS[log.suffix](log, node=node) for node, log in logs.items()}
+    tracks = {node: read_track(log, node=node) for node, log in logs.items()}
     first = max(track.time.values[0] for track in tracks.values())
     last = min(track.time.values[-1] for track in tracks.values())
-    times = _pulse_times(campaign.raw_file(flight, tx, ".sigmf-meta"), first, last, waveform.prf_hz)
+    recorded = open_recording(campaign.recording_files(flight, tx)).captures.time
+    times = _pulse_times(recorded, first, last, waveform.prf_hz)
     places, axes = [], {}
     for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
         track, settings = tracks[node], campaign.settings.nodes[node]
@@ -102,12 +100,11 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     return OpenPair(flight, pair, aperture, frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
 
 
-def _pulse_times(meta: Path, first: np.datetime64, last: np.datetime64, prf_hz: float) -> NDArray[np.datetime64]:
-    """Return the capture times of a recording inside the logs, or a regular series where it has none."""
-    captures: list[Mapping[str, str]] = json.loads(meta.read_text(encoding="utf-8")).get("captures", [])
-    stated = [capture["core:datetime"].removesuffix("Z") for capture in captures if "core:datetime" in capture]
-    times = np.array(stated, "datetime64[ns]")
-    if len(times) < 2:
+def _pulse_times(
+    recorded: NDArray[np.datetime64], first: np.datetime64, last: np.datetime64, prf_hz: float
+) -> NDArray[np.datetime64]:
+    """Return the recorded capture times inside the logs, or a regular series where the recorder ran through."""
+    if len(recorded) < 2:
         count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
-        times = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
-    return times[(times >= first) & (times <= last)]
+        recorded = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
+    return recorded[(recorded >= first) & (recorded <= last)]

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-import zarr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
@@ -19,7 +18,7 @@ from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.dem import COVER_NODES, UncheckedDem
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, GridHeights, Terrain
-from apertura.store import manifest_of, open_stage
+from apertura.store import manifest_of, open_array, open_stage
 
 PATH = Path("results/scene.json")
 
@@ -98,7 +97,7 @@ def open_scene(campaign: Campaign) -> OpenScene:
         return scene
     folder = campaign.stage("terrain")
     stage = open_stage(folder, "terrain")
-    heights = GridHeights(scene.grid, zarr.open_array(folder / "height", mode="r"))
+    heights = GridHeights(scene.grid, open_array(folder, "height", mode="r"))
     return replace(scene, terrain=heights, parents=(stage,))
 
 

@@ -5,11 +5,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
-from rasterio.windows import Window
 
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
@@ -150,6 +148,9 @@ class Dem(Terrain):
             [int(np.clip(np.floor(by(axis)), 0, size - 2)) for axis, size in zip(at, self.shape, strict=True)]
             for by in (np.min, np.max)
         )
+        import rasterio
+        from rasterio.windows import Window
+
         with rasterio.open(self.path) as raster:
             window = Window.from_slices(*((low, high + 2) for low, high in zip(first, last, strict=True)))
             posts = raster.read(1, window=window, masked=True)

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import rasterio
 from pyproj import CRS
 
 from apertura.errors import CampaignError
@@ -62,6 +61,8 @@ def _opened(path: Path) -> Any:
         raise CampaignError(
             "no such file", where=path, expected="the DEM of scene.dem", remedy="Copy it there, or correct scene.dem."
         )
+    import rasterio
+
     try:
         return rasterio.open(path)
     except rasterio.errors.RasterioIOError as error:

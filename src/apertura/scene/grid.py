@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rasterio.crs import CRS
 
 from apertura.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
 from apertura.scene.map_crs import check_crs
@@ -78,6 +77,8 @@ class SceneGrid:
     @property
     def crs_wkt(self) -> str:
         """The CRS of rasters on this grid, as GDAL writes it."""
+        from rasterio.crs import CRS
+
         return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
 
     @property

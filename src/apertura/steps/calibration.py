@@ -11,6 +11,7 @@ from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import frame_from_map
 from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
@@ -47,15 +48,15 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
     path = campaign.root / campaign.calibration_file(asked.flight)
-    found = json.loads(path.read_text(encoding="utf-8"))["pairs"]
-    if pair not in found:
+    offsets = json.loads(path.read_text(encoding="utf-8"))["pairs"]
+    if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",
             where=path,
-            expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(found)}",
+            expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(offsets)}",
             remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
         )
-    return {"flight": asked.flight, **{name: found[pair][name] for name in ("offset_m", "std_m", "inputs", "flags")}}
+    return {"flight": asked.flight, **{name: offsets[pair][name] for name in ("offset_m", "std_m", "inputs", "flags")}}
 
 
 def _asked(campaign: Campaign) -> Calibration:
@@ -71,26 +72,24 @@ def _asked(campaign: Campaign) -> Calibration:
 
 def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: str) -> dict[str, Any]:
     reflector = frame_from_map(campaign.settings.scene.crs, *asked.reflector_m)
-    path_m = np.asarray(
-        sum(np.linalg.norm(echo[name].values - reflector, axis=1) for name in ("tx_position", "rx_position"))
-    )
+    path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
     transfer, frequency = echo.transfer.values, echo.frequency.values
-    found = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=asked.search_m, where=where)
-    history = reflector_history(transfer, frequency, path_m=path_m + found.offset_m)
+    offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=asked.search_m, where=where)
+    history = reflector_history(transfer, frequency, path_m=path_m + offset.offset_m)
     phase = np.unwrap(np.angle(history))
     return {
-        "offset_m": round(echo.attrs["stated_offset_m"] + found.offset_m, 6),
-        "std_m": found.std_m if np.isfinite(found.std_m) else None,
+        "offset_m": round(echo.attrs["stated_offset_m"] + offset.offset_m, 6),
+        "std_m": offset.std_m if np.isfinite(offset.std_m) else None,
         "stated_offset_m": echo.attrs["stated_offset_m"],
-        "contrast_db": round(found.contrast_db, 2),
-        "pulses": found.pulses,
+        "contrast_db": round(offset.contrast_db, 2),
+        "pulses": offset.pulses,
         "coherence_factor": coherence_factor(history),
         "phase_rad": [round(float(value), 4) for value in phase],
         "phase_std_rad": round(float(np.std(phase)), 4),
-        "flags": {**echo.attrs["flags"], **found.flags},
+        "flags": {**echo.attrs["flags"], **offset.flags},
     }
 
 
-def calibration_spec(found: dict[str, Any] | None) -> str:
+def calibration_spec(offset: dict[str, Any] | None) -> str:
     """Return what was taken from a calibration flight as one line for provenance."""
-    return canonical_json({name: found[name] for name in ("flight", "offset_m", "std_m")} if found else None)
+    return canonical_json({name: offset[name] for name in ("flight", "offset_m", "std_m")} if offset else None)

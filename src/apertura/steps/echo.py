@@ -9,130 +9,122 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.association import Association, associate
+from apertura.echo.association import Association
 from apertura.echo.demodulate import remove_path
-from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES
-from apertura.load.recording import Recording, open_recording
+from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
+from apertura.ingest import read_phase_history
+from apertura.load.acquisition import Acquisition, common_pulses, open_acquisition
+from apertura.load.transmitted import read_codes, symbol_samples
 from apertura.provenance import merged, sha256_file
-from apertura.settings import OfdmWaveform, PathOffsets, PhaseHistoryWaveform, Processing
+from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
 from apertura.steps.calibration import calibrated, calibration_spec
 from apertura.steps.stamping import stamped
-from apertura.steps.transfer import Transfer, by_code, by_sidelink
 from apertura.store import save_stage
 
 
 def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/echo.zarr."""
-    tx, rx = pair.split("-")
     waveform = campaign.settings.waveform
     parents: list[xr.Dataset] = []
-    offset = calibrated(campaign, flight, pair)
+    calibration = calibrated(campaign, flight, pair)
     if isinstance(waveform, PhaseHistoryWaveform):
-        files = list(campaign.raw_files(flight, rx).values())
-        dataset = PHASE_HISTORIES[waveform.format](files, pair=pair)
+        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
+        dataset = read_phase_history(waveform.format, files, pair=pair)
     else:
         files = [campaign.root / waveform.codes]
-        codes = _read_codes(files[0], waveform.subcarriers)
-        recordings = {node: open_recording(campaign, flight, node, waveform) for node in {tx, rx}}
-        parents = [stage for node in recordings.values() for stage in (node.raw, node.track)]
-        dataset = _ofdm(recordings[tx], recordings[rx], codes, waveform, campaign.settings.processing, offset)
+        codes = read_codes(files[0], waveform.subcarriers)
+        tx, rx = pair.split("-")
+        nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}
+        parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
+        dataset = _echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
-    if offset:
-        inputs = merged(inputs, offset["inputs"])
-    relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(offset)}
+    if calibration:
+        inputs = merged(inputs, calibration["inputs"])
+    relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     save_stage(stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
 
 
-def _read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
-    try:
-        codes = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise CampaignError(
-            f"not readable ({error})", where=path, expected="a .npy file of code symbols", remedy="Copy it there."
-        ) from error
-    usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
-    if not usable:
-        raise CampaignError(
-            f"{codes.dtype} of shape {codes.shape}, {int((codes == 0).sum())} of them zero",
-            where=path,
-            expected=f"({subcarriers},) complex64 without zeros, as config/config.yaml: waveform.subcarriers",
-            remedy="Use the codes that were transmitted, or correct the waveform.",
-        )
-    return np.asarray(codes, np.complex64)
-
-
-def _pulses(tx: Recording, rx: Recording, prf_hz: float) -> Association:
-    tx_time, rx_time = (node.raw.time.values.astype("datetime64[ns]").astype(np.int64) for node in (tx, rx))
-    return associate(
-        tx_time,
-        rx_time,
-        repetition_interval_s=1 / prf_hz,
-        tx_frame=tx.raw.frame.values,
-        rx_frame=rx.raw.frame.values,
-        where=f"{tx.files} and {rx.files}",
-    )
-
-
-def _ofdm(
-    tx: Recording,
-    rx: Recording,
+def _echo(
+    tx: Acquisition,
+    rx: Acquisition,
     codes: NDArray[np.complex64],
     waveform: OfdmWaveform,
     processing: Processing,
     calibration: dict[str, Any] | None,
 ) -> xr.Dataset:
-    pulses, monostatic = _pulses(tx, rx, waveform.prf_hz), tx.name == rx.name
-    found = (
-        by_code(rx, pulses, codes, waveform) if monostatic else by_sidelink(tx, rx, pulses, codes, waveform, processing)
-    )
-    offset_m = _offset_m(rx.settings.path_offset_m, monostatic=monostatic, calibration=calibration)
-    flags, attrs = {**pulses.flags, **found.flags}, dict(found.report)
-    if calibration:
-        flags |= calibration["flags"]
-        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
-    attrs |= {
+    pulses = common_pulses(tx, rx, prf_hz=waveform.prf_hz)
+    measured, sidelink_m = _transfer(tx, rx, pulses, codes, waveform, processing)
+    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
+    attrs = {
+        "frame": "ecef",
+        "pair": f"{tx.name}-{rx.name}",
+        **measured.report,
         "stated_offset_m": offset_m,
-        "flags": flags,
-        "pulses": {"used": len(found.rx_index), "dropped": len(tx.raw.time) - len(found.rx_index)},
+        "flags": {**pulses.flags, **measured.flags},
+        "pulses": {"used": len(measured.transfer), "dropped": len(tx.raw.time) - len(measured.transfer)},
     }
-    variables = {**_echo_arrays(tx, rx, found, offset_m, waveform), **_axes(tx, rx, found)}
-    return xr.Dataset(variables, attrs={"frame": "ecef", "pair": f"{tx.name}-{rx.name}", **attrs})
-
-
-def _echo_arrays(
-    tx: Recording, rx: Recording, found: Transfer, offset_m: float, waveform: OfdmWaveform
-) -> dict[str, tuple[str | tuple[str, ...], NDArray[Any]]]:
-    frequency = np.asarray(waveform.carrier_hz + rx.waveform.numbers * waveform.subcarrier_spacing_hz, np.float64)
-    beyond_m = offset_m - found.sidelink_m  # path of an echo beyond tx → scene → rx
-    transfer = remove_path(found.transfer, frequency, delay_s=np.asarray(beyond_m / SPEED_OF_LIGHT_M_S))
-    return {
-        "time": ("pulse", tx.raw.time.values[found.tx_index]),
-        "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", found.tx_index)),
-        "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", found.rx_index)),
-        "transfer": (("pulse", "subcarrier"), transfer),
-        "frequency": ("subcarrier", frequency),
-        "reference_delay": ("pulse", np.zeros(len(found.rx_index))),
-        "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
-    }
-
-
-def _axes(tx: Recording, rx: Recording, found: Transfer) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return the body axes of the nodes whose antennas have a beam."""
-    nodes = (
-        ("tx_axes", tx, found.tx_index, tx.settings.antennas.radar_tx),
-        ("rx_axes", rx, found.rx_index, rx.settings.antennas.radar_rx),
-    )
-    return {
-        name: (("pulse", "axis", "body"), node.body_axes(index))
-        for name, node, index, antenna in nodes
-        if antenna is not None
-    }
-
-
-def _offset_m(stated: PathOffsets, *, monostatic: bool, calibration: dict[str, Any] | None) -> float:
     if calibration:
-        return float(calibration["offset_m"])
+        attrs["flags"] |= calibration["flags"]
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    index = pulses.tx_index[measured.kept], pulses.rx_index[measured.kept]
+    beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
+    frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
+    return xr.Dataset(
+        {
+            "time": ("pulse", tx.raw.time.values[index[0]]),
+            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", index[0])),
+            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", index[1])),
+            "transfer": (("pulse", "subcarrier"), remove_path(measured.transfer, frequency, delay_s=delay_s)),
+            "frequency": ("subcarrier", frequency),
+            "reference_delay": ("pulse", np.zeros(len(beyond_m))),
+            "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            **_axes((tx, rx), index),
+        },
+        attrs=attrs,
+    )
+
+
+def _transfer(
+    tx: Acquisition,
+    rx: Acquisition,
+    pulses: Association,
+    codes: NDArray[np.complex64],
+    waveform: OfdmWaveform,
+    processing: Processing,
+) -> tuple[Transfer, NDArray[np.float64]]:
+    """Return what the pulses of a pair measured, and the sidelink's length (m) in those kept; 0 without one."""
+    if tx.name == rx.name:
+        measured = transfer_by_code(rx.captures("radar", pulses.rx_index), codes, rx.numerology)
+        return measured, np.zeros(len(measured.transfer))
+    ends = tx.antenna("sidelink", pulses.tx_index), rx.antenna("sidelink", pulses.rx_index)
+    length_m = np.linalg.norm(ends[0] - ends[1], axis=1)
+    measured = transfer_by_sidelink(
+        {channel: rx.captures(channel, pulses.rx_index) for channel in ("radar", "sidelink")},
+        codes,
+        rx.numerology,
+        symbol_samples=symbol_samples(waveform),
+        sidelink_m=length_m,
+        method=processing.sidelink,
+        accuracy_db=processing.accuracy_db,
+        where=str(rx.files),
+    )
+    return measured, length_m[measured.kept]
+
+
+def _axes(
+    nodes: tuple[Acquisition, Acquisition], index: tuple[NDArray[np.int64], NDArray[np.int64]]
+) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return the body axes of the nodes whose antennas have a beam."""
+    beams = nodes[0].settings.antennas.radar_tx, nodes[1].settings.antennas.radar_rx
+    return {
+        name: (("pulse", "axis", "body"), node.body_axes(pulses))
+        for name, node, pulses, beam in zip(("tx_axes", "rx_axes"), nodes, index, beams, strict=True)
+        if beam is not None
+    }
+
+
+def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:
+    stated = rx.settings.path_offset_m
     return stated.radar if monostatic else stated.radar - stated.sidelink

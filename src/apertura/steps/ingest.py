@@ -1,53 +1,73 @@
-"""Rules of the ingest wing: what a node recorded, as `raw` and `track`."""
+"""Rule `ingest`: what a node recorded in a flight, as `raw` and `track`."""
 
 from pathlib import Path
 
+import xarray as xr
+
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.ingest import TRACKS, cut, open_sigmf
+from apertura.ingest import open_recording, read_track
+from apertura.ingest.recording import Recording
+from apertura.load.transmitted import read_framing, symbol_samples
 from apertura.provenance import sha256_file
+from apertura.settings import OfdmWaveform
 from apertura.steps.stamping import stamped
-from apertura.steps.triggering import triggered
 from apertura.store import save_stage
 
 
-def raw(campaign: Campaign, flight: str, node: str) -> Path:
-    """Write results/<flight>/<node>/raw.zarr from the node's SigMF recording; a continuous one is triggered first."""
-    meta, data = (campaign.raw_file(flight, node, suffix) for suffix in (".sigmf-meta", ".sigmf-data"))
-    recording = open_sigmf(meta, data)
-    files = [meta, data]
-    if recording.framing is None:
-        dataset = cut(recording, recording.captures(), node=node)
-    else:
-        files.append(campaign.root / recording.framing["preamble"])
-        dataset = triggered(recording, campaign, node=node)
-    stamp = stamped(
-        dataset,
-        "raw",
-        modules=[__name__],
-        settings=campaign.relevant("raw") if recording.framing else {},
-        inputs=_hashes(campaign.root, *files),
-    )
-    folder = campaign.stage("raw", flight, node)
-    save_stage(stamp, folder, chunks={"channel": 1, "pulse": 256})
-    return folder
+def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
+    """Write results/<flight>/<node>/raw.zarr and track.zarr from a node's recording and flight log.
 
-
-def track(campaign: Campaign, flight: str, node: str) -> Path:
-    """Write results/<flight>/<node>/track.zarr from the node's flight log."""
+    Raises
+    ------
+    CampaignError
+        If a file is missing, damaged, or not what its format promises.
+    """
     log = campaign.track_file(flight, node)
-    if log.suffix not in TRACKS:
+    track = stamped(read_track(log, node=node), "track", modules=[__name__], inputs=_hashes(campaign, log))
+    recording = open_recording(campaign.recording_files(flight, node))
+    recording.check_hash()
+    files = list(recording.files)
+    if recording.framing is None:
+        dataset, settings = recording.cut(recording.captures, node=node), {}
+    else:
+        dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
+        files.append(campaign.root / recording.framing["preamble"])
+    inputs = _hashes(campaign, *files)
+    raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=inputs)
+    folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
+    save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256})
+    save_stage(track, folders[1])
+    return folders
+
+
+def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
+    from apertura.echo.continuous import trigger_captures
+
+    waveform, described = campaign.settings.waveform, recording.framing or {}
+    if not isinstance(waveform, OfdmWaveform):
+        raise TypeError("a recording of samples needs an OFDM waveform")
+    framing = read_framing(
+        campaign.root / described["preamble"],
+        described,
+        sample_rate_hz=recording.sample_rate_hz,
+        where=recording.files[0],
+    )
+    rate = campaign.settings.processing.false_alarms_per_s
+    channel = "sidelink" if "sidelink" in recording.channels else "radar"
+    samples, length = recording.samples[:, recording.channels.index(channel)], symbol_samples(waveform)
+    captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate)
+    if not captures.start.size:
         raise CampaignError(
-            f"a flight log of kind {log.suffix!r}",
-            where=log,
-            expected=f"one of {sorted(TRACKS)}",
-            remedy="Convert the log, or write a reader for it.",
+            f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",
+            where=recording.files[1],
+            expected=f"preambles of {described['preamble']} in channel {channel}",
+            remedy="Check the preamble file and apertura:framing, or record with more signal.",
         )
-    dataset = TRACKS[log.suffix](log, node=node)
-    folder = campaign.stage("track", flight, node)
-    save_stage(stamped(dataset, "track", modules=[__name__], inputs=_hashes(campaign.root, log)), folder)
-    return folder
+    dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
+    return dataset.assign_attrs(trigger=captures.report)
 
 
-def _hashes(root: Path, *files: Path) -> dict[str, str]:
-    return {path.relative_to(root).as_posix(): sha256_file(path) for path in files}
+def _hashes(campaign: Campaign, *files: Path) -> dict[str, str]:
+    return {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}

@@ -161,9 +161,9 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
         )
 
 
-def open_array(folder: Path, name: str) -> Any:
-    """Return an array of work in progress, a `zarr.Array` to be read and written."""
-    return writable_zarr().open_array(folder / name, mode="r+")
+def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
+    """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
+    return writable_zarr().open_array(folder / name, mode=mode)
 
 
 def writable_zarr() -> Any:

@@ -14,18 +14,9 @@ app = typer.Typer(no_args_is_help=True, help="The paper's claims, and the stabil
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
 PAPER_PARTS = (
-    "parameters",
-    "resolution",
-    "uav_resolution",
-    "coherence",
-    "loss_carrier_phase",
-    "loss_timing",
-    "loss_cfo",
-    "loss_sfo",
-    "loss_localization",
-    "corrected",
-    "clock",
-)
+    "parameters", "resolution", "uav_resolution", "coherence", "loss_carrier_phase", "loss_timing", "loss_cfo",
+    "loss_sfo", "loss_localization", "corrected", "clock",
+)  # fmt: skip
 """Files of rows that make up claims.csv, in its order; `loss_…` for each of `apertura.study.paper.losses.ERRORS`."""
 
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]

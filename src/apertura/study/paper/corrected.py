@@ -3,7 +3,7 @@
 import numpy as np
 
 from apertura.echo.clock import estimate_clock
-from apertura.echo.resampling import Waveform as Symbol
+from apertura.echo.demodulate import Numerology
 from apertura.echo.resampling import correct_clock
 from apertura.echo.sidelink import METHODS, divide
 from apertura.simulation.impairments import Clock, Impairments, Timing, UniformPhase
@@ -74,7 +74,7 @@ def clock_claims(*, pulses: int = 150, ppm: float = CLOCK_PPM, seed: int = 1) ->
     wave = scene.waveform
     clock = Clock.of_ppm(ppm, carrier_hz=wave.carrier_hz, sample_rate_hz=wave.sample_rate_hz)
     captures = _captures(scene, Impairments(clock=clock))
-    symbol = Symbol(
+    symbol = Numerology(
         wave.carrier_hz,
         wave.sample_rate_hz,
         np.arange(len(wave.codes)),

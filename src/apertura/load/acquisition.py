@@ -9,8 +9,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.echo.demodulate import demodulate, subcarrier_numbers
-from apertura.echo.resampling import Waveform
+from apertura.echo.association import Association, associate
+from apertura.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.errors import CampaignError
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.settings import Node, OfdmWaveform
@@ -18,18 +18,36 @@ from apertura.store import open_stage
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What one node recorded in one flight."""
+class Acquisition:
+    """What one node recorded in one flight.
+
+    Attributes
+    ----------
+    name, settings
+        Of the node.
+    raw, track
+        Its stages.
+    files
+        raw/<flight>/<node>, what its files' names begin with.
+    numerology
+        Of the symbol.
+    """
 
     name: str
     raw: xr.Dataset
     track: xr.Dataset
     settings: Node
     files: Path
-    waveform: Waveform
+    numerology: Numerology
 
     def captures(self, channel: str, pulses: NDArray[np.int64]) -> NDArray[np.int16]:
-        """Return the samples of a channel at some pulses, (pulse, sample, 2) int16."""
+        """Return the samples of a channel at some pulses, (pulse, sample, 2) int16.
+
+        Raises
+        ------
+        CampaignError
+            If the channel was not recorded, or captures are shorter than prefix and DFT window.
+        """
         channels = self.raw.attrs["channels"]
         if channel not in channels:
             raise CampaignError(
@@ -39,7 +57,7 @@ class Recording:
                 remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
             )
         iq = self.raw.iq.isel(channel=channels.index(channel)).values[pulses]
-        needed = self.waveform.prefix_samples + self.waveform.dft_samples
+        needed = self.numerology.prefix_samples + self.numerology.dft_samples
         if iq.shape[1] < needed:
             raise CampaignError(
                 f"captures of {iq.shape[1]} samples",
@@ -48,13 +66,6 @@ class Recording:
                 remedy="Correct the waveform in config/config.yaml or record longer captures.",
             )
         return np.asarray(iq)
-
-    def symbols(self, captures: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Return the code symbols of captures, (pulse, subcarrier) complex64."""
-        wave = self.waveform
-        return demodulate(
-            captures, numbers=wave.numbers, prefix_samples=wave.prefix_samples, dft_samples=wave.dft_samples
-        )
 
     def antenna(
         self, name: Literal["radar_tx", "radar_rx", "sidelink"], pulses: NDArray[np.int64]
@@ -82,24 +93,47 @@ class Recording:
         )
 
 
-def open_recording(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Recording:
-    """Return the finished raw and track stages of a node, refusing a recording of another waveform."""
+def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Acquisition:
+    """Return the finished raw and track stages of a node.
+
+    Raises
+    ------
+    CampaignError
+        If it was recorded at another carrier or sample rate than `waveform`.
+    """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     files = Path("raw") / flight / node
-    for key, found in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
+    for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
         asked = getattr(waveform, key)
-        if abs(found - asked) > 1e-9 * asked:
+        if abs(recorded - asked) > 1e-9 * asked:
             raise CampaignError(
-                f"recorded with {key} {found:.6f}",
+                f"recorded with {key} {recorded:.6f}",
                 where=f"{files}.sigmf-meta",
                 expected=f"{asked:.6f}, as config/config.yaml: waveform.{key}",
                 remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
             )
-    sampled = Waveform(
+    return Acquisition(node, raw, track, campaign.settings.nodes[node], files, numerology_of(waveform))
+
+
+def numerology_of(waveform: OfdmWaveform) -> Numerology:
+    """Return how receivers sample a waveform's symbol."""
+    return Numerology(
         waveform.carrier_hz,
         waveform.sample_rate_hz,
         subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is),
         prefix_samples=round(waveform.cyclic_prefix_s * waveform.sample_rate_hz),
         dft_samples=round(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz),
     )
-    return Recording(node, raw, track, campaign.settings.nodes[node], files, sampled)
+
+
+def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:
+    """Return the pulses that a transmitter and a receiver have in common."""
+    tx_time, rx_time = (node.raw.time.values.astype("datetime64[ns]").astype(np.int64) for node in (tx, rx))
+    return associate(
+        tx_time,
+        rx_time,
+        repetition_interval_s=1 / prf_hz,
+        tx_frame=tx.raw.frame.values,
+        rx_frame=rx.raw.frame.values,
+        where=f"{tx.files} and {rx.files}",
+    )
