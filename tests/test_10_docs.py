@@ -59,6 +59,22 @@ def test_every_test_that_a_document_cites_exists(document):
     assert sorted(set(_TEST.findall(text_of(document))) - written) == []
 
 
+@pytest.mark.parametrize(
+    "document", [*ROOT.glob("docs/theory/*.md"), *ROOT.glob("docs/[gt]*.md")], ids=lambda path: path.stem
+)
+def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code(document):
+    files = [
+        ROOT / "config/schema.json",
+        *(ROOT / "native").glob("*.?pp"),
+        *ROOT.glob("src/**/*.py"),
+        *ROOT.glob("tests/*.py"),
+    ]
+    code = set(re.findall(r"\w+", "\n".join(map(text_of, files))))
+    quoted = [name for name in re.findall(r"`([^`\n]+)`", text_of(document)) if not re.search(r"[/*{]|\.\w+$", name)]
+    words = {word for name in quoted for word in re.findall(r"[A-Za-z]\w*", name) if re.search(r"_|[a-z][A-Z]", word)}
+    assert sorted(words - code) == []
+
+
 @parametrized
 def test_every_dotted_name_in_a_document_resolves(document):
     for name in sorted(set(_DOTTED.findall(text_of(document))) - ENTRY_POINTS):

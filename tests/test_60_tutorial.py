@@ -9,6 +9,10 @@ from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
 
+import pytest
+
+from apertura.focus.engines import native
+
 TUTORIAL = Path(__file__).parents[1] / "docs/tutorial.md"
 SHOWN = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
@@ -30,6 +34,7 @@ def run_shell(block):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.skipif(not native.available(), reason="the plan that is shown takes the compiled engine")
 def test_every_block_of_the_tutorial_runs_and_prints_what_it_shows(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
