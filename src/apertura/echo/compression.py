@@ -141,8 +141,8 @@ def compress(
         spectrum = np.zeros((len(here), length // factor), np.complex64)
         for tap in range(filters.taps.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
-        whole = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
-        profiles[part] = whole[:, after % (length // factor)] * filters.response
+        swath = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
+        profiles[part] = swath[:, after % (length // factor)] * filters.response
     return profiles
 
 
