@@ -123,7 +123,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
     profiles
         At least twice oversampled, so that half the band is left for the transition of the filter.
     oversampling
-        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (DESIGN section 5).
+        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (docs/theory/planner.md, "Error").
     """
     factor = max(1, round(oversampling / profiles.oversampling))
     fine = refine(profiles.samples, factor)
