@@ -68,7 +68,7 @@ def beamed(_beamed, tmp_path):
 
 @pytest.fixture
 def even(_even, tmp_path):
-    """Antennas that look everywhere alike."""
+    """Isotropic antennas."""
     return copy_writable(_even, tmp_path / "campaign")
 
 

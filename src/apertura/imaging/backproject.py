@@ -52,7 +52,7 @@ def backproject(
     engine
         'auto' or a key of `apertura.focus.engines.ENGINES`.
     beams
-        Of the antennas; alike in all directions by default.
+        Of the antennas; isotropic by default.
     tile_px
         Side of a tile, which is a chunk of the array; a multiple of 16.
     certified_pixels
