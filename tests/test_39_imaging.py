@@ -94,3 +94,8 @@ def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
     asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-20.0, engine_options={"toy": {"refine": 2}})
     assert asked.attrs["models"]["refine"] == "2: asked for in the config; nearest sample of a refined profile"
+
+
+def test_an_antenna_in_the_ground_is_refused():
+    with pytest.raises(CampaignError, match="in or below the ground of the scene"):
+        ap.backproject(recorded(), grid(), terrain=ap.FlatGround(1e4))

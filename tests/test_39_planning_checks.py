@@ -35,7 +35,7 @@ def test_no_pulses_and_pulses_without_a_place_are_refused():
         plan(aperture=Aperture(lost, straight_track()))
     with pytest.raises(CampaignError, match="zero pulses see the scene"):
         plan(path_limit_m=30.0)
-    assert "places_unseen" in plan(path_limit_m=55.0).flags
+    assert "beyond_cyclic_prefix" in plan(path_limit_m=55.0).flags
 
 
 @pytest.mark.parametrize(("spread", "flagged"), [(0.97, False), (1.03, True)])

@@ -67,7 +67,7 @@ def beamed(_beamed, tmp_path):
 
 @pytest.fixture
 def even(_even, tmp_path):
-    """Antennas without beams."""
+    """Isotropic antennas."""
     return copy_writable(_even, tmp_path / "campaign")
 
 

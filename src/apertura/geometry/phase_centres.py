@@ -53,7 +53,8 @@ def phase_centres(
 
     Notes
     -----
-    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED.
+    Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
+    (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
     centres = _spline(track_time, position)(_seconds(at - track_time[0]))
