@@ -98,4 +98,4 @@ def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
 
 def test_an_antenna_in_the_ground_is_refused():
     with pytest.raises(CampaignError, match="in or below the ground of the scene"):
-        ap.backproject(recorded(), grid(), terrain=ap.FlatGround(1e4))
+        ap.backproject(point_history(), TARGET_GRID, terrain=ap.FlatGround(1e4))
