@@ -55,12 +55,20 @@ def range_step(frequency_hz: NDArray[np.float64], *, oversampling: float) -> tup
     oversampling
         At least this many samples per resolution cell c/B.
 
+    Raises
+    ------
+    ValueError
+        If there is but one frequency, or they do not ascend in equal steps: a hundredth of one is let pass.
+
     Examples
     --------
     >>> range_step(1e9 + 1e6 * np.arange(100), oversampling=2)
     (1.49896229, 200)
     """
-    spacing = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
+    steps = np.diff(frequency_hz)
+    spacing = float(steps.mean()) if len(steps) else 0.0
+    if not (spacing > 0 and (np.abs(steps - spacing) <= 0.01 * spacing).all()):
+        raise ValueError(f"{len(frequency_hz)} frequencies: must be two or more that ascend in equal steps")
     length = fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
     return SPEED_OF_LIGHT_M_S / (spacing * length), length
 

@@ -35,6 +35,11 @@ class SceneGrid:
     name
         What GIS software shows for a local frame.
 
+    Raises
+    ------
+    ValueError
+        If the spacing or a side is not positive, or a corner is not finite.
+
     Examples
     --------
     >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60))
@@ -51,6 +56,13 @@ class SceneGrid:
     shape: tuple[int, int]
     first: tuple[int, int] = (0, 0)
     name: str = LOCAL
+
+    def __post_init__(self) -> None:
+        if not (0 < self.spacing_m < np.inf and np.isfinite([self.west_m, self.north_m]).all() and min(self.shape) > 0):
+            raise ValueError(
+                f"{self.west_m=}, {self.north_m=}, {self.spacing_m=}, {self.shape=}: must be finite, the spacing and "
+                "both sides positive"
+            )
 
     @classmethod
     def from_bounds(
