@@ -389,6 +389,22 @@ def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
     assert len(read_table(tmp_path / "parts" / "parameters.csv", Claim)) > 10
 
 
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("paper-part", "loss_x"), "loss_timing"),
+        (("paper-figure", "x"), "carrier_phase"),
+        (("stability-sweep", "x", "divide"), "missed_triggers"),
+        (("stability-sweep", "timing", "x"), "two_parameter"),
+        (("stability-chart", "x"), "missed_triggers"),
+    ],
+)
+def test_a_job_of_the_study_that_does_not_exist_is_told_those_that_do(arguments, named):
+    error = CliRunner().invoke(commands.app, arguments).exception
+    assert isinstance(error, CampaignError)
+    assert named in str(error)
+
+
 def test_a_localization_error_moves_antennas_and_not_the_logs():
     wrong = Impairments(localization=Localization(0.02))
     scene = reduced_scene(pulses=150, subcarriers=128, rx_ahead_m=4.7)

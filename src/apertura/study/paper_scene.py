@@ -94,10 +94,8 @@ class Disturbance:
 
     Attributes
     ----------
-    receiver
-        Impairments of the receiving node.
-    transmitter
-        Of the transmitting node; None: one node does both.
+    receiver, transmitter
+        Impairments of the two nodes.
     sampled
         Go through samples (clock errors, Doppler, the converter) instead of transfer functions.
     quantised
@@ -105,13 +103,12 @@ class Disturbance:
     """
 
     receiver: Impairments = NO_IMPAIRMENTS
-    transmitter: Impairments | None = None
+    transmitter: Impairments = NO_IMPAIRMENTS
     sampled: bool = False
     quantised: bool = False
 
 
 UNDISTURBED = Disturbance()
-UNDISTURBED_PAIR = Disturbance(transmitter=NO_IMPAIRMENTS)
 
 
 def receive_pair(
@@ -122,7 +119,7 @@ def receive_pair(
     Examples
     --------
     >>> scene = reduced_scene(pulses=4, subcarriers=128, rx_ahead_m=4.7)
-    >>> radar, sidelink, _ = receive_pair(scene, UNDISTURBED_PAIR, np.random.default_rng(0))
+    >>> radar, sidelink, _ = receive_pair(scene, UNDISTURBED, np.random.default_rng(0))
     >>> radar.shape, sidelink.shape
     ((4, 128), (4, 128))
     """

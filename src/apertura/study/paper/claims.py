@@ -51,15 +51,13 @@ def compare(
     Parameters
     ----------
     claim, computed, unit, paper, independent_model
-        As in `Claim`; one of the last two.
+        Columns of `Claim`; one of the last two.
     within
         Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`.
     style
         Format of `computed`.
-    agreement
-        Verdict where the difference is small enough.
-    note
-        Appended to the verdict.
+    agreement, note
+        Verdict where the difference is small enough, and what is appended to any.
 
     Raises
     ------
@@ -93,12 +91,10 @@ def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, st
 
     Parameters
     ----------
-    claim, computed, unit
-        As in `Claim`.
+    claim, computed, unit, style, note
+        As for `compare`.
     limit, met
         What the project requires, in words, and whether `computed` meets it.
-    style, note
-        As in `compare`.
 
     Examples
     --------

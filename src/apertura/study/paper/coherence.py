@@ -23,13 +23,6 @@ def coherence_claims(*, draws: int = DRAWS, seed: int = 1) -> list[Claim]:
 
     The SNR of the corrected ones is the closed form of the paper's value, so they check only that the simulator, the
     division and the closed form are consistent.
-
-    Parameters
-    ----------
-    draws
-        Over which the factors are averaged.
-    seed
-        Of everything random.
     """
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9))
     uncorrected = [_factors(clocks, np.random.default_rng([seed, draw]))[0] for draw in range(draws)]
@@ -79,7 +72,7 @@ def _static() -> PaperScene:
 def _factors(impairments: Impairments, generator: np.random.Generator) -> tuple[float, float]:
     """Return the coherence factor at the reflector without and with division by the sidelink."""
     scene = _static()
-    radar, sidelink, _ = receive_pair(scene, Disturbance(impairments, Impairments()), generator)
+    radar, sidelink, _ = receive_pair(scene, Disturbance(impairments), generator)
     histories = phase_history(scene, radar), divided_history(scene, divide(radar, sidelink))
     before, after = (float(coherence_factors(one, scene.scatterers.position_m)[0]) for one in histories)
     return before, after

@@ -12,7 +12,7 @@ from apertura.study.dft_window import demodulated
 from apertura.study.paper.claims import Claim, require
 from apertura.study.paper_scene import (
     RX_AHEAD_M,
-    UNDISTURBED_PAIR,
+    UNDISTURBED,
     Complexes,
     Disturbance,
     PaperScene,
@@ -39,8 +39,8 @@ def corrected_claims(*, seed: int = 1) -> list[Claim]:
     """Return what carrier phase and timing cost after each sidelink correction, as large as the prefix allows."""
     scene = reduced_scene(pulses=150, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=2e-6))
-    disturbed = Disturbance(clocks, Impairments(), sampled=True)
-    clean, direct, _ = receive_pair(scene, UNDISTURBED_PAIR, np.random.default_rng(seed))
+    disturbed = Disturbance(clocks, sampled=True)
+    clean, direct, _ = receive_pair(scene, UNDISTURBED, np.random.default_rng(seed))
     radar, sidelink, _ = receive_pair(scene, disturbed, np.random.default_rng(seed))
     ideal = _peaks(scene, divide(clean, direct))
     rows = []
@@ -59,17 +59,7 @@ def _peaks(scene: PaperScene, corrected: Complexes) -> Floats:
 
 
 def clock_claims(*, pulses: int = 150, ppm: float = CLOCK_PPM, seed: int = 1) -> list[Claim]:
-    """Return the floor that one clock leaves in the divided image, without and with correction in the samples.
-
-    Parameters
-    ----------
-    pulses
-        Over the aperture.
-    ppm
-        By which the receiver's clock is fast.
-    seed
-        Of the random pixels.
-    """
+    """Return the floor that a clock fast by `ppm` leaves in the divided image, without and with correction."""
     scene = reduced_scene(pulses=pulses, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     wave = scene.waveform
     clock = Clock.of_ppm(ppm, carrier_hz=wave.carrier_hz, sample_rate_hz=wave.sample_rate_hz)
@@ -97,7 +87,7 @@ def clock_claims(*, pulses: int = 150, ppm: float = CLOCK_PPM, seed: int = 1) ->
 
 
 def _captures(scene: PaperScene, receiver: Impairments) -> list[Complexes]:
-    _, _, observation = receive_pair(scene, Disturbance(receiver, Impairments()), np.random.default_rng(0))
+    _, _, observation = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
     return [samples(observation.channels[name], None).astype(np.complex64) for name in ("radar", "sidelink")]
 
 

@@ -33,10 +33,7 @@ SEPARATION_M = 4.7
 def simulated_table(*, pulses: int = 600) -> list[Claim]:
     """Return ground-range and cross-range widths of the five targets beside an independent model and closed forms.
 
-    Parameters
-    ----------
-    pulses
-        Of the 3000; widths do not change from 150 on.
+    Of the paper's 3000 pulses as few as 150 do not change the widths.
     """
     scene = reduced_scene(pulses=pulses, subcarriers=256)
     targets = scene.scatterers.position_m
@@ -60,13 +57,7 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
 
 
 def uav_table(*, pulses: int = 200) -> list[Claim]:
-    """Return the widths of the UAV flight with a Hann window, mono and fused.
-
-    Parameters
-    ----------
-    pulses
-        Per segment.
-    """
+    """Return the widths of the UAV flight with a Hann window, mono and fused, from `pulses` per segment."""
     scene = reduced_scene(pulses=pulses, subcarriers=512)
     ground_m, slant_m = UAV_TARGET_M[0, 1], float(np.hypot(UAV_TARGET_M[0, 1], UAV_HEIGHT_M))
     closed_m = ground_range_resolution_m(_bandwidth_hz(scene), ground_m, UAV_HEIGHT_M, half_power=HALF_POWER_OF_HANN)

@@ -63,16 +63,9 @@ class Outcome:
 
 
 def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcome]:
-    """Yield the outcome at each size of one impairment under one correction.
+    """Yield the outcome at each size of one impairment of `SWEEPS` under one correction of `CHOICES`.
 
-    Parameters
-    ----------
-    impairment
-        A key of `SWEEPS`.
-    method
-        One of `CHOICES`.
-    seed
-        Draws depend on it and on their number alone: every method and size meets the same random numbers.
+    Draws depend on the seed and on their number alone: every method and size meets the same random numbers.
     """
     sweep = SWEEPS[impairment]
     for size in sweep.sizes:
@@ -157,7 +150,7 @@ def correct(
     radar, sidelink
         (pulse, subcarrier) complex64.
     recorded
-        (pulse,) bool, which pulses the receiver recorded.
+        (pulse,) bool.
     """
     if method == "none":
         return recorded, radar[recorded], "none"

@@ -43,10 +43,8 @@ class Sweep:
         For charts.
     sizes
         From negligible to destructive.
-    receiver
-        Size → what replaces fields of `ORDINARY` in the receiving node.
-    transmitter
-        Size → what is wrong with the transmitting node.
+    receiver, transmitter
+        Size → the fields of `Impairments` that it sets in the receiving node, and all of the transmitting one's.
     subcarriers
         1024 where the band matters, 4096 where the SNR or the spacing of the subcarriers does.
     sampled, quantised
@@ -72,9 +70,9 @@ class Sweep:
     moving: bool = False
     tagged: bool = False
 
-    def disturbance(self, size: float) -> Disturbance:
-        """Return what goes wrong at one size."""
-        receiver = replace(ORDINARY, **self.receiver(size))  # type: ignore[arg-type]
+    def disturbance(self, size: float, *, besides: Impairments = ORDINARY) -> Disturbance:
+        """Return what goes wrong at one size, and `besides` in the receiving node."""
+        receiver = replace(besides, **self.receiver(size))  # type: ignore[arg-type]
         return Disturbance(receiver, self.transmitter(size), self.sampled, self.quantised)
 
     def flown(self, size: float) -> PaperScene:
