@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
+from apertura.errors import CampaignError
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.observation import observe
 from apertura.simulation.synthesis import samples
