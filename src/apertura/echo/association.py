@@ -69,7 +69,7 @@ def associate(
     Parameters
     ----------
     tx_time_ns, rx_time_ns
-        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any origin common to both.
+        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any common origin.
     repetition_interval_s
         Nominal time between pulses, seconds.
     tx_frame, rx_frame
@@ -79,10 +79,6 @@ def associate(
         a counter ever steps back.
     where
         What to call the recordings in errors.
-
-    Returns
-    -------
-    Association
 
     Raises
     ------
@@ -118,8 +114,7 @@ def associate(
         raise _nothing_in_common(tags, repetition_interval_s, where)
     line = fit_pairs(tags, pairs, interval_ns)
     association = Association(
-        tx_index=pairs[0],
-        rx_index=pairs[1],
+        *pairs,
         offset_s=line.offset_ns * 1e-9,
         drift_ppm=line.drift * 1e6,
         residual_s=float(np.sqrt(np.mean(residual_ns(tags, pairs, line) ** 2))) * 1e-9,
@@ -142,10 +137,9 @@ def detect_wrong_association(
 
     Parameters
     ----------
-    sidelink_path_m
-        (pulse,) float64, measured delay of the sidelink times c, metres; NaN where it did not lock.
-    predicted_path_m
-        (pulse,) float64, distance between the antennas of the sidelink for the same pulses, metres.
+    sidelink_path_m, predicted_path_m
+        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
+        between its antennas.
     tolerance_m
         Largest movement that positions alone may explain, metres.
     window
@@ -185,13 +179,9 @@ def detect_wrong_association(
 def _require_ascending(tags: Integers, node: str, where: str) -> None:
     back = np.flatnonzero(np.diff(tags) <= 0)
     if back.size or tags.size == 0:
+        found = f"time tag of pulse {back[0] + 1} of the {node} steps back" if tags.size else f"no pulses of the {node}"
         raise CampaignError(
-            f"no pulses of the {node}"
-            if not tags.size
-            else f"time tag of pulse {back[0] + 1} of the {node} steps back",
-            where=where,
-            expected="time tags that ascend",
-            remedy="Check core:datetime of the capture segments.",
+            found, where, expected="time tags that ascend", remedy="Check core:datetime of the capture segments."
         )
 
 

@@ -73,17 +73,7 @@ class Framing:
         return float(waveform.baseband_hz[len(waveform.codes) // 2])
 
     def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:
-        """Return the preamble and payload as sent, at baseband.
-
-        Parameters
-        ----------
-        waveform
-            Gives sampling rate, band centre and power.
-        frame
-            Number before it wraps.
-        time_s
-            (...,) float64, seconds after the start of the cyclic prefix (negative).
-        """
+        """Return preamble and payload of a frame at baseband, (...,) seconds after the cyclic prefix starts."""
         chips = np.concatenate([self.preamble(), self.payload(frame)])
         rate = waveform.sample_rate_hz
         # a millionth of a sample is rounding, not an earlier chip
@@ -126,14 +116,10 @@ def continuous_blocks(
         Of one node; their `start_s` matters at the first pulse only.
     time_s
         (pulse,) float64, times of the pulses.
-    adc
-        Converter; its full scale is set as for captures.
     generator
         Draws the noise.
-    framing
-        What goes before each symbol; None: nothing.
-    first_frame
-        Number of the first pulse.
+    framing, first_frame
+        What goes before each symbol, counted from where; None: nothing.
     block_samples
         How many samples of noise alone to make at a time.
 

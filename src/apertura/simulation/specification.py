@@ -215,17 +215,7 @@ def _plain(value: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class DrawnCampaign:
-    """A specification with its code symbols and trajectories drawn.
-
-    Attributes
-    ----------
-    specification
-        What it was drawn from.
-    waveform
-        What is transmitted.
-    trajectories
-        (flight, node) → how the node flies.
-    """
+    """A specification with its code symbols and trajectories, (flight, node) → how the node flies, drawn."""
 
     specification: CampaignSpecification
     waveform: TransmitWaveform

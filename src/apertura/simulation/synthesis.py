@@ -28,10 +28,6 @@ class Channel:
 
     Attributes
     ----------
-    waveform
-        What is transmitted.
-    paths
-        (pulse, path) delays and amplitudes.
     response
         (subcarrier,) complex128, ripple of transmitter and receiver.
     phase_rad
@@ -104,14 +100,10 @@ def samples(
 
     Parameters
     ----------
-    channel
-        What is received.
     generator
         Draws the noise, pulse after pulse; None: without noise.
-    pulses
-        Which captures.
-    count
-        Samples per capture; prefix and symbol if None.
+    pulses, count
+        Which captures, and samples of each; prefix and symbol if None.
 
     Notes
     -----

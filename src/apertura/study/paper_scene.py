@@ -26,16 +26,9 @@ RX_AHEAD_M = 4.7
 
 @dataclass(frozen=True)
 class PaperScene:
-    """What is transmitted, over which targets, from where.
+    """What is transmitted, over which targets, from where as the logs say.
 
-    Attributes
-    ----------
-    waveform
-        The paper's, with as many subcarriers over the same band as the question needs.
-    scatterers
-        Targets on the ground, in local Cartesian metres: along the track, across it, up.
-    geometry
-        Phase centres as the logs say.
+    In local Cartesian metres: along the track, across it, up.
     """
 
     waveform: TransmitWaveform
@@ -94,8 +87,6 @@ class Disturbance:
 
     Attributes
     ----------
-    receiver, transmitter
-        Impairments of the two nodes.
     sampled
         Go through samples (clock errors, Doppler, the converter) instead of transfer functions.
     quantised

@@ -35,8 +35,6 @@ def phase_history(
 
     Parameters
     ----------
-    scene
-        Where the logs say the antennas are.
     transfer
         (pulse, subcarrier) complex64 of the kept pulses, of the total path tx → target → rx.
     pulses
@@ -148,7 +146,7 @@ def error_floor_db(values: Complexes, ideal: Complexes, peaks: Floats) -> float:
     values, ideal
         Complex64 of one shape: the image and the undisturbed one.
     peaks
-        (target,) float64, magnitudes of the image's peaks.
+        (target,) float64, magnitudes.
     """
     gain = np.vdot(ideal, values) / np.vdot(ideal, ideal).real
     return float(amplitude_db(np.sqrt(np.mean(np.abs(values - gain * ideal) ** 2)) / peaks.mean()))

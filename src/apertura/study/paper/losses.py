@@ -37,15 +37,11 @@ class UncorrectedError:
     sweep
         The impairment; here it comes alone.
     independent_model_db
-        Size → mean peak loss of an independent model, dB.
+        Size → mean peak loss of an independent model, dB; `within_db` of it agrees.
     pulses
         That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
-    subcarriers, rx_ahead_m
-        As in `reduced_scene`.
     draws
         Over which the loss is averaged; 1 where nothing is random.
-    within_db
-        Largest difference that agrees.
     divided
         Whether the sidelink is divided out (and its length is as wrong as the positions).
     reach_m

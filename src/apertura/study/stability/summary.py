@@ -29,14 +29,10 @@ class Tolerance:
 
     Attributes
     ----------
-    impairment, unit, method
-        What was tried.
     size_at_1_db, size_at_3_db
         Interpolated; NaN where the peaks never get that wrong, too low or too high.
     first_size, last_size
         Between which sizes it was tried.
-    draws, seed
-        As `Outcome`.
     """
 
     impairment: str
