@@ -14,6 +14,11 @@ from apertura.errors import CampaignError
 LARGEST_JITTER = 1 / 6
 """RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
 
+EXPLAINED_M = 0.05
+"""Movement of a sidelink that errors of the logged positions alone may explain."""
+
+_MEDIAN_PULSES = 15  # of the running median that tells movement from jitter, an odd number
+
 NEAR_HALF = 0.4
 """Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
 
@@ -126,13 +131,11 @@ def associate(
     return replace(association, flags=_flags(association, repetition_interval_s, conflicts))
 
 
-def detect_wrong_association(
-    sidelink_path_m: Floats, predicted_path_m: Floats, *, tolerance_m: float = 0.05, window: int = 15
-) -> str | None:
+def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) -> str | None:
     """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
 
     A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
-    `tolerance_m` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
+    `EXPLAINED_M` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
     somebody else's positions.
 
     Parameters
@@ -140,10 +143,6 @@ def detect_wrong_association(
     sidelink_path_m, predicted_path_m
         (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
         between its antennas.
-    tolerance_m
-        Largest movement that positions alone may explain, metres.
-    window
-        Pulses of the running median that tells movement from jitter, an odd number.
 
     Notes
     -----
@@ -159,16 +158,16 @@ def detect_wrong_association(
     'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
     """
     pulse = np.flatnonzero(np.isfinite(sidelink_path_m) & np.isfinite(predicted_path_m))
-    if pulse.size < 2 * window:
+    if pulse.size < 2 * _MEDIAN_PULSES:
         return None
     residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
-    padded = np.pad(residual, window // 2, mode="edge")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1)
+    padded = np.pad(residual, _MEDIAN_PULSES // 2, mode="edge")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, _MEDIAN_PULSES), axis=1)
     smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
     jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
-    noise = 1.2533 * jitter / np.sqrt(window)  # standard deviation of a median of `window` Gaussian samples
+    noise = 1.2533 * jitter / np.sqrt(_MEDIAN_PULSES)  # standard deviation of a median of so many Gaussian samples
     worst = int(np.argmax(np.abs(smooth)))
-    if abs(smooth[worst]) <= max(tolerance_m, 5 * noise):
+    if abs(smooth[worst]) <= max(EXPLAINED_M, 5 * noise):
         return None
     return (
         f"sidelink leaves its geometry by {abs(smooth[worst]):.2f} m at pulse {pulse[worst]} (noise {noise:.3f} m): "

@@ -49,10 +49,8 @@ class Recording:
         As the recorder was triggered; one, of all samples, if it ran through.
     framing
         What was sent before each symbol, where the recorder ran through; else None.
-    files
-        Metadata and samples, for messages and hashes.
-    sha512
-        Of the file of samples as the recorder stated it.
+    files, sha512
+        Metadata and samples, and the hash of the samples as the recorder stated it.
     """
 
     samples: NDArray[np.int16]

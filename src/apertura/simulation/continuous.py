@@ -38,9 +38,7 @@ class Framing:
     register_bits: int = Field(
         default=10, ge=2, le=20, description="length k of the shift register: 2^k - 1 chips of preamble"
     )
-    chip_samples: int = Field(
-        default=4, ge=1, description="samples per chip; the sampling rate over it must fit the band"
-    )
+    chip_samples: int = Field(default=4, ge=1, description="samples per chip; the rate of chips must fit the band")
     counter_bits: int = Field(default=16, ge=1, description="width of the frame counter; it wraps at 2^counter_bits")
     bit_chips: int = Field(default=15, ge=1, description="chips per payload bit, all of one sign: +1 for a one")
     guard_samples: int = Field(default=256, ge=0, description="silence before the prefix, longer than the longest echo")
@@ -116,8 +114,6 @@ def continuous_blocks(
         Of one node; their `start_s` matters at the first pulse only.
     time_s
         (pulse,) float64, times of the pulses.
-    generator
-        Draws the noise.
     framing, first_frame
         What goes before each symbol, counted from where; None: nothing.
     block_samples

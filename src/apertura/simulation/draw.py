@@ -10,15 +10,7 @@ import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
-from apertura.simulation.impairments import (
-    Blockage,
-    Floats,
-    Impairments,
-    Localization,
-    PhaseWalk,
-    Timing,
-    UniformPhase,
-)
+from apertura.simulation.impairments import Blockage, Floats, Impairments, Localization, PhaseWalk, Timing, UniformPhase
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from apertura.simulation.recording import Geometry, receive
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
 from apertura.simulation.synthesis import Channel
-from apertura.simulation.trajectory import body_turn, phase_centre, phase_centre_velocity
+from apertura.simulation.trajectory import body_turn, logged_velocity, phase_centre
 
 _Node = tuple[Impairments, ImpairmentDraw]
 
@@ -79,7 +79,7 @@ def _logged(campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str) -> 
         return phase_centre(origin, campaign.trajectories[flight.name, name], time_s, arm)
 
     def velocity(name: str) -> Floats:
-        return phase_centre_velocity(origin, campaign.trajectories[flight.name, name], time_s)
+        return logged_velocity(origin, campaign.trajectories[flight.name, name], time_s)
 
     sender = flight.transmitter
     return Geometry(
@@ -128,8 +128,6 @@ def observe(
         What is transmitted; its repetition frequency gives the times.
     scatterers, logged
         The scene, and where the logs say the antennas are, in one frame; localization errors move the true ones.
-    generator
-        Everything random.
     receiver, transmitter
         What is wrong with each node. No transmitter: it is the receiver, with one position error.
     sidelink

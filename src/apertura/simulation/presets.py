@@ -8,7 +8,7 @@ import numpy as np
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments, Leakage, TimeTag, Timing, UniformPhase
 from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.recording import Geometry
+from apertura.simulation.recording import Geometry, straight_pair
 from apertura.simulation.scene import Origin, PointTarget, Scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
@@ -151,7 +151,7 @@ def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     return replace(_PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
 
 
-def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
+def paper_scene(*, pulses: int = 3000, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
     """Return the paper's simulated scene as arrays: five targets, straight track at 10 m, antennas at one place.
 
     Both are in local Cartesian metres: cross-range (along the track, centred on zero), ground range, up. The receiver
@@ -169,7 +169,4 @@ def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float
     """
     cross_ground = np.array(_PAPER_TARGETS)
     scatterers = Scatterers(np.column_stack([cross_ground, np.zeros(5)]), np.ones(5, np.complex128))
-    along = np.linspace(-length_m / 2, length_m / 2, pulses)
-    sender = np.column_stack([along, np.zeros(pulses), np.full(pulses, 10.0)])
-    receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
-    return scatterers, Geometry(sender, receiver, sender, receiver)
+    return scatterers, straight_pair(np.linspace(-15.0, 15.0, pulses), 10.0, rx_ahead_m=rx_ahead_m)

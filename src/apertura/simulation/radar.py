@@ -141,9 +141,7 @@ def echo_paths(
     Parameters
     ----------
     tx_position_m, rx_position_m
-        (pulse, 3) float64, phase centres in the frame of the scatterers, metres.
-    scatterers
-        Points in the same Cartesian frame.
+        (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
     path_offset_m
         Electrical path of the receiving channel beyond geometry, metres.
     tx_velocity_m_s, rx_velocity_m_s

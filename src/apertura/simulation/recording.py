@@ -40,6 +40,13 @@ class Geometry:
     gain: Floats | float = 1.0
 
 
+def straight_pair(along_m: Floats, height_m: float, *, rx_ahead_m: float = 0.0) -> Geometry:
+    """Return two nodes with their antennas at one place each, above the first axis at (pulse,) places along it."""
+    sender = np.column_stack([along_m, np.zeros(len(along_m)), np.full(len(along_m), height_m)])
+    receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
+    return Geometry(sender, receiver, sender, receiver)
+
+
 def receive(
     waveform: TransmitWaveform,
     scatterers: Scatterers,
@@ -57,10 +64,8 @@ def receive(
     ----------
     scatterers, geometry
         The scene, and where the antennas truly are.
-    impairments, draw
-        What is wrong with the receiving node, and what was drawn of it.
-    transmitter
-        What is wrong with the transmitting node: its ripple.
+    impairments, draw, transmitter
+        What is wrong with the receiving node, what was drawn of it, and what is wrong with the transmitting one.
     path_offset_m
         Electrical path beyond geometry per channel, metres; zero where missing.
     sidelink

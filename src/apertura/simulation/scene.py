@@ -128,9 +128,7 @@ class Clutter:
 
     bounds_m: tuple[float, float, float, float] = Field(description="east min, north min, east max, north max, m")
     reflectivity: float = Field(ge=0, description="mean power per square metre; 1: one unit point target per m²")
-    density_per_m2: float = Field(
-        default=10.0, gt=0, description="points per m²; several per resolution cell look like ground"
-    )
+    density_per_m2: float = Field(default=10.0, gt=0, description="points per m²; several per cell look like ground")
     up_m: float = Field(default=0.0, description="height above the origin, m")
     kind: Literal["clutter"] = Field(default="clutter", kw_only=True, repr=False)
 

@@ -39,9 +39,7 @@ class WaveformSpecification:
     carrier_is: Literal["band_start", "band_centre"] = Field(
         default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
     )
-    code: Literal["qpsk", "newman"] = Field(
-        default="qpsk", description="code symbols: random QPSK, or Newman's flat symbol"
-    )
+    code: Literal["qpsk", "newman"] = Field(default="qpsk", description="random QPSK, or Newman's flat symbol")
 
     @model_validator(mode="after")
     def _dft_fits(self) -> Self:

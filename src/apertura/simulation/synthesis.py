@@ -72,18 +72,16 @@ def path_spectrum(waveform: TransmitWaveform, delay_s: Floats, amplitude: Comple
     return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
 
 
-def transfer_functions(
-    channel: Channel, generator: Generator | None, pulses: slice | NDArray[np.intp] = slice(None)
-) -> Complex:
+def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
     """Return (pulse, subcarrier) transfer functions as an ideal demodulator would measure them, without samples.
 
     Equal to the DFT of `samples` divided by the code while clocks run true, nothing moves within the pulse and
     all echoes stay inside the prefix; many times faster. Without generator, without noise.
     """
-    waveform, paths = channel.waveform, channel.paths.at(pulses)
-    early = paths.delay_s - channel.start_s[pulses, None]
+    waveform, paths = channel.waveform, channel.paths
+    early = paths.delay_s - channel.start_s[:, None]
     transfer = path_spectrum(waveform, early, paths.amplitude) * channel.response
-    transfer *= np.exp(1j * channel.phase_rad[pulses, None])
+    transfer *= np.exp(1j * channel.phase_rad[:, None])
     if generator is not None and channel.noise_variance:
         transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
     return np.asarray(transfer)

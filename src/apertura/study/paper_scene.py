@@ -36,11 +36,6 @@ class PaperScene:
     geometry: Geometry
 
     @property
-    def frequency_hz(self) -> NDArray[np.float64]:
-        """(subcarrier,) float64, RF."""
-        return self.waveform.frequency_hz
-
-    @property
     def sidelink_m(self) -> NDArray[np.float64]:
         """(pulse,) float64, length of the direct path as the logs say."""
         return np.asarray(np.linalg.norm(self.geometry.sidelink_tx - self.geometry.sidelink_rx, axis=1))
@@ -68,14 +63,14 @@ def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qps
     Examples
     --------
     >>> scene = reduced_scene(pulses=300, subcarriers=128)
-    >>> float(scene.waveform.prf_hz), float(scene.frequency_hz[-1] - scene.frequency_hz[0])
-    (10.0, 406400000.0)
+    >>> float(scene.waveform.prf_hz), len(scene.waveform.codes) * scene.waveform.subcarrier_spacing_hz
+    (10.0, 409600000.0)
     """
     waveform = paper_waveform(prf_hz=pulses / LENGTH_M)
     every = len(waveform.codes) // subcarriers
     codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else newman_codes(subcarriers)
     waveform = replace(waveform, codes=codes, subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz)
-    return PaperScene(waveform, *paper_scene(pulses=pulses, length_m=LENGTH_M, rx_ahead_m=rx_ahead_m))
+    return PaperScene(waveform, *paper_scene(pulses=pulses, rx_ahead_m=rx_ahead_m))
 
 
 NO_IMPAIRMENTS = Impairments()

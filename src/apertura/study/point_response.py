@@ -43,7 +43,7 @@ def phase_history(
         Key of `apertura.echo.compression.WINDOWS`.
     """
     kept = slice(None) if pulses is None else pulses
-    frequency_hz, geometry = scene.frequency_hz, scene.geometry
+    frequency_hz, geometry = scene.waveform.frequency_hz, scene.geometry
     weight = window_weights(window, len(frequency_hz))
     aperture = Aperture(geometry.radar_tx[kept], geometry.radar_rx[kept])
     return PhaseHistory(transfer, frequency_hz, weight, np.zeros(len(transfer)), aperture)
@@ -53,7 +53,7 @@ def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[n
     """Return the `phase_history` of total paths less that of the sidelink, whose logged length is put back."""
     kept = slice(None) if pulses is None else pulses
     delay_s = -scene.sidelink_m[kept] / SPEED_OF_LIGHT_M_S
-    return phase_history(scene, remove_path(transfer, scene.frequency_hz, delay_s=delay_s), pulses=pulses)
+    return phase_history(scene, remove_path(transfer, scene.waveform.frequency_hz, delay_s=delay_s), pulses=pulses)
 
 
 def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:
@@ -86,10 +86,10 @@ def pixels_around(centre_m: Floats, along_m: Floats, across_m: Floats) -> Floats
     return np.asarray(centre_m + np.stack([along, across, np.zeros_like(along)], axis=-1))
 
 
-def random_pixels(generator: Generator, count: int = 256) -> Floats:
-    """Return (1, count, 3) float64 pixels between the five targets, uniformly distributed."""
-    along_m, across_m = generator.uniform(-6, 6, count), generator.uniform(5, 25, count)
-    return np.column_stack([along_m, across_m, np.zeros(count)])[None]
+def random_pixels(generator: Generator) -> Floats:
+    """Return (1, 256, 3) float64 pixels between the five targets, uniformly distributed."""
+    along_m, across_m = generator.uniform(-6, 6, 256), generator.uniform(5, 25, 256)
+    return np.column_stack([along_m, across_m, np.zeros(256)])[None]
 
 
 def mean_image(tables: numba.Tables, pixels_m: Floats) -> Complexes:

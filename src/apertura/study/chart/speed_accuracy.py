@@ -47,8 +47,6 @@ class Part:
         (pixel, 2) int64, rows and columns in the window whose exact values are known.
     exact
         (pixel,) complex128.
-    total_pixels
-        Of the whole image.
     reference_seconds
         What the exact values took.
     """

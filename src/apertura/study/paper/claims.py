@@ -9,17 +9,11 @@ class Claim:
 
     Attributes
     ----------
-    claim
-        What is claimed, in words.
     paper
         Value that the source paper prints; empty where it prints none.
     independent_model
         Value of a model that shares no code with this project, or of a closed form; empty where the paper's stands.
         Both are empty for requirements that this project sets itself.
-    computed
-        Value of this project.
-    unit
-        Of all three.
     verdict
         How `computed` compares with what is given, and a note where the paper contradicts itself. It begins with
         "consistency check" where something was fitted to the expected value, so that agreeing proves little.

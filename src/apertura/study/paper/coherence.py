@@ -6,7 +6,7 @@ import numpy as np
 
 from apertura.echo.sidelink import divide
 from apertura.simulation.impairments import Impairments, Timing, UniformPhase
-from apertura.simulation.recording import Geometry
+from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare
 from apertura.study.paper.formulas import snr_of_coherence_factor
@@ -63,10 +63,8 @@ def coherence_claims(*, draws: int = DRAWS, seed: int = 1) -> list[Claim]:
 def _static() -> PaperScene:
     """Return a recording that does not move: one reflector 15 m away, receiver 4.7 m beside the transmitter."""
     scene = reduced_scene(pulses=PULSES, subcarriers=128)
-    sender = np.tile([0.0, 0.0, 4.8], (PULSES, 1))
-    receiver = sender + [RX_AHEAD_M, 0.0, 0.0]
     target = Scatterers(np.array([[2.35, 14.0, 0.0]]), np.ones(1, np.complex128))
-    return replace(scene, scatterers=target, geometry=Geometry(sender, receiver, sender, receiver))
+    return replace(scene, scatterers=target, geometry=straight_pair(np.zeros(PULSES), 4.8, rx_ahead_m=RX_AHEAD_M))
 
 
 def _factors(impairments: Impairments, generator: np.random.Generator) -> tuple[float, float]:

@@ -28,8 +28,6 @@ class Outcome:
 
     Attributes
     ----------
-    impairment, unit, size, method
-        What was tried.
     loss_db, loss_spread_db
         Loss of the five peaks against the undisturbed scene, and its standard deviation over the draws.
     coherence_factor
@@ -42,8 +40,6 @@ class Outcome:
         Mean share of the pulses that were imaged.
     chosen
         Method that was applied in most draws; `refused` where none locks.
-    draws, seed
-        How often, from which seed.
     """
 
     impairment: str
