@@ -35,11 +35,6 @@ class PaperScene:
     scatterers: Scatterers
     geometry: Geometry
 
-    @property
-    def sidelink_m(self) -> NDArray[np.float64]:
-        """(pulse,) float64, length of the direct path as the logs say."""
-        return np.asarray(np.linalg.norm(self.geometry.sidelink_tx - self.geometry.sidelink_rx, axis=1))
-
 
 def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qpsk: bool = False) -> PaperScene:
     """Return the paper's simulated scene with fewer pulses and subcarriers over the same 30 m at 1 m/s and band.

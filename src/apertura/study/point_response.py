@@ -29,14 +29,21 @@ _REFINEMENTS = 4
 
 
 def phase_history(
-    scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None, window: str = "none"
+    scene: PaperScene,
+    transfer: Complexes,
+    *,
+    divided: bool = False,
+    pulses: NDArray[np.bool_] | None = None,
+    window: str = "none",
 ) -> PhaseHistory:
-    """Return transfer functions of total paths with the phase centres of the scene's logs.
+    """Return transfer functions of total paths tx → target → rx with the phase centres of the scene's logs.
 
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64 of the kept pulses, of the total path tx → target → rx.
+        (pulse, subcarrier) complex64 of the kept pulses.
+    divided
+        Whether the path of the sidelink, whose logged length is put back, was taken off that of the echoes.
     pulses
         (pulse,) bool, which of the scene's are kept; None: all.
     window
@@ -44,16 +51,12 @@ def phase_history(
     """
     kept = slice(None) if pulses is None else pulses
     frequency_hz, geometry = scene.waveform.frequency_hz, scene.geometry
+    if divided:
+        sidelink_m = np.linalg.norm(geometry.sidelink_tx - geometry.sidelink_rx, axis=1)[kept]
+        transfer = remove_path(transfer, frequency_hz, delay_s=-sidelink_m / SPEED_OF_LIGHT_M_S)
     weight = window_weights(window, len(frequency_hz))
     aperture = Aperture(geometry.radar_tx[kept], geometry.radar_rx[kept])
     return PhaseHistory(transfer, frequency_hz, weight, np.zeros(len(transfer)), aperture)
-
-
-def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None) -> PhaseHistory:
-    """Return the `phase_history` of total paths less that of the sidelink, whose logged length is put back."""
-    kept = slice(None) if pulses is None else pulses
-    delay_s = -scene.sidelink_m[kept] / SPEED_OF_LIGHT_M_S
-    return phase_history(scene, remove_path(transfer, scene.waveform.frequency_hz, delay_s=delay_s), pulses=pulses)
 
 
 def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:

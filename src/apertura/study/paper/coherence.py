@@ -11,7 +11,7 @@ from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare
 from apertura.study.paper.formulas import snr_of_coherence_factor
 from apertura.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
-from apertura.study.point_response import coherence_factors, divided_history, phase_history
+from apertura.study.point_response import coherence_factors, phase_history
 
 PULSES = 200
 CORRECTED = (0.986, 0.9999, 0.9995)
@@ -71,6 +71,6 @@ def _factors(impairments: Impairments, generator: np.random.Generator) -> tuple[
     """Return the coherence factor at the reflector without and with division by the sidelink."""
     scene = _static()
     radar, sidelink, _ = receive_pair(scene, Disturbance(impairments), generator)
-    histories = phase_history(scene, radar), divided_history(scene, divide(radar, sidelink))
+    histories = phase_history(scene, radar), phase_history(scene, divide(radar, sidelink), divided=True)
     before, after = (float(coherence_factors(one, scene.scatterers.position_m)[0]) for one in histories)
     return before, after

@@ -22,10 +22,10 @@ from apertura.study.paper_scene import (
 from apertura.study.point_response import (
     Floats,
     amplitude_db,
-    divided_history,
     error_floor_db,
     find_peaks,
     mean_image,
+    phase_history,
     random_pixels,
     range_tables,
 )
@@ -55,7 +55,7 @@ def corrected_claims(*, seed: int = 1) -> list[Claim]:
 
 def _peaks(scene: PaperScene, corrected: Complexes) -> Floats:
     targets = scene.scatterers.position_m
-    return find_peaks(range_tables(divided_history(scene, corrected), targets), targets)[1]
+    return find_peaks(range_tables(phase_history(scene, corrected, divided=True), targets), targets)[1]
 
 
 def clock_claims(*, pulses: int = 150) -> list[Claim]:
@@ -99,5 +99,5 @@ def _image(scene: PaperScene, captures: list[Complexes]) -> tuple[Complexes, Flo
     window = slice(scene.waveform.prefix_samples, scene.waveform.prefix_samples + scene.waveform.dft_samples)
     radar, sidelink = (demodulated(capture[:, window], scene.waveform) for capture in captures)
     targets = scene.scatterers.position_m
-    tables = range_tables(divided_history(scene, divide(radar, sidelink)), targets)
+    tables = range_tables(phase_history(scene, divide(radar, sidelink), divided=True), targets)
     return mean_image(tables, random_pixels(np.random.default_rng(1))), find_peaks(tables, targets)[1]

@@ -125,9 +125,7 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
 
 def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
     """Return what is focused: the radar alone, or divided by the sidelink."""
-    if divided:
-        return point_response.divided_history(scene, divide(radar, sidelink))
-    return point_response.phase_history(scene, radar)
+    return point_response.phase_history(scene, divide(radar, sidelink) if divided else radar, divided=divided)
 
 
 @lru_cache(maxsize=2)

@@ -122,8 +122,7 @@ def _draw(
     kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
     if not kept.any():
         return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
-    history_of = point_response.phase_history if chosen == "none" else point_response.divided_history
-    history = history_of(logged, transfer, pulses=kept)
+    history = point_response.phase_history(logged, transfer, divided=chosen != "none", pulses=kept)
     return _measured(history, ideal, float(kept.mean()), flown.scatterers.position_m), chosen
 
 
