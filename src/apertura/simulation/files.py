@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import pulse_samples
+from apertura.simulation.impairments import Floats
 from apertura.simulation.observation import Observation
-from apertura.simulation.radar import Floats
 from apertura.simulation.recording import full_scale
 from apertura.simulation.scene import Origin, PointTarget, Target, scatterers
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight

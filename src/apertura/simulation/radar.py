@@ -8,9 +8,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.simulation.impairments import Floats
 from apertura.simulation.scene import Scatterers
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS
+from apertura.simulation.impairments import STRICT_KEYS, Floats
 
 Vector = tuple[float, float, float]
-Floats = NDArray[np.float64]
 
 _NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

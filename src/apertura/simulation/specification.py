@@ -16,8 +16,8 @@ from pydantic.fields import FieldInfo
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
-from apertura.simulation.radar import Floats, TransmitWaveform, newman_codes, qpsk_codes
+from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Floats, Impairments, RadarPoint
+from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
 from apertura.validation import read_yaml, validated

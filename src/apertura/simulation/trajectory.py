@@ -6,15 +6,12 @@ from typing import Annotated, Literal, Protocol, Self
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from apertura.geometry.geodesy import body_axes, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS
+from apertura.simulation.impairments import STRICT_KEYS, Floats
 from apertura.simulation.scene import Origin, Vector
-
-Floats = NDArray[np.float64]
 
 
 class Trajectory(Protocol):

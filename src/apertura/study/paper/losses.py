@@ -46,8 +46,6 @@ class UncorrectedError:
         Whether the sidelink is divided out (and its length is as wrong as the positions).
     reach_m
         How far peaks are looked for.
-    note
-        Appended to each verdict.
     """
 
     sweep: Sweep
