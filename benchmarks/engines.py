@@ -1,7 +1,7 @@
 """Times every engine on one job in one interleaved run: `make bench`, or `python benchmarks/engines.py`.
 
 Seconds are the median over rounds of the process's CPU time, since other work on the machine stretches the wall
-clock; rounds visit all contestants in turn, so that a slow minute hits all alike. Two threads count the CPU time of
+clock; rounds visit all contestants in turn, so that a slow minute hits each of them. Two threads count the CPU time of
 the busier one, which is the wall clock of an idle machine. Tables are a row of their own; fastsar compresses within
 its call, so its own compression is timed too and taken off. Prints a table and writes benchmarks/latest.json.
 """
@@ -66,20 +66,20 @@ class Contestant:
 def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
     """Return the compiled engine in each instruction set and geometry."""
     flat = jobs["bistatic"]
-    found = [
+    contestants = [
         Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
         for isa in filter(native_binding.runs, native.INSTRUCTION_SETS)
     ]
-    fast, linear = found[0].isa, {"oversampling": 10, "degree": 1}
-    found += [
+    fast, linear = contestants[0].isa, {"oversampling": 10, "degree": 1}
+    contestants += [
         Contestant(f"native {fast}", name, former(job), job, isa=fast) for name, job in jobs.items() if job is not flat
     ]
-    found.append(Contestant(f"native {fast}, lines 10x", "bistatic", former(flat, **linear), flat, isa=fast))
-    found.append(compression_contestant(flat))
-    found.append(Contestant("tables", "bistatic", lambda: native.prepare(flat.profiles), isa=fast))
+    contestants.append(Contestant(f"native {fast}, lines 10x", "bistatic", former(flat, **linear), flat, isa=fast))
+    contestants.append(compression_contestant(flat))
+    contestants.append(Contestant("tables", "bistatic", lambda: native.prepare(flat.profiles), isa=fast))
     pair = TwoThreads(flat)
-    found.append(Contestant(f"native {fast}, two threads", "bistatic", pair, flat, pair.clock, isa=fast))
-    return found
+    contestants.append(Contestant(f"native {fast}, two threads", "bistatic", pair, flat, pair.clock, isa=fast))
+    return contestants
 
 
 def compression_contestant(job: Job) -> Contestant:
@@ -138,13 +138,13 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
     tx, rx, mean, middle = centred(job)
     history, points = spectra(job, 2 * mean), job.pixels - middle
     points_less = Contestant("fastsar compression", "bistatic", compression(bp, history, 8), every=4)
-    found = [points_less]
+    contestants = [points_less]
 
     def form_points() -> np.ndarray:
         options = {"rcv": rx, "ref": mean, "backend": "cpu", "window": False}
         return fastsar.backproject(history, tx, fmin_hz, SPACING_HZ, points, **options)
 
-    found.append(Contestant("fastsar backproject", "bistatic", form_points, job, every=4, less=points_less))
+    contestants.append(Contestant("fastsar backproject", "bistatic", form_points, job, every=4, less=points_less))
     antenna, _, distance, origin = centred(mono)
     echoes, (rows, columns) = spectra(mono, 2 * distance), mono.pixels.shape[:2]
     centre = mono.pixels[rows // 2, columns // 2] - origin
@@ -152,7 +152,7 @@ def fastsar_contestants(job: Job, mono: Job) -> list[Contestant]:
     exact = fastsar.ExactFormer(antenna, fmin_hz, SPACING_HZ, SUBCARRIERS, columns, rows, 0.05, 0.05, **options)
     former_less = Contestant("fastsar compression", "monostatic", compression(bp, echoes, 8), every=4)
     cubic = Contestant("fastsar exact cubic", "monostatic", lambda: exact(echoes).T, mono, every=2, less=former_less)
-    return [*found, former_less, cubic]
+    return [*contestants, former_less, cubic]
 
 
 def centred(job: Job) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -176,12 +176,12 @@ def compression(bp: Any, history: np.ndarray, upsample: int) -> Callable[[], Non
 def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
     """Return what was measured, one dict per contestant."""
     best = contestants[0].median()
-    found = []
+    table = []
     for one in contestants:
         seconds = one.median()
         cores = 2 if isinstance(one.run, TwoThreads) else 1
         work = None if one.job is None else one.job.pixels[..., 0].size * len(one.job.profiles.samples) / cores
-        found.append(
+        table.append(
             {
                 "name": one.name,
                 "geometry": one.geometry,
@@ -192,7 +192,7 @@ def rows(contestants: list[Contestant]) -> list[dict[str, object]]:
                 "rounds": len(one.seconds),
             }
         )
-    return found
+    return table
 
 
 def main() -> None:

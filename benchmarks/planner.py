@@ -1,6 +1,6 @@
 """The planner against exhaustive search: 30 random campaigns, every setting timed and measured.
 
-A setting counts where its measured error meets the accuracy asked. Each campaign's plan, thinning included, and the
+A setting counts where its measured error meets the accuracy asked. Each campaign's plan, presum included, and the
 five fastest settings that count are timed again in turn; the ratio is of medians of CPU seconds. Where the plan's
 setting misses the accuracy, the next better one's seconds are added to its own, until it is met.
 """

@@ -88,7 +88,7 @@ def main() -> None:
     grid = SceneGrid("EPSG:32632", 5e5, 5.3e6, SPACING_M, (asked.size, asked.size))
     history = profiles(grid, asked.pulses)
     spent, alone = image_seconds(history, grid, blocks=asked.blocks, threads=asked.threads)
-    found = {
+    measured = {
         "pixels": asked.size**2,
         "pulses": asked.pulses,
         "threads": asked.threads,
@@ -98,8 +98,8 @@ def main() -> None:
         "pixel_pulses_per_s_per_core": float(f"{asked.size**2 * asked.pulses / spent / asked.threads:.3g}"),
         "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
     }
-    print(json.dumps(found, indent=1))
-    Path(__file__).with_name("size.json").write_text(json.dumps(found, indent=1) + "\n")
+    print(json.dumps(measured, indent=1))
+    Path(__file__).with_name("size.json").write_text(json.dumps(measured, indent=1) + "\n")
 
 
 if __name__ == "__main__":

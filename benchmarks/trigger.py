@@ -17,8 +17,8 @@ SYMBOL = 16000
 
 
 def search(blocks: list[np.ndarray], false_alarms_per_s: float = 1e-2) -> int:
-    found = find_preambles(blocks, FRAMING, symbol_samples=SYMBOL, false_alarms_per_s=false_alarms_per_s)
-    return sum(1 for _ in found)
+    detections = find_preambles(blocks, FRAMING, symbol_samples=SYMBOL, false_alarms_per_s=false_alarms_per_s)
+    return sum(1 for _ in detections)
 
 
 def throughput_gb_min(samples: int = 2**25) -> float:
@@ -42,8 +42,8 @@ def detection_probability(snr_db: float, trials: int = 200) -> float:
         sent = keyed * np.exp(2j * np.pi * (FRAMING.centre_hz / RATE_HZ * (sample - start) + rng.random()))
         iq = 100 * 10 ** (snr_db / 20) * sent + (rng.normal(size=(2, spacing)).T @ [1, 1j]) * 100 / np.sqrt(2)
         block = np.stack([iq.real, iq.imag], -1).round().astype(np.int16)
-        found = find_preambles([block], FRAMING, symbol_samples=SYMBOL, false_alarms_per_s=1e-2)
-        hits += any(abs(detection.sample - start) < length / 100 for detection in found)
+        detections = find_preambles([block], FRAMING, symbol_samples=SYMBOL, false_alarms_per_s=1e-2)
+        hits += any(abs(detection.sample - start) < length / 100 for detection in detections)
     return hits / trials
 
 

@@ -1,16 +1,12 @@
 """Shared campaigns: the real ones beside the repository, and small simulated ones made once a session."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from folders import SHARED, copy_writable, run_steps
 
-from apertura.campaign import Campaign
+from apertura.focus.engines import ENGINES, native, native_binding
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
@@ -19,13 +15,6 @@ def shared():
     if not SHARED.is_dir():
         pytest.skip("real recordings are not here: no ../shared/data beside the repository")
     return SHARED
-
-
-def copy_writable(source: Path, target: Path) -> Path:
-    shutil.copytree(source, target, copy_function=shutil.copyfile)
-    for folder in [target, *(path for path in target.rglob("*") if path.is_dir())]:
-        folder.chmod(0o755)
-    return target
 
 
 @pytest.fixture(scope="session")
@@ -40,36 +29,6 @@ def tiny(_tiny, tmp_path):
     return copy_writable(_tiny, tmp_path / "campaign")
 
 
-def ground(campaign: Campaign) -> None:
-    scene.scene(campaign)
-    if campaign.settings.scene.dem:
-        terrain.terrain(campaign)
-
-
-def run_steps(root: Path, *, exports: bool = True) -> Campaign:
-    """Run every step of a campaign in this process, as the workflow would."""
-    campaign = Campaign.load(root)
-    for flight in campaign.image_flights:
-        if campaign.settings.waveform.kind == "ofdm":
-            for node in flight.nodes:
-                ingest.ingest(campaign, flight.name, node)
-        for pair in flight.pairs:
-            echo.echo(campaign, flight.name, pair)
-    ground(campaign)
-    for flight in campaign.image_flights:
-        for pair in flight.pairs:
-            profile.profile(campaign, flight.name, pair)
-            image.image(campaign, flight.name, pair, threads=2)
-            if exports:
-                export.export(campaign, flight.name, pair)
-    cube.cube(campaign)
-    if exports:
-        layers.layers(campaign, threads=2)
-        for flight in campaign.image_flights:
-            export.export_fused(campaign, flight.name)
-    return campaign
-
-
 @pytest.fixture(scope="session")
 def finished_tiny(_tiny, tmp_path_factory):
     """The tiny campaign with all its results; read only."""
@@ -80,3 +39,18 @@ def finished_tiny(_tiny, tmp_path_factory):
 def finished_sample(shared, tmp_path_factory):
     """The independently made campaign-sample with all its results; read only."""
     return run_steps(copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign"))
+
+
+@pytest.fixture(params=native.INSTRUCTION_SETS)
+def isa(request, monkeypatch):
+    """Each instruction set of the compiled engine that this machine runs, in turn."""
+    if not native_binding.runs(request.param):
+        pytest.skip(f"this machine has no {request.param}")
+    monkeypatch.setenv("APERTURA_ISA", request.param)
+    return request.param
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """The engine of `toy_engine.py`, known by its one row."""
+    monkeypatch.setitem(ENGINES, "toy", "toy_engine")

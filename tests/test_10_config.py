@@ -80,7 +80,7 @@ def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
 
 
 def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
-    """A wing that saw the whole config would rerun for nothing."""
+    """A step that depended on the complete config would rerun for nothing."""
     everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}
     for stage in ("echo", "profile", "image", "scene"):
         assert set(finished_tiny.relevant(stage, "uav1-uav2")) < everything

@@ -21,8 +21,8 @@ def fly(rng, pulses=400, interval_s=0.05, *, offset_s=0.0, jitter_s=0.0, drift_p
     return (np.sort((t * NS).astype(np.int64)) + 1_747_000_000 * NS for t in tags), (tx, rx)
 
 
-def share_right(found, numbers):
-    return np.mean(numbers[0][found.tx_index] == numbers[1][found.rx_index])
+def share_right(pairs, numbers):
+    return np.mean(numbers[0][pairs.tx_index] == numbers[1][pairs.rx_index])
 
 
 @pytest.mark.parametrize("offset_s", [-0.019, -0.004, 0.0, 0.003, 0.019])
@@ -30,14 +30,14 @@ def share_right(found, numbers):
 def test_pulses_missed_on_both_sides_leave_every_pair_right(offset_s, jitter_s):
     rng = np.random.default_rng(1)
     (tx, rx), numbers = fly(rng, offset_s=offset_s, jitter_s=jitter_s, missed=0.2, tx_missed=0.1)
-    found = associate(tx, rx, repetition_interval_s=0.05)
+    pairs = associate(tx, rx, repetition_interval_s=0.05)
     common = np.intersect1d(*numbers).size
-    assert share_right(found, numbers) == 1.0
-    assert found.tx_index.size == common
-    assert (found.tx_dropped, found.rx_dropped) == (tx.size - common, rx.size - common)
-    assert found.offset_s == pytest.approx(offset_s, abs=0.0012)
-    assert found.method == "time tags"
-    assert found.flags == {}
+    assert share_right(pairs, numbers) == 1.0
+    assert pairs.tx_index.size == common
+    assert (pairs.tx_dropped, pairs.rx_dropped) == (tx.size - common, rx.size - common)
+    assert pairs.offset_s == pytest.approx(offset_s, abs=0.0012)
+    assert pairs.method == "time tags"
+    assert pairs.flags == {}
 
 
 @pytest.mark.parametrize("drift_ppm", [-100.0, 35.0, 100.0])
@@ -52,49 +52,49 @@ def test_tags_that_drift_past_a_whole_interval_are_followed(drift_ppm):
         missed=0.1,
         tx_missed=0.05,
     )
-    found = associate(tx, rx, repetition_interval_s=0.01)
+    pairs = associate(tx, rx, repetition_interval_s=0.01)
     assert abs(drift_ppm) * 1e-6 * 400 > 0.01  # the tags do pass an interval
-    assert share_right(found, numbers) == 1.0
-    assert found.drift_ppm == pytest.approx(drift_ppm, abs=2)
+    assert share_right(pairs, numbers) == 1.0
+    assert pairs.drift_ppm == pytest.approx(drift_ppm, abs=2)
 
 
 def test_a_long_gap_in_either_recording_is_bridged():
     (tx, rx), numbers = fly(np.random.default_rng(3), 1000, offset_s=0.01, jitter_s=0.002)
     keep_tx, keep_rx = np.r_[0:200, 420:1000], np.r_[0:500, 760:1000]
-    found = associate(tx[keep_tx], rx[keep_rx], repetition_interval_s=0.05)
-    assert share_right(found, (numbers[0][keep_tx], numbers[1][keep_rx])) == 1.0
-    assert found.tx_index.size == 200 + 80 + 240
+    pairs = associate(tx[keep_tx], rx[keep_rx], repetition_interval_s=0.05)
+    assert share_right(pairs, (numbers[0][keep_tx], numbers[1][keep_rx])) == 1.0
+    assert pairs.tx_index.size == 200 + 80 + 240
 
 
 def test_a_receiver_that_starts_late_is_paired_from_its_first_pulse():
     (tx, rx), _ = fly(np.random.default_rng(4), 300, offset_s=-0.015)
-    found = associate(tx, rx[250:], repetition_interval_s=0.05)
-    assert found.tx_index[0] == 250
-    assert found.tx_index.size == 50
+    pairs = associate(tx, rx[250:], repetition_interval_s=0.05)
+    assert pairs.tx_index[0] == 250
+    assert pairs.tx_index.size == 50
 
 
 @pytest.mark.parametrize(("offset_s", "flagged"), [(0.0195, False), (0.0205, True), (-0.0195, False), (-0.0205, True)])
 def test_an_offset_near_half_an_interval_is_flagged(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), offset_s=offset_s)
-    found = associate(tx, rx, repetition_interval_s=0.05)
-    assert ("association_ambiguous" in found.flags) == flagged
+    pairs = associate(tx, rx, repetition_interval_s=0.05)
+    assert ("association_ambiguous" in pairs.flags) == flagged
 
 
 @pytest.mark.parametrize(("jitter_s", "flagged"), [(0.0008, False), (0.0015, True)])
 def test_tags_too_rough_for_the_interval_are_flagged(jitter_s, flagged):
     (tx, rx), numbers = fly(np.random.default_rng(6), interval_s=0.01, jitter_s=jitter_s, missed=0.05)
-    found = associate(tx, rx, repetition_interval_s=0.01)
-    assert ("time_tag_jitter" in found.flags) == flagged
-    assert (share_right(found, numbers) == 1.0) or flagged
+    pairs = associate(tx, rx, repetition_interval_s=0.01)
+    assert ("time_tag_jitter" in pairs.flags) == flagged
+    assert (share_right(pairs, numbers) == 1.0) or flagged
 
 
 @pytest.mark.parametrize(("common", "flagged"), [(200, False), (199, True)])
 def test_recordings_with_little_in_common_are_flagged(common, flagged):
     tx = np.arange(400) * (NS // 20)
     rx = tx + (400 - common) * (NS // 20)
-    found = associate(tx, rx, repetition_interval_s=0.05)
-    assert found.tx_index.size == common
-    assert ("association_sparse" in found.flags) == flagged
+    pairs = associate(tx, rx, repetition_interval_s=0.05)
+    assert pairs.tx_index.size == common
+    assert ("association_sparse" in pairs.flags) == flagged
 
 
 def test_recordings_of_different_flights_are_refused_with_how_far_apart_they_are():
@@ -113,31 +113,31 @@ def test_a_tag_that_steps_back_is_named():
 def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_turn(offset_s):
     (tx, rx), numbers = fly(np.random.default_rng(9), 1500, offset_s=offset_s, jitter_s=0.003, missed=0.2)
     frames = [(n + 40) % 64 for n in numbers]
-    found = associate(tx, rx, repetition_interval_s=0.05, tx_frame=frames[0], rx_frame=frames[1])
-    assert found.method == "frame counter"
-    assert share_right(found, numbers) == 1.0
-    assert found.tx_index.size == rx.size
-    assert ("time_tags_apart" in found.flags) == (offset_s > 0.025)
+    pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=frames[0], rx_frame=frames[1])
+    assert pairs.method == "frame counter"
+    assert share_right(pairs, numbers) == 1.0
+    assert pairs.tx_index.size == rx.size
+    assert ("time_tags_apart" in pairs.flags) == (offset_s > 0.025)
 
 
 def test_a_gap_of_several_turns_of_the_counter_is_bridged():
     (tx, rx), numbers = fly(np.random.default_rng(10), 2000, jitter_s=0.003)
     keep = np.r_[0:100, 1234:2000]
-    found = associate(
+    pairs = associate(
         tx, rx[keep], repetition_interval_s=0.05, tx_frame=numbers[0] % 256, rx_frame=numbers[1][keep] % 256
     )
-    assert share_right(found, (numbers[0], numbers[1][keep])) == 1.0
-    assert found.tx_index.size == keep.size
+    assert share_right(pairs, (numbers[0], numbers[1][keep])) == 1.0
+    assert pairs.tx_index.size == keep.size
 
 
 def test_pulses_whose_number_was_not_read_are_paired_by_their_tags():
     rng = np.random.default_rng(11)
     (tx, rx), numbers = fly(rng, 500, offset_s=0.02, jitter_s=0.002, missed=0.1)
     frame = np.where(rng.random(rx.size) < 0.3, -1, numbers[1])
-    found = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame)
-    assert found.method == "frame counter"
-    assert found.rx_dropped == 0
-    assert share_right(found, numbers) == 1.0
+    pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame)
+    assert pairs.method == "frame counter"
+    assert pairs.rx_dropped == 0
+    assert share_right(pairs, numbers) == 1.0
 
 
 def test_a_misread_number_is_dropped_and_flagged():
@@ -145,15 +145,15 @@ def test_a_misread_number_is_dropped_and_flagged():
     frame = numbers[1].copy()
     frame[150] = 42  # a pulse of seven seconds before
     frame[42] = -1
-    found = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame, frame_modulus=1024)
-    assert share_right(found, numbers) == 1.0
-    assert found.flags["frame_counter_conflict"].startswith("1 pulses dropped")
+    pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame, frame_modulus=1024)
+    assert share_right(pairs, numbers) == 1.0
+    assert pairs.flags["frame_counter_conflict"].startswith("1 pulses dropped")
 
 
 def test_without_any_read_number_the_tags_decide():
     (tx, rx), numbers = fly(np.random.default_rng(13), 50)
-    found = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=np.full(rx.size, -1))
-    assert found.method == "time tags"
+    pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=np.full(rx.size, -1))
+    assert pairs.method == "time tags"
 
 
 def sidelink_of_a_flight(rng, wrong_from, lag, jitter_m=0.03):

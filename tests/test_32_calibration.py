@@ -33,12 +33,12 @@ def fly(rng, *, offset_m=1.374, snr_db=3.0, level=1.0, clutter=0.0, wobble_m=0.0
 
 
 @pytest.mark.parametrize("offset_m", [-4.2, 0.0, 1.374, 9.5])
-def test_the_path_offset_of_a_node_is_found_to_a_millimetre(offset_m):
+def test_the_path_offset_of_a_node_is_estimated_to_a_millimetre(offset_m):
     transfer, predicted = fly(np.random.default_rng(1), offset_m=offset_m, snr_db=20)
-    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
-    assert found.offset_m == pytest.approx(offset_m, abs=0.002)
-    assert found.std_m < 0.001
-    assert found.flags == {}
+    estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert estimate.offset_m == pytest.approx(offset_m, abs=0.002)
+    assert estimate.std_m < 0.001
+    assert estimate.flags == {}
 
 
 @pytest.mark.parametrize(("snr_db", "clutter", "wobble_m"), [(-15, 0.0, 0.0), (10, 0.05, 0.0), (10, 0.0, 0.01)])
@@ -56,8 +56,8 @@ def test_the_stated_deviation_is_the_one_over_many_flights(snr_db, clutter, wobb
 
 def test_clutter_as_strong_in_sum_as_the_reflector_does_not_move_it():
     transfer, predicted = fly(np.random.default_rng(3), clutter=0.1)
-    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
-    assert found.offset_m == pytest.approx(1.374, abs=0.03)
+    estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert estimate.offset_m == pytest.approx(1.374, abs=0.03)
 
 
 @pytest.mark.parametrize(("level", "visible"), [(0.0, False), (0.01, False), (0.06, True)])
@@ -94,25 +94,25 @@ def test_a_reflector_outside_the_search_is_refused(search_m, visible):
 @pytest.mark.parametrize(("rival", "flagged"), [(0.45, False), (0.56, True)])
 def test_a_second_reflector_as_strong_is_flagged(rival, flagged):
     transfer, predicted = fly(np.random.default_rng(6), snr_db=20, rival=rival)
-    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
-    assert found.offset_m == pytest.approx(1.374, abs=0.01)
-    assert ("calibration_ambiguous" in found.flags) == flagged
+    estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert estimate.offset_m == pytest.approx(1.374, abs=0.01)
+    assert ("calibration_ambiguous" in estimate.flags) == flagged
 
 
 @pytest.mark.parametrize(("wobble_m", "flagged"), [(0.01, False), (0.2, True)])
 def test_an_offset_known_too_poorly_is_flagged(wobble_m, flagged):
     transfer, predicted = fly(np.random.default_rng(7), snr_db=20, wobble_m=wobble_m)
-    found = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
-    assert (found.std_m > NEEDED_STD_M) == flagged
-    assert ("calibration_uncertain" in found.flags) == flagged
+    estimate = estimate_path_offset(transfer, FREQUENCY, path_m=predicted)
+    assert (estimate.std_m > NEEDED_STD_M) == flagged
+    assert ("calibration_uncertain" in estimate.flags) == flagged
 
 
 def test_a_single_pulse_gives_an_offset_without_a_deviation():
     transfer, predicted = fly(np.random.default_rng(8), snr_db=20)
-    found = estimate_path_offset(transfer[:1], FREQUENCY, path_m=predicted[:1])
-    assert found.offset_m == pytest.approx(1.374, abs=0.02)
-    assert found.std_m == np.inf
-    assert "calibration_uncertain" in found.flags
+    estimate = estimate_path_offset(transfer[:1], FREQUENCY, path_m=predicted[:1])
+    assert estimate.offset_m == pytest.approx(1.374, abs=0.02)
+    assert estimate.std_m == np.inf
+    assert "calibration_uncertain" in estimate.flags
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.4])

@@ -103,7 +103,7 @@ def test_blocked_pulses_do_no_harm():
 
 
 @pytest.mark.parametrize(("cfo_hz", "sfo_hz"), [(10e3, 0.0), (2e3, 0.0), (0.0, 200 * 102.4), (9600.0, 819.2)])
-def test_the_predicted_floor_is_the_one_that_is_found(cfo_hz, sfo_hz):
+def test_the_predicted_floor_is_the_one_that_is_measured(cfo_hz, sfo_hz):
     predicted = interference_floor_db(cfo_hz, sfo_hz / 102.4, NUMEROLOGY)
     # what an echo shares with the sidelink divides out; the rest grows with the delay between them
     turn = 2 * np.pi * 100e3 * (ECHOES_S - 0.1e-6)
@@ -150,7 +150,7 @@ def test_a_true_clock_passes_the_correction_unchanged():
     assert np.abs(again - radar[:, :1344]).max() < 1e-5 * np.abs(radar).max()
 
 
-def test_a_band_around_the_carrier_is_measured_and_corrected_alike():
+def test_a_band_around_the_carrier_is_measured_and_corrected_as_well():
     centred = Numerology(1.2e9, 102.4e6, NUMBERS - 256, prefix_samples=320, dft_samples=1024)
     capture = record(0.1e-6, cfo_hz=9600.0, sfo_hz=819.2, waveform=centred)
     offset = estimate_clock(capture, centred)

@@ -1,4 +1,4 @@
-"""Triggering on a preamble in a recording that never stops: what is found, what is not, at what cost."""
+"""Triggering on a preamble in a recording that never stops: what is detected, what is not, at what cost."""
 
 import tracemalloc
 
@@ -47,15 +47,15 @@ def find(recording, *, block=50_000, false_alarms_per_s=ALARMS_PER_S):
 
 @pytest.mark.parametrize("snr_db", [-10, 10, 30])
 @pytest.mark.parametrize("block", [333, 50_000, 10**9])
-def test_every_preamble_is_found_where_it_is_however_the_stream_is_cut(snr_db, block):
+def test_every_preamble_is_detected_where_it_is_however_the_stream_is_cut(snr_db, block):
     rng = np.random.default_rng(1)
     starts = 70_000 * np.arange(4) + rng.integers(10, 60_000, 4)
-    found = find(record(starts, snr_db, 300_000, rng), block=block)
-    assert [detection.sample for detection in found] == pytest.approx(starts, abs=0 if snr_db > -10 else 1)
-    assert np.mean([detection.snr_db for detection in found]) == pytest.approx(snr_db, abs=1)
+    detections = find(record(starts, snr_db, 300_000, rng), block=block)
+    assert [detection.sample for detection in detections] == pytest.approx(starts, abs=0 if snr_db > -10 else 1)
+    assert np.mean([detection.snr_db for detection in detections]) == pytest.approx(snr_db, abs=1)
 
 
-def test_a_preamble_across_the_seam_of_two_transforms_is_found():
+def test_a_preamble_across_the_seam_of_two_transforms_is_detected():
     rng = np.random.default_rng(2)
     step = 2**16 - (FRAMING.template().size - 1)  # places that one transform decides
     starts = [step, 2 * step - 1, 3 * step + 3]
@@ -64,8 +64,8 @@ def test_a_preamble_across_the_seam_of_two_transforms_is_found():
 
 def test_a_clock_of_10_khz_off_does_not_hide_a_preamble():
     starts = [4000]
-    found = find(record(starts, -12, 20_000, np.random.default_rng(3), cfo_hz=10e3))
-    assert [detection.sample for detection in found] == pytest.approx(starts, abs=1)
+    detections = find(record(starts, -12, 20_000, np.random.default_rng(3), cfo_hz=10e3))
+    assert [detection.sample for detection in detections] == pytest.approx(starts, abs=1)
 
 
 @pytest.mark.parametrize("sigma", [3.0, 1000.0])
@@ -73,10 +73,10 @@ def test_noise_triggers_at_the_set_rate_at_any_level(sigma):
     rng = np.random.default_rng(4)
     samples = 4_000_000
     alarms_per_s = 2e-5 * RATE_HZ  # one in 50 000 samples, so that 80 can be expected
-    found = find(record([], 0, samples, rng, sigma=sigma), false_alarms_per_s=alarms_per_s)
+    detections = find(record([], 0, samples, rng, sigma=sigma), false_alarms_per_s=alarms_per_s)
     expected = alarms_per_s * samples / RATE_HZ
     # neighbouring samples alarm together and a frame of silence follows: fewer than set, never more
-    assert 0.6 * expected < len(found) < expected + 2 * np.sqrt(expected)
+    assert 0.6 * expected < len(detections) < expected + 2 * np.sqrt(expected)
 
 
 def theory(snr_db, false_alarm):
@@ -91,8 +91,8 @@ def test_detection_probability_is_that_of_theory_and_99_percent_at_minus_13_db(s
     rng = np.random.default_rng(5)
     trials = 300
     starts = 5000 * np.arange(trials) + rng.integers(100, 1000, trials)
-    found = [detection.sample for detection in find(record(starts, snr_db, 5000 * trials, rng))]
-    hits = np.sum(np.min(np.abs(starts[:, None] - np.array(found)[None]), axis=1, initial=10**6) <= 2)
+    detections = [detection.sample for detection in find(record(starts, snr_db, 5000 * trials, rng))]
+    hits = np.sum(np.min(np.abs(starts[:, None] - np.array(detections)[None]), axis=1, initial=10**6) <= 2)
     expected = theory(snr_db, ALARMS_PER_S / RATE_HZ)
     assert hits / trials == pytest.approx(expected, abs=3 * np.sqrt(expected * (1 - expected) / trials) + 0.02)
     assert hits >= 0.99 * trials or snr_db < -13
@@ -101,10 +101,10 @@ def test_detection_probability_is_that_of_theory_and_99_percent_at_minus_13_db(s
 def test_the_symbol_behind_a_preamble_does_not_trigger_again():
     rng = np.random.default_rng(6)
     starts = 8000 * np.arange(30) + 100
-    found = find(record(starts, 25, 8000 * 31, rng), false_alarms_per_s=1e-5 * RATE_HZ)
-    after = [(detection.sample - 100) % 8000 for detection in found]
+    detections = find(record(starts, 25, 8000 * 31, rng), false_alarms_per_s=1e-5 * RATE_HZ)
+    after = [(detection.sample - 100) % 8000 for detection in detections]
     assert not [place for place in after if 0 < place < FRAMING.lead_samples + SYMBOL]
-    assert set(starts) <= {detection.sample for detection in found}
+    assert set(starts) <= {detection.sample for detection in detections}
 
 
 def test_the_counter_of_a_frame_is_read_and_wraps():

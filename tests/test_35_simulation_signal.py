@@ -111,6 +111,7 @@ def test_fast_transfer_functions_equal_the_dft_of_samples():
     waveform = small_waveform("band_centre")
     wrong = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), radar_ripple=Ripple(1.0, 3e-8))
     seen = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=wrong)
+    assert seen.channels.keys() == {"radar", "sidelink"}
     for channel in seen.channels.values():
         fast = transfer_functions(channel, None)
         assert_allclose(recovered(waveform, samples(channel, None)), fast, atol=1e-11 * abs(fast).max())

@@ -66,15 +66,15 @@ def test_a_raster_lies_where_the_grid_says_and_carries_its_origin(tmp_path, name
 
 def test_pixels_are_the_image_its_power_and_its_decibels(tmp_path):
     image = speckle(600, 40)
-    found = {}
+    rasters = {}
     for name, write in RASTERS.items():
         write(tmp_path / name, image, **UTM, tags={})
         with rasterio.open(tmp_path / name) as raster:
-            found[name] = raster.read(1)
-    assert found["slc.tif"].dtype == np.complex64
-    assert np.array_equal(found["slc.tif"], image)
-    assert np.allclose(found["power.tif"], np.abs(image.astype(complex)) ** 2, rtol=1e-6)
-    assert np.allclose(found["db.tif"], 20 * np.log10(np.abs(image.astype(complex))), rtol=0, atol=1e-5)
+            rasters[name] = raster.read(1)
+    assert rasters["slc.tif"].dtype == np.complex64
+    assert np.array_equal(rasters["slc.tif"], image)
+    assert np.allclose(rasters["power.tif"], np.abs(image.astype(complex)) ** 2, rtol=1e-6)
+    assert np.allclose(rasters["db.tif"], 20 * np.log10(np.abs(image.astype(complex))), rtol=0, atol=1e-5)
 
 
 def test_local_axes_survive_the_file(tmp_path):

@@ -151,6 +151,7 @@ def test_localization_costs_what_the_independent_model_says(monkeypatch):
 @pytest.mark.parametrize("name", ERRORS)
 def test_every_row_of_the_loss_table_is_met(name):
     claims = loss_claims(name)
+    assert len(claims) == len(ERRORS[name].independent_model_db)
     assert [(c.claim, c.verdict) for c in claims if not c.verdict.startswith("agrees")] == []
     deep = [claim for claim in claims if float(claim.independent_model) < DESTROYED_DB]
     assert all("destroyed" in claim.verdict for claim in deep)

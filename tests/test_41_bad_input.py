@@ -5,46 +5,10 @@ import json
 
 import numpy as np
 import pytest
-import yaml
+from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
 from apertura.steps import echo, ingest, profile, scene
-
-
-def edit_config(root, change):
-    path = root / "config" / "config.yaml"
-    document = yaml.safe_load(path.read_text())
-    change(document)
-    path.write_text(yaml.safe_dump(document))
-
-
-def edit_meta(root, node, change):
-    path = root / "raw" / "f01" / f"{node}.sigmf-meta"
-    meta = json.loads(path.read_text())
-    change(meta)
-    path.write_text(json.dumps(meta))
-
-
-def edit_data(root, node, change):
-    """Rewrite the samples and their hash: damage that only the content shows."""
-    path = root / "raw" / "f01" / f"{node}.sigmf-data"
-    samples = np.fromfile(path, "<i2")
-    change(samples)
-    samples.tofile(path)
-    digest = hashlib.sha512(path.read_bytes()).hexdigest()
-    edit_meta(root, node, lambda meta: meta["global"].__setitem__("core:sha512", digest))
-
-
-def edit_track(root, node, change):
-    path = next((root / "raw" / "f01").glob(f"{node}.track.*"))
-    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
-
-
-def complaint(work):
-    with pytest.raises(CampaignError) as caught:
-        work()
-    return str(caught.value)
 
 
 def nothing_half_written(root):
@@ -52,11 +16,6 @@ def nothing_half_written(root):
     results = root / "results"
     manifests = {path.name for path in results.rglob("*.manifest.json")}
     return manifests <= {"raw.manifest.json", "track.manifest.json"} and not list(results.rglob("*.tif"))
-
-
-def ingest_all(campaign):
-    for node in ("uav1", "uav2"):
-        ingest.ingest(campaign, "f01", node)
 
 
 def test_a_misspelt_key_is_named_with_the_nearest_valid_one(tiny):
@@ -80,7 +39,7 @@ def test_a_missing_node_file_is_named(tiny):
     assert "node uav2" in message
 
 
-def test_truncated_samples_are_found_by_their_captures(tiny):
+def test_truncated_samples_are_noticed_by_their_captures(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))

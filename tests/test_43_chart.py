@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from conftest import copy_writable
+from folders import copy_writable
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.focus.engines import ENGINES
 from apertura.steps import image
 from apertura.steps.plan import expected_plan
 from apertura.study.chart.pareto import Point, with_front
@@ -31,6 +30,7 @@ def charted(finished_tiny, tmp_path_factory):
 def test_the_front_holds_what_nothing_faster_beats(charted):
     rows = charted[1]
     seconds = [float(row["seconds"]) for row in rows]
+    assert {row["on_front"] for row in rows} == {"True", "False"}
     assert seconds == sorted(seconds)
     for number, row in enumerate(rows):
         beaten = any(float(faster["error_db"]) <= float(row["error_db"]) for faster in rows[:number])
@@ -72,9 +72,8 @@ def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
 
 
-def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tiny, tmp_path, monkeypatch):
+def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tiny, tmp_path, toy):
     """One file and one row: the config knows its name and options, the plan its prediction, the product its report."""
-    monkeypatch.setitem(ENGINES, "toy", "toy_engine")
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     config = root / "config" / "config.yaml"
     document = yaml.safe_load(config.read_text())

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from conftest import copy_writable, ground, run_steps
+from folders import complaint, copy_writable, run_steps, settle_ground
 from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
-from apertura.imaging.stages import phase_history_of, profiles_of
-from apertura.load import pair as pairs
+from apertura.imaging.stages import profiles_of
 from apertura.load.ground import Ground
 from apertura.load.pair import open_pair
 from apertura.load.plan import job_of, plan_pair
@@ -78,9 +76,9 @@ def hillside(tmp_path_factory):
 
 
 def test_every_target_on_a_hillside_is_where_it_stands(hillside):
-    found = verify(hillside)
-    assert len(found) == 9
-    assert max(finding.error_m for finding in found) < 0.03
+    findings = verify(hillside)
+    assert len(findings) == 9
+    assert max(finding.error_m for finding in findings) < 0.03
 
 
 @pytest.mark.slow
@@ -88,8 +86,8 @@ def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
     root = copy_writable(hillside.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     edit_scene(root, dem=None, dem_datum=None)
-    found = verify(run_steps(root))
-    off = [finding.error_m for finding in found if finding.target and finding.image == "uav1-uav1"]
+    findings = verify(run_steps(root))
+    off = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
     assert min(off) > 0.1
 
 
@@ -154,7 +152,7 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
 
 
 @pytest.mark.parametrize("made", [True, False])
-def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
+def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
     """Samples and bytes of tables are those of its ground, whether stage `terrain` is made or only its DEM is there."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
     if not made:
@@ -170,22 +168,18 @@ def test_the_plan_foresees_the_profiles_of_a_hillside(hillside, made, tmp_path):
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
 
 
-def test_an_echo_that_is_open_is_not_read_again(hillside, monkeypatch):
-    echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
-    held = phase_history_of(echo, "hann").transfer
-    monkeypatch.setattr(pairs, "open_stage", None)
-    opened = pairs.open_pair(hillside, "f01", "uav1-uav2", echo=echo)
-    assert np.shares_memory(opened.history.transfer, held)
-    plan_pair(hillside, opened, open_scene(hillside))
+def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
+    """Its stage may even be gone: the pair is opened and planned from the arrays that are held."""
+    campaign = Campaign.load(copy_writable(hillside.root, tmp_path / "campaign"))
+    echo = open_stage(campaign.stage("echo", *PAIR), "echo").load()
+    shutil.rmtree(campaign.stage("echo", *PAIR))
+    opened = open_pair(campaign, *PAIR, echo=echo)
+    assert np.shares_memory(opened.history.transfer, echo.transfer.values)
+    planned = plan_pair(campaign, opened, open_scene(campaign))
+    assert planned.setting == plan_pair(hillside, open_pair(hillside, *PAIR), open_scene(hillside)).setting
 
 
 # Bad input
-
-
-def complaint(work):
-    with pytest.raises(CampaignError) as caught:
-        work()
-    return str(caught.value)
 
 
 def test_a_dem_without_its_datum_is_refused(tiny):
@@ -207,13 +201,13 @@ def test_a_void_in_the_scene_is_counted_and_placed(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
     planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before anything ran
-    message = complaint(lambda: ground(campaign))
+    message = complaint(lambda: settle_ground(campaign))
     assert planned == message
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
-    write_plane(tiny)  # mended: the work in progress of the old DEM is not taken up
-    ground(campaign)
+    write_plane(tiny)  # corrected: the work in progress of the old DEM is not taken up
+    settle_ground(campaign)
     assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
 
 
@@ -249,7 +243,7 @@ def under(grid, seen):
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, "auto"])
-def test_plan_and_run_say_alike_which_half_of_the_scene_a_dem_misses(tiny, spacing_m):
+def test_plan_and_run_give_the_same_message_about_half_a_scene_without_dem(tiny, spacing_m):
     write_plane(tiny, keep=(slice(None), slice(20, None)))
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
@@ -273,7 +267,7 @@ def test_a_void_undeclared_is_no_height_on_earth(tiny):
     """-9999 without nodata is refused as it stands, wherever the DEM is first read."""
     write_plane(tiny, void=-9999.0)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    for work in (lambda: expected_plan(campaign, *PAIR), lambda: ground(campaign)):
+    for work in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
         message = complaint(work)
         assert "dem.tif: 1 of the " in message
         assert "no height on Earth, most often -9999 m" in message
@@ -307,7 +301,7 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is in or below the ground" in planned
     shutil.copytree(hillside.results / "f01", root / "results" / "f01")
-    ground(campaign)
+    settle_ground(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
     assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]
     assert "transmitter is in or below the ground" in message

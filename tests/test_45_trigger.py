@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import copy_writable
-from test_35_simulation_campaign import small_simulation
-from test_41_bad_input import complaint, edit_data
+from folders import complaint, copy_writable, edit_data, small_simulation
 
 from apertura.campaign import Campaign
 from apertura.simulation import Framing, Impairments, simulate
@@ -47,8 +45,8 @@ def test_captures_start_where_the_symbols_start(flown):
     truth = json.loads((campaign.root / "truth.json").read_text())["flights"]["f01"]["nodes"]["b"]
     meta = json.loads((campaign.root / "raw/f01/b.sigmf-meta").read_text())
     begun = np.datetime64(meta["captures"][0]["core:datetime"].removesuffix("Z"), "ns")
-    found = (raw_of(campaign).time.values - begun) / np.timedelta64(1, "ns") * 32e6 / 1e9
-    np.testing.assert_allclose(found, truth["pulse_start_sample"], atol=2)
+    starts = (raw_of(campaign).time.values - begun) / np.timedelta64(1, "ns") * 32e6 / 1e9
+    np.testing.assert_allclose(starts, truth["pulse_start_sample"], atol=2)
 
 
 def test_duty_cycle_and_data_rate_are_reported(flown):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from test_41_bad_input import complaint, edit_config
+from folders import complaint, edit_config
 
 from apertura.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
@@ -53,10 +53,10 @@ def report(campaign):
 
 
 @pytest.mark.parametrize(("pair", "true_m"), [("uav1-uav1", 1.374), ("uav1-uav2", 0.911 - 0.402)])
-def test_the_true_offset_is_found_within_its_deviation(calibrated, pair, true_m):
-    found = report(calibrated)[pair]
-    assert found["std_m"] < 0.02
-    assert abs(found["offset_m"] - true_m) < max(4 * found["std_m"], 0.01)
+def test_the_true_offset_is_estimated_within_its_deviation(calibrated, pair, true_m):
+    estimate = report(calibrated)[pair]
+    assert estimate["std_m"] < 0.02
+    assert abs(estimate["offset_m"] - true_m) < max(4 * estimate["std_m"], 0.01)
 
 
 def test_a_reflector_alone_is_coherent(calibrated):
@@ -68,10 +68,10 @@ def test_a_reflector_alone_is_coherent(calibrated):
 def test_imaging_flights_take_the_offset_by_reference_and_say_so(calibrated):
     echo.echo(calibrated, "f01", "uav1-uav2")
     dataset = open_stage(calibrated.stage("echo", "f01", "uav1-uav2"), "echo")
-    found = report(calibrated)["uav1-uav2"]
-    assert dataset.attrs["calibration"] == {name: found.get(name, "c01") for name in ("flight", "offset_m", "std_m")}
+    estimate = report(calibrated)["uav1-uav2"]
+    assert dataset.attrs["calibration"] == {name: estimate.get(name, "c01") for name in ("flight", "offset_m", "std_m")}
     assert "raw/c01/uav2.sigmf-data" in dataset.attrs["inputs"]
-    assert str(found["offset_m"]) in dataset.attrs["runspec"]
+    assert str(estimate["offset_m"]) in dataset.attrs["runspec"]
     limit = 299792458 * 7.8125e-7
     assert (np.abs(dataset.path_limit.values - limit) < 10).all()
 

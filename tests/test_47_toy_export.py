@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import rasterio
-from conftest import copy_writable
+from folders import copy_writable
 
 ROOT = Path(__file__).parents[1]
 TOY = """

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from conftest import copy_writable
-from test_41_bad_input import complaint, edit_config
+from folders import complaint, copy_writable, edit_config
 
 from apertura.campaign import Campaign
 from apertura.quality.point_targets import cut_through, find_peak
@@ -68,7 +67,7 @@ def beamed(_beamed, tmp_path):
 
 @pytest.fixture
 def even(_even, tmp_path):
-    """Antennas that look everywhere alike."""
+    """Isotropic antennas."""
     return copy_writable(_even, tmp_path / "campaign")
 
 
@@ -178,7 +177,7 @@ def test_a_sampled_gaussian_is_the_gaussian(beamed):
 
 
 def test_the_beam_turns_with_the_yaw_that_was_logged(beamed):
-    """Nose to tail, the beam looks to the other side; the target is least far off at the ends of the track."""
+    """Nose to tail, the beam points to the other side; the target is least far off at the ends of the track."""
     log = beamed / "raw" / "f01" / "uav1.track.csv"
     head, *lines = log.read_text().splitlines()
     turned = [",".join([*line.split(",")[:-1], str(float(line.split(",")[-1]) - 180)]) for line in lines]
@@ -225,13 +224,13 @@ def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     def axes(campaign):
         ingest.ingest(campaign, "f01", "uav1")
         echo.echo(campaign, "f01", "uav1-uav1")
-        found = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo")
-        return {name: found[name].values for name in ("tx_axes", "rx_axes") if name in found}
+        stored = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo")
+        return {name: stored[name].values for name in ("tx_axes", "rx_axes") if name in stored}
 
     assert axes(stated(beamed, None)) == {}
-    found = axes(stated(beamed, BEAM))
-    assert found.keys() == {"tx_axes", "rx_axes"}
-    east_north_up = DEMO_ORIGIN.enu(DEMO_ORIGIN.ecef(np.zeros(3)) + found["tx_axes"][0].T)
+    stored = axes(stated(beamed, BEAM))
+    assert stored.keys() == {"tx_axes", "rx_axes"}
+    east_north_up = DEMO_ORIGIN.enu(DEMO_ORIGIN.ecef(np.zeros(3)) + stored["tx_axes"][0].T)
     np.testing.assert_allclose(east_north_up, [AHEAD, RIGHT, [0, 0, -1]], atol=1e-4)
 
 

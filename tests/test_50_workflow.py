@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import copy_writable
+from folders import copy_writable
 
 ROOT = Path(__file__).parents[1]
 

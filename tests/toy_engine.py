@@ -10,6 +10,8 @@ from apertura.focus.inputs import Profiles
 from apertura.focus.job import Job
 
 READS = "profiles"
+CALLS: list[str] = []
+"""What was called, in order."""
 
 
 class Options(EngineOptions):
@@ -36,11 +38,13 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
 
 
 def prepare(profiles: Profiles, *, refine: int) -> tuple[Profiles, int]:
+    CALLS.append("prepare")
     return profiles, refine
 
 
 def form(prepared: tuple[Profiles, int], pixels: np.ndarray, *, beams: Any = None) -> np.ndarray:
     """Return the sum over the pulses of the nearest of refined samples, the carrier turned back."""
+    CALLS.append("form")
     profiles, refine = prepared
     length = profiles.samples.shape[1]
     spectrum = np.fft.fft(profiles.samples, axis=1)

@@ -109,7 +109,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """Beams of transmitter and receiver; None looks everywhere alike.
+    """Beams of transmitter and receiver; None is isotropic.
 
     Attributes
     ----------

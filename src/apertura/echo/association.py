@@ -136,7 +136,7 @@ def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) 
 
     A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
     `EXPLAINED_M` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
-    somebody else's positions.
+    positions of other pulses.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ def estimate_path_offset(
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within a sixteenth of the flight,
-    over which tracks err alike, and in power beyond.
+    over which errors of the track are constant, and in power beyond.
 
     Examples
     --------
@@ -185,14 +185,14 @@ def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float
         aligned = groups * np.exp(np.outer(offset, turn))
         total, first, second = aligned.sum(1), aligned @ turn, aligned @ turn**2
         slope = 2 * np.real(total.conj() * first)
-        bend = 2 * (np.abs(first) ** 2 + np.real(total.conj() * second))
-        step = np.clip(-slope / np.where(bend < 0, bend, -np.inf), -cell_m / 8, cell_m / 8)
+        curvature = 2 * (np.abs(first) ** 2 + np.real(total.conj() * second))
+        step = np.clip(-slope / np.where(curvature < 0, curvature, -np.inf), -cell_m / 8, cell_m / 8)
         offset = np.clip(offset + step, start_m - cell_m / 2, start_m + cell_m / 2)
     return offset
 
 
 def _deviation_of_mean(parts: Floats) -> float:
-    """Return the standard deviation of the mean of parts whose neighbours may err alike, as tracks do."""
+    """Return the standard deviation of the mean of parts whose neighbours may share errors of the track."""
     if len(parts) < _GROUPS:
         return np.inf
     quarters = parts.reshape(4, -1).mean(1)

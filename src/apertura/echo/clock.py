@@ -151,7 +151,7 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology)
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Clock": a tone δ bins off keeps sinc²(δ) of its power, the rest falls on
-    the other subcarriers, in the echo and in the sidelink alike, and compression spreads it over N cells.
+    the other subcarriers, in the echo as in the sidelink, and compression spreads it over N cells.
 
     Examples
     --------

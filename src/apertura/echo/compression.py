@@ -128,8 +128,8 @@ def compress(
         spectrum = np.zeros((len(here), length // factor), np.complex64)
         for tap in range(filters.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
-        whole = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
-        profiles[part] = whole[:, after % (length // factor)] * response
+        swath = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
+        profiles[part] = swath[:, after % (length // factor)] * response
     return profiles
 
 

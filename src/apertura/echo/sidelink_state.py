@@ -153,7 +153,7 @@ def _average(sidelink: Complexes, path: LineOfSight) -> _Average:
 def _strongest_echo(average: _Average) -> tuple[float, int]:
     """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
 
-    Ripple answers on both sides of the direct path alike, an echo on one; only the excess of one side counts.
+    Ripple makes echoes on both sides of the direct path, a reflection on one; only the excess of one side counts.
     """
     cells = np.arange(2, average.power.size - 1)
     excess = average.power - average.noise

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.inputs import Profiles
+from apertura.interpolation import kaiser_sinc
 
 _HALF_TAPS = 24
 _KAISER_BETA = 22.0  # -190 dB with half the band free for the transition
@@ -45,10 +46,10 @@ def band_limited_image(
         place = (path - profiles.start_m[part, None]) / profiles.step_m
         whole = np.floor(place).astype(np.int64)
         distance = (place - whole)[..., None] - taps
-        window = np.i0(_KAISER_BETA * np.sqrt(1 - (distance / _HALF_TAPS) ** 2)) / np.i0(_KAISER_BETA)
+        weights = kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
         index = np.clip(whole[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
         samples = np.take_along_axis(padded[part, None], index, axis=2)
-        value = (samples * np.sinc(distance) * window).sum(-1) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
+        value = (samples * weights).sum(-1) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
         if beams is not None:
             value *= beams[part].weight(profiles.aperture[part], pixels)
         image += value.sum(axis=0)

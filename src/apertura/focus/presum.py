@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
+from apertura.interpolation import kaiser_beta, kaiser_sinc, kaiser_window
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -72,7 +73,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     from scipy import sparse
 
     stop_db = 12.0 - error_db
-    beta = 0.1102 * (stop_db - 8.7)
+    beta = kaiser_beta(stop_db)
     half = int(np.ceil((stop_db - 7.95) / (14.36 * room) / 2))
     beyond = half // factor + 1
     at = factor * np.arange(-beyond, (pulses - 1) // factor + beyond + 2, dtype=np.float64)
@@ -80,8 +81,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     first = np.clip(np.searchsorted(at, pulse - half), 0, len(at))
     rows = first[:, None] + np.arange(2 * half // factor + 2)
     apart = (at[np.minimum(rows, len(at) - 1)] - pulse[:, None]) / half
-    shape = np.i0(beta * np.sqrt(np.clip(1 - apart**2, 0, None))) / np.i0(beta)
-    taps = np.sinc(apart * half / factor) * shape
+    taps = np.sinc(apart * half / factor) * kaiser_window(apart, beta)
     held = (np.abs(apart) <= 1) & (rows < len(at))
     columns = np.broadcast_to(pulse[:, None], rows.shape)
     weight = sparse.csr_array((taps[held], (rows[held], columns[held])), shape=(len(at), pulses))
@@ -169,8 +169,7 @@ def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: 
     whole = np.floor(shift).astype(int)
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     distance = (shift - whole)[:, None] - taps
-    shape = np.sqrt(np.clip(1 - (distance / _HALF_TAPS) ** 2, 0, None))
-    filters = (np.sinc(distance) * np.i0(_KAISER_BETA * shape) / np.i0(_KAISER_BETA)).astype(np.float32)
+    filters = kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA).astype(np.float32)
     for pulse, (row, start, weights) in enumerate(zip(samples, whole, filters, strict=True)):
         padded = np.concatenate([np.zeros(_HALF_TAPS - 1, np.complex64), row, np.zeros(_HALF_TAPS, np.complex64)])
         refined = np.convolve(padded, weights[::-1], "valid")  # refined[i] = row at i + fraction

@@ -96,7 +96,7 @@ class Aperture:
 
         Notes
         -----
-        Source: docs/theory.md, eq. 1.
+        Source: docs/theory.md, eq. 3.
         """
         tx, rx = (np.linalg.norm(points_m - self._against(leg, points_m), axis=-1) for leg in self.legs)
         return np.asarray(tx + rx)

@@ -54,7 +54,7 @@ def phase_centres(
     Notes
     -----
     Position is a cubic spline through the epochs; R = Rz(yaw)·Ry(pitch)·Rx(roll) turns body axes to NED
-    (DESIGN section 3).
+    (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
     centres = _spline(track_time, position)(_seconds(at - track_time[0]))

@@ -15,6 +15,7 @@ from apertura.imaging.range_profiles import range_compress
 from apertura.imaging.stages import inputs_of
 from apertura.planning.planner import make_plan
 from apertura.quality.measures import numerical_error
+from apertura.scene.clearance import check_antennas
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
 from apertura.scene.terrain import FlatGround, Terrain
@@ -52,7 +53,7 @@ def backproject(
     engine
         'auto' or a key of `apertura.focus.engines.ENGINES`.
     beams
-        Of the antennas; alike in all directions by default.
+        Of the antennas; isotropic by default.
     tile_px
         Side of a tile, which is a chunk of the array; a multiple of 16.
     certified_pixels
@@ -73,7 +74,8 @@ def backproject(
     Raises
     ------
     CampaignError
-        If there is no pulse, no echo of the scene arrives, or what is asked cannot run here.
+        If there is no pulse, no echo of the scene arrives, an antenna is in the ground, or what is asked cannot run
+        here.
     ValueError
         If the scene is deeper than the unambiguous range.
 
@@ -100,6 +102,7 @@ def backproject(
     inputs = inputs_of(profiles)
     ground = terrain if terrain is not None else FlatGround(0.0)
     level = ground if isinstance(ground, FlatGround) else FlatGround(float(np.nanmean(ground.heights(grid.coarse(33)))))
+    flags = check_antennas(grid, ground, inputs.aperture, where="backproject")
     models = GroundModels.of(ground, level, grid)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
@@ -113,7 +116,7 @@ def backproject(
         "grid_mapping": "spatial_ref",
         "setting": plan.setting.line,
         "models": plan.reasons,
-        "flags": dict(plan.flags),
+        "flags": {**flags, **plan.flags},
         "predicted_error_db": round(plan.predicted_error_db, 2),
     }
     if certified_pixels:

@@ -38,7 +38,7 @@ class Formation:
     side_px
         Of a tile.
     beams
-        Of the antennas; None where they look everywhere alike.
+        Of the antennas; None where they are isotropic.
     """
 
     history: PhaseHistory | None

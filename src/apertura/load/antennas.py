@@ -27,7 +27,7 @@ def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
 
 
 def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float64]]) -> Beams | None:
-    """Return the beams of a pair; None where its antennas look everywhere alike.
+    """Return the beams of a pair; None where its antennas are isotropic.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class OpenPair:
     history
         The echo itself; None before it is formed.
     beams
-        Of the antennas; None where they look everywhere alike.
+        Of the antennas; None where they are isotropic.
     """
 
     flight: str

@@ -50,7 +50,7 @@ def numerical_error(
 
     Notes
     -----
-    Source: DESIGN section 5, the definitions of numerical_error_db and peak_error_db; Efron (1982), The jackknife.
+    Source: docs/theory.md, "Image" (numerical_error_db, peak_error_db); Efron (1982), The jackknife.
 
     Examples
     --------
@@ -162,7 +162,7 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
 
     Notes
     -----
-    Source: DESIGN section 4.
+    Source: docs/theory.md, "Quality".
 
     Examples
     --------

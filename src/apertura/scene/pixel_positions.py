@@ -1,7 +1,7 @@
 """Where the pixels of a projected grid are: PROJ at a few nodes of each block, polynomials in between.
 
 PROJ takes as long for a pixel as the sum of hundreds of pulses; Earth is so smooth that over a block of pixels
-polynomials of degree four are as exact as float64 holds positions (docs/theory/planner.md, "Places").
+polynomials of degree four are as exact as float64 holds positions (docs/theory/planner.md, "Pixel positions").
 """
 
 from dataclasses import dataclass

@@ -33,7 +33,7 @@ class Antenna(Section):
         return self
 
 
-_BEAM = "null (alike in all directions), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
+_BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
 
 
 class Antennas(Section):

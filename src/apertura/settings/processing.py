@@ -8,6 +8,11 @@ from apertura.focus.engines import ENGINES, load_engine
 from apertura.settings.section import Metres3, Name, Section
 
 
+def _options_of_each_engine(schema: dict[str, Any]) -> None:
+    engines = {name: load_engine(name).Options.model_json_schema() for name in ENGINES}
+    schema.update(additionalProperties=False, properties=engines)
+
+
 class Processing(Section):
     """How to compute; every key has a default."""
 
@@ -22,6 +27,7 @@ class Processing(Section):
         default_factory=dict,
         description="options of engines that the planner shall not choose: engine → option → value",
         examples=[{}],
+        json_schema_extra=_options_of_each_engine,
     )
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from apertura.focus.engines import ENGINES, load_engine
 from apertura.settings import Node, OfdmWaveform, Settings
 
 _EXAMPLES: dict[str, Any] = {"waveform": OfdmWaveform, "nodes": {"uav1": Node, "uav2": Node}}
@@ -42,6 +43,8 @@ def _section(model: type[BaseModel], depth: int) -> list[str]:
     for name, field in model.model_fields.items():
         indent = "  " * depth
         lines.append(f"{indent}# {field.description}{_choices(field)}")
+        if name == "engine_options":
+            lines += [f"{indent}#   {line}" for line in _options_of_each_engine()]
         value = _EXAMPLES.get(name) if depth == 0 and name in _EXAMPLES else _value(field)
         if isinstance(value, type) and issubclass(value, BaseModel):
             lines += [f"{indent}{name}:", *_section(value, depth + 1)]
@@ -52,6 +55,11 @@ def _section(model: type[BaseModel], depth: int) -> list[str]:
         else:
             lines.append(f"{indent}{name}: {_scalar(value)}")
     return lines
+
+
+def _options_of_each_engine() -> list[str]:
+    engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
+    return [f"{name}.{key}: {field.description}" for name, fields in engines.items() for key, field in fields.items()]
 
 
 def _value(field: FieldInfo) -> Any:

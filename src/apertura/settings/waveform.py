@@ -2,8 +2,9 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from apertura.ingest import PHASE_HISTORIES
 from apertura.settings.section import Section
 
 
@@ -44,7 +45,17 @@ class PhaseHistoryWaveform(Section):
     """Frequency-domain samples with antenna positions, recorded by another radar."""
 
     kind: Literal["phase_history"] = Field(description="recorded frequency-domain samples with antenna positions")
-    format: Literal["afrl_mat"] = Field(description="afrl_mat: AFRL Gotcha .mat files raw/<flight>/<node>.*.mat")
+    format: str = Field(
+        description=f"format of the files raw/<flight>/<node>.*: {', '.join(PHASE_HISTORIES)}",
+        json_schema_extra={"enum": [*PHASE_HISTORIES]},
+    )
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, name: str) -> str:
+        if name not in PHASE_HISTORIES:
+            raise ValueError(f"no such format; choose {', '.join(PHASE_HISTORIES)}")
+        return name
 
 
 Waveform = Annotated[OfdmWaveform | PhaseHistoryWaveform, Field(discriminator="kind")]

@@ -16,6 +16,7 @@ from apertura.focus.engines.native_tables import BAND, band_error_db
 from apertura.focus.inputs import Profiles
 from apertura.focus.job import Job
 from apertura.geometry.aperture import Aperture
+from apertura.interpolation import kaiser_sinc
 
 READS: Literal["profiles"] = "profiles"
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
@@ -122,7 +123,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
     profiles
         At least twice oversampled, so that half the band is left for the transition of the filter.
     oversampling
-        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (DESIGN section 5).
+        Samples per cell c/B; cubic interpolation of 8 errs by about -80 dB (docs/theory/planner.md, "Error").
     """
     factor = max(1, round(oversampling / profiles.oversampling))
     fine = refine(profiles.samples, factor)
@@ -161,10 +162,8 @@ def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]
     near = np.lib.stride_tricks.sliding_window_view(padded, 2 * _HALF_TAPS, axis=1)[:, 1:]
     fine = np.empty((*samples.shape, factor), np.complex64)
     for phase in range(factor):
-        distance = phase / factor - np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
-        shape = np.sqrt(np.clip(1 - (distance / _HALF_TAPS) ** 2, 0, None))
-        taps = np.sinc(distance) * np.i0(_KAISER_BETA * shape) / np.i0(_KAISER_BETA)
-        fine[..., phase] = near @ taps.astype(np.float32)
+        distance = phase / factor - np.arange(1.0 - _HALF_TAPS, _HALF_TAPS + 1)
+        fine[..., phase] = near @ kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA).astype(np.float32)
     return fine.reshape(len(samples), -1)
 
 

@@ -1,132 +1,22 @@
 """The compiled engine against the double sum over pulses and subcarriers, in each instruction set."""
 
-import os
-import shutil
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from scenes import AXES, PLACE, decibels, ecef, error_db, fly, pixel_grid, scatter
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.errors import CampaignError
 from apertura.focus.engines import native, native_binding
-from apertura.focus.engines.native_constants import KERNEL
-from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
-SUBCARRIERS, BANDWIDTH_HZ = 128, 409.6e6
-GUARD = 12
-
-
-def _axes() -> NDArray[np.float64]:
-    """East, north, up of some place, as ECEF columns: nothing may depend on axes being aligned."""
-    return np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
-
-
-AXES, PLACE = _axes(), np.array([4.1e6, 0.9e6, 4.8e6])
-
-
-def ecef(local: NDArray[np.float64]) -> NDArray[np.float64]:
-    return local @ AXES.T + PLACE
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What was flown, and the calibrated spectra it gave; positions in ECEF."""
-
-    transfer: NDArray[np.complex128]
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    carrier_hz: float
-
-    @property
-    def offset_hz(self) -> NDArray[np.float64]:
-        return (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2) * BANDWIDTH_HZ / SUBCARRIERS
-
-    def path_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
-        return sum(np.linalg.norm(place - antenna[:, None], axis=-1) for antenna in (self.tx, self.rx))
-
-    def profiles(self, around: NDArray[np.float64]) -> Profiles:
-        paths = self.path_m(around.reshape(-1, 3))
-        step_m = C / BANDWIDTH_HZ / 2
-        start = paths.min(1) - GUARD * step_m
-        length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
-        at = start[:, None] + step_m * np.arange(length)
-        turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
-        samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
-        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
-
-    def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
-        delay = self.path_m(places) / C
-        inner = np.einsum("pxn,pn->px", np.exp(2j * np.pi * delay[..., None] * self.offset_hz), self.transfer)
-        return (inner * np.exp(2j * np.pi * self.carrier_hz * delay)).sum(0)
-
-
-def fly(
-    targets: NDArray[np.float64],
-    *,
-    pulses: int = 70,
-    bistatic: bool = True,
-    carrier_hz: float = 1.2e9,
-    range_m: float = 12.0,
-) -> Scene:
-    """Echoes of targets (local metres, around x = range_m) seen from height range_m, aperture equal to the range."""
-    along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
-    bend = np.sin(np.linspace(0, 7, pulses))[:, None]
-    tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
-    rx = ecef(np.hstack([-1.5 + along / 7, 3 + 0.8 * along, 1.2 * range_m - 0.04 * bend])) if bistatic else tx.copy()
-    empty = Scene(np.zeros((pulses, SUBCARRIERS), complex), tx, rx, carrier_hz)
-    amplitude = np.exp(2j * np.pi * np.arange(len(targets)) * 0.618)
-    delay = empty.path_m(ecef(targets)) / C
-    waves = np.exp(-2j * np.pi * delay[..., None] * (carrier_hz + empty.offset_hz))
-    return replace(empty, transfer=np.einsum("ptn,t->pn", waves, amplitude))
-
-
-def grid(
-    rows: int, columns: int, *, spacing_m: float = 0.05, turned_deg: float = 0.0, range_m: float = 12.0
-) -> NDArray[np.float64]:
-    """(y, x, 3) local pixels around (range_m, 0)."""
-    across, along = np.meshgrid(
-        spacing_m * (np.arange(columns) - columns / 2), spacing_m * (np.arange(rows) - rows / 2)
-    )
-    turn = np.radians(turned_deg)
-    x, y = across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
-    return np.stack([x + range_m, y, 0 * x], -1)
-
-
-def scatter(pixels: NDArray[np.float64], count: int = 25) -> NDArray[np.float64]:
-    return pixels.reshape(-1, 3)[np.random.default_rng(2).integers(0, pixels[..., 0].size, count)]
-
-
-def error_db(scene: Scene, pixels: NDArray[np.float64], image: NDArray[np.complex64], count: int = 150) -> float:
-    """RMS error of random pixels, no gain taken out."""
-    pick = np.random.default_rng(3).integers(0, image.size, count)
-    truth = scene.exact(ecef(pixels).reshape(-1, 3)[pick])
-    return decibels(image.ravel()[pick] - truth, truth)
-
-
-def decibels(difference: NDArray[np.complexfloating], truth: NDArray[np.complexfloating]) -> float:
-    return 10 * np.log10(np.sum(np.abs(difference) ** 2) / np.sum(np.abs(truth) ** 2) + 1e-30)
-
-
-@pytest.fixture(params=native.INSTRUCTION_SETS)
-def isa(request, monkeypatch):
-    if not native_binding.runs(request.param):
-        pytest.skip(f"this machine has no {request.param}")
-    monkeypatch.setenv("APERTURA_ISA", request.param)
-    return request.param
-
 
 @pytest.fixture(scope="module")
 def plain():
-    pixels = grid(50, 83)
+    pixels = pixel_grid(50, 83)
     scene = fly(scatter(pixels))
     return scene, pixels, scene.profiles(ecef(pixels))
 
@@ -141,7 +31,7 @@ def test_every_instruction_set_agrees_with_the_double_sum(isa, plain):
 
 
 def test_a_monostatic_image_agrees_with_the_double_sum(isa):
-    pixels = grid(48, 48)
+    pixels = pixel_grid(48, 48)
     scene = fly(scatter(pixels), bistatic=False)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
     assert error_db(scene, pixels, image) <= -70
@@ -153,7 +43,9 @@ def test_instruction_sets_agree_with_each_other(plain, monkeypatch):
     for name in filter(native_binding.runs, native.INSTRUCTION_SETS):
         monkeypatch.setenv("APERTURA_ISA", name)
         images.append(native.form(native.prepare(profiles), ecef(pixels)))
-    assert all(decibels(image - images[0], images[0]) <= -95 for image in images[1:])
+    if len(images) < 2:
+        pytest.skip("this machine runs one instruction set")
+    assert max(decibels(image - images[0], images[0]) for image in images[1:]) <= -95
 
 
 @pytest.mark.parametrize(("oversampling", "degree"), [(5, 2), (6, 2), (8, 2), (8, 1), (10, 1), (16, 1)])
@@ -172,7 +64,7 @@ def test_more_oversampling_errs_less(plain):
 
 @pytest.mark.parametrize("carrier_hz", [0.41e9, 3e9, 10e9])
 def test_carriers_that_turn_often_within_a_cell_are_held(isa, carrier_hz):
-    pixels = grid(40, 40, spacing_m=C / carrier_hz / 4)
+    pixels = pixel_grid(40, 40, spacing_m=C / carrier_hz / 4)
     scene = fly(scatter(pixels), carrier_hz=carrier_hz)
     image = native.form(native.prepare(scene.profiles(ecef(pixels)), oversampling=6), ecef(pixels))
     assert error_db(scene, pixels, image) <= -70
@@ -180,8 +72,8 @@ def test_carriers_that_turn_often_within_a_cell_are_held(isa, carrier_hz):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 17), (33, 5), (15, 16), (17, 49)])
 def test_any_size_of_tile_will_do(isa, size):
-    pixels = grid(*size)
-    scene = fly(scatter(grid(40, 40)))
+    pixels = pixel_grid(*size)
+    scene = fly(scatter(pixel_grid(40, 40)))
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
     assert image.shape == size
     assert error_db(scene, pixels, image) <= -70
@@ -190,9 +82,9 @@ def test_any_size_of_tile_will_do(isa, size):
 @pytest.mark.parametrize("size", [(1, 1), (17, 3)])
 @pytest.mark.parametrize("rough_m", [0.0, 0.03])
 def test_one_pulse_will_do(isa, size, rough_m):
-    pixels = grid(*size)
+    pixels = pixel_grid(*size)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal(size)
-    scene = fly(scatter(grid(40, 40)), pulses=1)
+    scene = fly(scatter(pixel_grid(40, 40)), pulses=1)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
     assert error_db(scene, pixels, image) <= -70
 
@@ -219,7 +111,7 @@ def test_threads_give_the_same_bits(plain):
 
 
 def test_a_turned_grid_takes_the_same_way_with_the_same_error(isa):
-    pixels = grid(64, 64, turned_deg=30)
+    pixels = pixel_grid(64, 64, turned_deg=30)
     scene = fly(scatter(pixels))
     counts = np.zeros(4, np.int64)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
@@ -229,7 +121,7 @@ def test_a_turned_grid_takes_the_same_way_with_the_same_error(isa):
 
 @pytest.mark.parametrize("rough_m", [0.002, 0.02])
 def test_heights_that_change_from_pixel_to_pixel_are_followed(isa, rough_m):
-    pixels = grid(48, 64)
+    pixels = pixel_grid(48, 64)
     generator = np.random.default_rng(6)
     pixels[..., 2] = 0.3 * np.sin(pixels[..., 0]) * np.cos(pixels[..., 1]) + rough_m * generator.standard_normal(
         (48, 64)
@@ -242,7 +134,7 @@ def test_heights_that_change_from_pixel_to_pixel_are_followed(isa, rough_m):
 
 
 def test_a_crooked_surface_goes_the_exact_way(isa):
-    pixels = grid(32, 32) + 0.1 * np.random.default_rng(6).standard_normal((32, 32, 3))
+    pixels = pixel_grid(32, 32) + 0.1 * np.random.default_rng(6).standard_normal((32, 32, 3))
     scene = fly(scatter(pixels))
     counts = np.zeros(4, np.int64)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
@@ -252,7 +144,7 @@ def test_a_crooked_surface_goes_the_exact_way(isa):
 
 @pytest.mark.parametrize(("range_m", "rough_m"), [(12, 3.0), (2000, 1.5)])  # beyond the series; beyond the window alone
 def test_heights_that_leave_the_windows_are_taken_one_by_one(isa, range_m, rough_m):
-    pixels = grid(33, 21, range_m=range_m)
+    pixels = pixel_grid(33, 21, range_m=range_m)
     pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((33, 21))
     scene = fly(scatter(pixels), range_m=range_m)
     counts = np.zeros(4, np.int64)
@@ -262,7 +154,7 @@ def test_heights_that_leave_the_windows_are_taken_one_by_one(isa, range_m, rough
 
 
 def test_rough_tiles_have_the_same_bits(isa):
-    pixels = grid(40, 56)
+    pixels = pixel_grid(40, 56)
     pixels[..., 2] = 0.02 * np.random.default_rng(6).standard_normal((40, 56))
     tables = native.prepare(fly(scatter(pixels)).profiles(ecef(pixels)))
     whole, part = native.form(tables, ecef(pixels)), native.form(tables, ecef(pixels)[16:, 32:])
@@ -272,8 +164,8 @@ def test_rough_tiles_have_the_same_bits(isa):
 @pytest.mark.parametrize("size", [(1, 1), (17, 3)])
 def test_a_pixel_at_a_phase_centre_is_formed_like_any_other(isa, size):
     antenna = (fly(np.zeros((1, 3)), pulses=3).tx[1] - PLACE) @ AXES
-    pixels = grid(*size) - grid(*size)[0, 0] + antenna
-    scene = fly(scatter(grid(40, 40)) - grid(40, 40)[0, 0] + antenna, pulses=3, bistatic=False)
+    pixels = pixel_grid(*size) - pixel_grid(*size)[0, 0] + antenna
+    scene = fly(scatter(pixel_grid(40, 40)) - pixel_grid(40, 40)[0, 0] + antenna, pulses=3, bistatic=False)
     assert np.linalg.norm(ecef(pixels)[0, 0] - scene.tx[1]) < 1e-8
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels))
     assert np.isfinite(image).all()
@@ -282,7 +174,7 @@ def test_a_pixel_at_a_phase_centre_is_formed_like_any_other(isa, size):
 
 @pytest.mark.parametrize("spacing_m", [0.12, 0.25, 0.6, 2.0])
 def test_coarse_pixels_leave_the_windows_without_leaving_the_truth(isa, spacing_m):
-    pixels = grid(20, 20, spacing_m=spacing_m, range_m=60)
+    pixels = pixel_grid(20, 20, spacing_m=spacing_m, range_m=60)
     scene = fly(scatter(pixels), range_m=60)
     counts = np.zeros(4, np.int64)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
@@ -292,7 +184,7 @@ def test_coarse_pixels_leave_the_windows_without_leaving_the_truth(isa, spacing_
 
 @pytest.mark.parametrize(("range_m", "way"), [(12, 0), (4, 1), (0.6, 2)])
 def test_near_ranges_take_more_exact_paths(isa, range_m, way):
-    pixels = grid(32, 32, range_m=range_m)
+    pixels = pixel_grid(32, 32, range_m=range_m)
     scene = fly(scatter(pixels), range_m=range_m, bistatic=False)
     counts = np.zeros(4, np.int64)
     image = native.form(native.prepare(scene.profiles(ecef(pixels))), ecef(pixels), counts=counts)
@@ -308,7 +200,7 @@ def test_swapping_transmitter_and_receiver_gives_the_same_image(isa, plain):
 
 
 def test_a_constant_height_equals_a_lowered_track(isa):
-    pixels = grid(32, 48)
+    pixels = pixel_grid(32, 48)
     scene = fly(scatter(pixels))
     raised = pixels + np.array([0, 0, 1.5])
     lowered = [antenna - 1.5 * AXES[:, 2] for antenna in (scene.tx, scene.rx)]
@@ -322,7 +214,7 @@ def test_a_raised_target_focuses_where_geometry_predicts(isa):
     height_m, ground_m = 1.0, 12.0
     scene = fly(np.array([[ground_m, 0, height_m]]), bistatic=False)
     laid_over_m = np.sqrt(ground_m**2 + (12 - height_m) ** 2 - 12**2)
-    pixels = grid(48, 96, spacing_m=0.03, range_m=ground_m - 0.5)
+    pixels = pixel_grid(48, 96, spacing_m=0.03, range_m=ground_m - 0.5)
     lifted = pixels + np.array([0, 0, height_m])
     tables = native.prepare(scene.profiles(np.concatenate([ecef(pixels), ecef(lifted)])))
     for surface, expected_m in ((pixels, laid_over_m), (lifted, ground_m)):
@@ -380,12 +272,6 @@ def test_a_pixel_without_a_position_is_nan_and_spoils_no_other(isa, plain, nowhe
     assert error_db(scene, pixels, image) <= -70
 
 
-def test_an_unknown_instruction_set_is_refused(monkeypatch):
-    monkeypatch.setenv("APERTURA_ISA", "sse9")
-    with pytest.raises(ValueError, match="APERTURA_ISA: 'sse9'; expected one of avx512, avx2, portable"):
-        native.instruction_set()
-
-
 def test_bad_input_is_refused(plain):
     profiles = plain[2]
     tables = native.prepare(profiles)
@@ -401,91 +287,3 @@ def test_bad_input_is_refused(plain):
         native.form(tables, np.zeros((4, 4)))
     with pytest.raises(ValueError, match="accumulate"):
         native.form(tables, np.zeros((4, 4, 3)), accumulate="float16")
-
-
-def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
-    assert not native.available()
-    with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
-        native.instruction_set()
-
-
-def test_python_predicts_with_the_constants_of_the_kernel():
-    assert native_binding.kernel_constants() == pytest.approx(asdict(KERNEL), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("was", "becomes", "named"),
-    [
-        ("pulses, padded, width, rows", "pulses, padded, rows, width", "ApertureJob.width"),
-        ("int32_t wide_sum; ", "int64_t wide_sum; ", "ApertureJob.wide_sum"),
-        ("double peak; ", "double peak, sum; ", "BeamJob"),
-    ],
-)
-def test_a_library_of_another_layout_is_refused_by_the_name_of_the_field(was, becomes, named, tmp_path, monkeypatch):
-    compiler = shutil.which("g++")
-    if not compiler:
-        pytest.skip("g++ is needed")
-    shutil.copytree(Path(__file__).parents[1] / "native", tmp_path, dirs_exist_ok=True)
-    job, contract = tmp_path / "job.hpp", tmp_path / "contract.cpp"
-    assert was in job.read_text()
-    job.write_text(job.read_text().replace(was, becomes))
-    library = tmp_path / f"{named}.so"
-    exports = 'extern "C" __attribute__((visibility("default"))) const char* apertura_isa(const char*) { return 0; }\n'
-    contract.write_text(contract.read_text() + exports)
-    subprocess.run([compiler, "-std=c++17", "-shared", "-fPIC", contract, "-o", library], check=True)
-    monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=rf"{named} at .*; expected {named} at byte \d+, \d+ bytes") as refused:
-        native.instruction_set()
-    assert str(library) in str(refused.value)
-
-
-def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
-    compiler = shutil.which("g++")
-    if not compiler:
-        pytest.skip("g++ is needed")
-    library, source = tmp_path / "old.so", tmp_path / "old.cpp"
-    source.write_text('extern "C" const char* apertura_form(const char* name) { return name; }\n')
-    subprocess.run([compiler, "-shared", "-fPIC", source, "-o", library], check=True)
-    monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=r"BeamJob\.axes at no place; expected .* byte 0, 8 bytes"):
-        native.instruction_set()
-
-
-def test_no_environment_variable_means_the_best(monkeypatch):
-    monkeypatch.delenv("APERTURA_ISA", raising=False)
-    assert native.instruction_set() == next(filter(native_binding.runs, native.INSTRUCTION_SETS))
-    assert "APERTURA_ISA" not in os.environ
-
-
-@pytest.mark.slow
-def test_the_kernel_is_clean_under_sanitizers(tmp_path):
-    cmake, compiler = shutil.which("cmake"), shutil.which("g++")
-    if not (cmake and compiler):
-        pytest.skip("cmake and g++ are needed")
-    root = Path(__file__).parents[1]
-    subprocess.run([cmake, "-S", root, "-B", tmp_path, "-DAPERTURA_SANITIZE=ON"], check=True, capture_output=True)
-    subprocess.run([cmake, "--build", tmp_path, "--parallel", "2"], check=True, capture_output=True)
-    runtime = subprocess.run(
-        [compiler, "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
-    ).stdout
-    environment = {
-        **os.environ,
-        "APERTURA_KERNEL": str(tmp_path / "_backprojection.so"),
-        "LD_PRELOAD": runtime.strip(),
-        "ASAN_OPTIONS": "detect_leaks=0",  # Python's own
-    }
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--noconftest",
-        "-m",
-        "not slow",
-        *map(str, Path(__file__).parent.glob("test_34_engine_*.py")),
-    ]
-    done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

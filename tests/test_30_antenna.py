@@ -5,7 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from campaigns import draw
-from test_33_planner import compiled, mono, net, plan, track
+from scenes import (
+    compiled,
+    ecef,
+    fly,
+    ground_points,
+    monostatic,
+    pixel_grid,
+    plan,
+    scatter,
+    side_beam,
+    straight_track,
+    swaying_beam,
+)
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.antenna.illumination import illuminate
@@ -19,15 +31,6 @@ from apertura.planning.planner import make_plan
 from apertura.quality.measures import numerical_error
 
 
-def side(width_deg=(40.0, 60.0), *, boresight_deg=(-90.0, -25.0), pulses=300, cutoff_db=-20.0):
-    """A beam to the left of a body that flies east: northward."""
-    body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
-    cuts = (
-        gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
-    )
-    return Beam(antenna_axes(body, boresight_deg), *(part for cut in cuts for part in cut))
-
-
 def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
     for azimuth, elevation in ((0, 0), (90, -30), (-135, 60), (200, -90)):
         body = body_axes(np.radians([[10.0, -20.0, 30.0]]))
@@ -38,7 +41,7 @@ def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
 
 
 def test_half_the_power_is_left_at_half_the_width_and_nothing_beyond_the_cutoff():
-    beam = side((20.0, 50.0), boresight_deg=(0.0, 0.0), pulses=1)
+    beam = side_beam((20.0, 50.0), boresight_deg=(0.0, 0.0), pulses=1)
     angle = np.radians([10.0, 25.0])
     places = np.array([[np.cos(angle[0]), -np.sin(angle[0]), 0], [np.cos(angle[1]), 0, np.sin(angle[1])], [1, -0.6, 0]])
     np.testing.assert_allclose(beam.gain(np.zeros((1, 3)), places)[0] ** 2, [0.5, 0.5, 0.0], atol=1e-4)
@@ -53,28 +56,28 @@ def test_a_wide_beam_ends_where_directions_do():
 
 def test_a_sampled_cut_keeps_its_main_lobe_alone():
     angle = np.array([-40.0, -30, -20, 0, 20, 30, 40])
-    found, gain = sampled_cut(angle, np.array([-5.0, -13, -60, 0, -60, -13, -5]), cutoff_db=-20)
-    assert np.degrees(found[-1]) == pytest.approx(20 / 3, abs=0.05)
+    kept, gain = sampled_cut(angle, np.array([-5.0, -13, -60, 0, -60, -13, -5]), cutoff_db=-20)
+    assert np.degrees(kept[-1]) == pytest.approx(20 / 3, abs=0.05)
     assert gain.min() >= 0.1
 
 
 def test_pulses_that_see_a_place_are_counted():
-    tx, places = track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
-    beams = Beams(side((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
-    found = illuminate(beams, mono(tx), places)
+    tx, places = straight_track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
+    beams = Beams(side_beam((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
+    lit = illuminate(beams, monostatic(tx), places)
     half_m = np.hypot(20, 10) * np.tan(np.radians(4 * np.sqrt(20 / 12.0412)))
     expected = [2 * half_m / 6 * 3000, (half_m + 1) / 6 * 3000, 0]
-    np.testing.assert_allclose(found.seen, expected, atol=12)
-    assert found.unseen == pytest.approx(1 / 3)
+    np.testing.assert_allclose(lit.seen, expected, atol=12)
+    assert lit.unseen == pytest.approx(1 / 3)
 
 
 def jobs(beams, *, shape=(200, 200)):
-    tx = track()
-    lit = None if beams is None else illuminate(beams, mono(tx), net().reshape(-1, 3))
+    tx = straight_track()
+    lit = None if beams is None else illuminate(beams, monostatic(tx), ground_points().reshape(-1, 3))
     return {"beams": beams, "illumination": lit, "shape": shape}
 
 
-def test_pulses_in_the_dark_cost_less_than_without_beams_and_lit_ones_more():
+def test_pulses_outside_a_beam_cost_less_than_without_beams_and_those_inside_more():
     shared = (1.0, 0.0, 0.0)
     lit, half, dark = (pixel_seconds(shared, 2, PatchWeights(1 - share, 0.0, share, 0.0, 2)) for share in (0, 0.5, 1))
     assert half == pytest.approx((lit + dark) / 2)
@@ -84,31 +87,32 @@ def test_pulses_in_the_dark_cost_less_than_without_beams_and_lit_ones_more():
 @compiled
 def test_a_plan_counts_what_its_beams_cost():
     lit = plan(**jobs(None, shape=(2000, 2000))).predicted_seconds
-    wide = Beams(side((100.0, 100.0), cutoff_db=-40.0), side((100.0, 100.0), cutoff_db=-40.0))
+    wide = Beams(side_beam((100.0, 100.0), cutoff_db=-40.0), side_beam((100.0, 100.0), cutoff_db=-40.0))
     assert plan(**jobs(wide, shape=(2000, 2000))).predicted_seconds > 1.8 * lit
 
 
 @compiled
 @pytest.mark.parametrize("width_deg", [20.0, 35.0, 60.0])
-def test_the_ways_native_weighs_are_foreseen(width_deg):
-    from test_34_engine_beam import beam
-    from test_34_engine_native import ecef, fly, grid, scatter
-
-    pixels = grid(48, 64)
+def test_how_native_applies_weights_is_predicted(width_deg):
+    pixels = pixel_grid(48, 64)
     scene = fly(scatter(pixels), pulses=64)
     places = ecef(pixels)
-    beams = Beams(beam(scene.tx, (12, 0, 0), width_deg, sway_deg=width_deg), beam(scene.rx, (12, 0, 0), width_deg))
+    beams = Beams(
+        swaying_beam(scene.tx, (12, 0, 0), width_deg, sway_deg=width_deg), swaying_beam(scene.rx, (12, 0, 0), width_deg)
+    )
     counts = np.zeros(4, np.int64)
     native.form(native.prepare(scene.profiles(places)), places, beams=beams, counts=counts)
     middle = places[8::16, 8::16]
     steps = np.stack([(places[8::16, 9::16] - middle).reshape(-1, 3), (places[9::16, 8::16] - middle).reshape(-1, 3)])
-    found = patch_weights(beams, Aperture(scene.tx, scene.rx), steps, middle.reshape(-1, 3))
-    np.testing.assert_allclose([found.smooth, found.pixelwise, found.dark], counts[1:] / counts.sum(), atol=0.1)
+    predicted = patch_weights(beams, Aperture(scene.tx, scene.rx), steps, middle.reshape(-1, 3))
+    np.testing.assert_allclose(
+        [predicted.smooth, predicted.pixelwise, predicted.dark], counts[1:] / counts.sum(), atol=0.1
+    )
 
 
 @compiled
 def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
-    beams = Beams(side((8.0, 16.0)), side((8.0, 16.0)))
+    beams = Beams(side_beam((8.0, 16.0)), side_beam((8.0, 16.0)))
     assert plan(-60.0, **jobs(beams)).engine == "native"
     fine = plan(-100.0, **jobs(beams))
     assert fine.engine != "native"
@@ -136,12 +140,12 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     across_deg = np.degrees(64 * drawn.grid.spacing_m / np.linalg.norm(middle - aperture.tx_m[45]))
     beams = Beams(*(aimed(position, middle, min(60.0, widths * across_deg)) for position in aperture.legs))
     lit = illuminate(beams, aperture, drawn.job.points_m)
-    found = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db)
-    engine = load_engine(found.engine)
-    inputs = {"phase_history": drawn.history, "profiles": found.inputs(drawn.profiles)}[engine.READS]
+    planned = make_plan(replace(drawn.job, beams=beams, illumination=lit), accuracy_db=drawn.accuracy_db)
+    engine = load_engine(planned.engine)
+    inputs = {"phase_history": drawn.history, "profiles": planned.inputs(drawn.profiles)}[engine.READS]
     places = drawn.grid.positions(0.0)
     image = engine.form(
-        engine.prepare(inputs, **found.setting.options), places, beams=beams, **found.setting.form_options
+        engine.prepare(inputs, **planned.setting.options), places, beams=beams, **planned.setting.form_options
     )
     some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
     exact = reference.form(drawn.history, places[some], beams=beams)

@@ -1,0 +1,151 @@
+"""Campaign folders for tests: copied, edited by hand, carried through every step in this process."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.simulation import (
+    CampaignSpecification,
+    Framing,
+    ImageGrid,
+    Impairments,
+    Origin,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    WaveformSpecification,
+)
+from apertura.simulation.observation import Observation, fly
+from apertura.simulation.scene import scatterers
+from apertura.simulation.specification import DrawnCampaign, draw_campaign
+from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
+
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared" / "data"
+
+
+def copy_writable(source: Path, target: Path) -> Path:
+    """Copy a folder to one that may be changed, and return that."""
+    shutil.copytree(source, target, copy_function=shutil.copyfile)
+    for folder in [target, *(path for path in target.rglob("*") if path.is_dir())]:
+        folder.chmod(0o755)
+    return target
+
+
+def settle_ground(campaign: Campaign) -> None:
+    """Run the steps between echo and profile."""
+    scene.scene(campaign)
+    if campaign.settings.scene.dem:
+        terrain.terrain(campaign)
+
+
+def ingest_all(campaign: Campaign) -> None:
+    """Ingest what both nodes of flight f01 recorded."""
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+
+
+def run_steps(root: Path, *, exports: bool = True) -> Campaign:
+    """Run every step of a campaign in this process, as the workflow would."""
+    campaign = Campaign.load(root)
+    for flight in campaign.image_flights:
+        if campaign.settings.waveform.kind == "ofdm":
+            for node in flight.nodes:
+                ingest.ingest(campaign, flight.name, node)
+        for pair in flight.pairs:
+            echo.echo(campaign, flight.name, pair)
+    settle_ground(campaign)
+    for flight in campaign.image_flights:
+        for pair in flight.pairs:
+            profile.profile(campaign, flight.name, pair)
+            image.image(campaign, flight.name, pair, threads=2)
+            if exports:
+                export.export(campaign, flight.name, pair)
+    cube.cube(campaign)
+    if exports:
+        layers.layers(campaign, threads=2)
+        for flight in campaign.image_flights:
+            export.export_fused(campaign, flight.name)
+    return campaign
+
+
+def edit_config(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a campaign's config in place."""
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    change(document)
+    path.write_text(yaml.safe_dump(document))
+
+
+def edit_meta(root: Path, node: str, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change what the SigMF file of a node says of its recording."""
+    path = root / "raw" / "f01" / f"{node}.sigmf-meta"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def edit_data(root: Path, node: str, change: Callable[[np.ndarray], object]) -> None:
+    """Rewrite the samples and their hash: damage that only the content shows."""
+    path = root / "raw" / "f01" / f"{node}.sigmf-data"
+    samples = np.fromfile(path, "<i2")
+    change(samples)
+    samples.tofile(path)
+    digest = hashlib.sha512(path.read_bytes()).hexdigest()
+    edit_meta(root, node, lambda meta: meta["global"].update({"core:sha512": digest}))
+
+
+def edit_track(root: Path, node: str, change: Callable[[list[str]], list[str]]) -> None:
+    """Change the lines of a node's log."""
+    path = next((root / "raw" / "f01").glob(f"{node}.track.*"))
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+
+def complaint(work: Callable[[], object]) -> str:
+    """Return the message of the `CampaignError` that the work must end with."""
+    with pytest.raises(CampaignError) as caught:
+        work()
+    return str(caught.value)
+
+
+def small_simulation(
+    *,
+    framing: Framing | None = None,
+    continuous: bool = False,
+    secondary: Impairments | None = None,
+    pulses: int = 6,
+    **flight: Any,
+) -> CampaignSpecification:
+    """Two nodes at a low sampling rate; pulses 2 ms apart, so that a continuous recording stays small."""
+    waveform = WaveformSpecification(64, 1.2e9 + 4567e3, 250e3, 5e-6, 2e-6, 32e6, 500.0)
+    tracks = {"a": Straight((-2.0, -11.0, 5.0), (5.0, 0.0, 0.0)), "b": Straight((2.7, -11.0, 5.0), (5.0, 0.0, 0.0))}
+    targets = (PointTarget((0.0, 0.0, 0.0)), PointTarget((1.0, 2.0, 0.5), 0.5))
+    nodes = {
+        "a": SimulatedNode({"radar_rx": (0.3, 0.0, 0.0)}),
+        "b": SimulatedNode(impairments=secondary or Impairments()),
+    }
+    plan = SimulatedFlight("f01", "a", tracks, pulses, framing=framing, continuous=continuous, **flight)
+    grid = ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.05)
+    return CampaignSpecification("small", Origin(48.0, 9.0, 500.0), waveform, targets, nodes, (plan,), grid)
+
+
+def recordings_of(specification: CampaignSpecification) -> tuple[dict[str, Observation], DrawnCampaign]:
+    """What each node of the first flight records, and the campaign that was drawn."""
+    campaign = draw_campaign(specification, np.random.default_rng(1))
+    standing = scatterers(specification.origin, specification.targets, np.random.default_rng(0))
+    return fly(campaign, specification.flights[0], standing, np.random.default_rng(0)), campaign
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}

@@ -1,0 +1,214 @@
+"""Small radar scenes as arrays: straight flights over flat ground, turned frames, antenna beams."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beam
+from apertura.antenna.pattern import antenna_axes, gaussian_cut
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.focus.engines import native
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.job import Job, Signal
+from apertura.geometry.aperture import Aperture
+from apertura.planning.plan import Plan
+from apertura.planning.planner import make_plan
+from apertura.scene.grid import SceneGrid
+from apertura.scene.ground_models import GroundModels
+from apertura.scene.terrain import FlatGround, GridHeights
+
+compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
+WAVELENGTH = C / 1.2e9
+
+# A straight flight along east, flat ground north of it
+
+
+def ground_points(size_m: float = 10.0, *, north_m: float = 20.0, count: int = 5) -> NDArray[np.float64]:
+    """(count, count, 3) places on flat ground north of the track, rows going south."""
+    east, north = np.meshgrid(np.linspace(-size_m / 2, size_m / 2, count), north_m + np.linspace(size_m, 0, count))
+    return np.stack([east, north, 0 * east], -1)
+
+
+def straight_track(
+    pulses: int = 300, *, length_m: float = 6.0, height_m: float = 10.0, wobble_m: float = 0.0
+) -> NDArray[np.float64]:
+    """(pulse, 3) eastward at north 0; the wobble is an amplitude, up and down."""
+    along = np.linspace(-length_m / 2, length_m / 2, pulses)
+    return np.stack([along, 0 * along, height_m + wobble_m * np.sin(2 * np.pi * along / length_m * 3)], -1)
+
+
+def monostatic(track_m: NDArray[np.float64]) -> Aperture:
+    return Aperture(track_m, track_m)
+
+
+def planning_job(**changes: Any) -> Job:
+    """What the planner is told of that flight, 400 MHz at 1.2 GHz."""
+    signal = Signal(1.2e9, 2.0, C / 800e6, 120)
+    plain = Job(
+        monostatic(straight_track()), ground_points(), (200, 200), 0.05, 1.2e9, 400e6, 512, signal, frame="local"
+    )
+    return replace(plain, **changes)
+
+
+def plan(accuracy_db: float = -60.0, *, overrides: Mapping[str, Any] | None = None, **changes: Any) -> Plan:
+    """What the planner makes of that flight."""
+    return make_plan(planning_job(**changes), accuracy_db=accuracy_db, overrides=overrides)
+
+
+def ground_of(heights: NDArray[np.float64], level_m: float = 0.0) -> GroundModels:
+    """A ground of one height per pixel of 5 cm."""
+    grid = SceneGrid("local", 0.0, 10.0, 0.05, heights.shape)
+    return GroundModels.of(GridHeights(grid, heights), FlatGround(level_m), grid)
+
+
+TARGET = np.array([[1.25, -0.75, 0.0]])
+TARGET_GRID = SceneGrid("local", -4.0, 4.0, 0.05, (160, 160))
+
+
+def point_history(pulses: int = 96) -> PhaseHistory:
+    """Echoes of `TARGET` from a straight track 20 m south of the middle of `TARGET_GRID`."""
+    frequency = 1.2e9 + 2e6 * np.arange(200)
+    along = np.linspace(-4, 4, pulses)
+    track = np.stack([along, np.full(pulses, -20.0), np.full(pulses, 10.0)], -1)
+    flown = Aperture(track, track + [0.5, 0.0, 0.0])
+    echo = np.exp(-2j * np.pi * frequency * flown.path(TARGET) / C).astype(np.complex64)
+    return PhaseHistory(echo, frequency, np.full(200, 1 / 200), np.zeros(pulses), flown)
+
+
+UTM_GRID = SceneGrid("EPSG:32632", 500020.0, 5400060.0, 0.5, (70, 90))
+
+# A bent bistatic flight somewhere on Earth, axes aligned with nothing
+
+AXES, PLACE = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0], np.array([4.1e6, 0.9e6, 4.8e6])
+SUBCARRIERS, BANDWIDTH_HZ = 128, 409.6e6
+GUARD = 12
+
+
+def ecef(local: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From local east, north, up to ECEF: nothing may depend on axes being aligned."""
+    return local @ AXES.T + PLACE
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What was flown, and the calibrated spectra it gave; positions in ECEF."""
+
+    transfer: NDArray[np.complex128]
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    carrier_hz: float
+
+    @property
+    def offset_hz(self) -> NDArray[np.float64]:
+        return (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2) * BANDWIDTH_HZ / SUBCARRIERS
+
+    def path_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sum(np.linalg.norm(place - antenna[:, None], axis=-1) for antenna in (self.tx, self.rx))
+
+    def history(self) -> PhaseHistory:
+        frequency, silent = self.carrier_hz + self.offset_hz, np.zeros(len(self.tx))
+        return PhaseHistory(self.transfer, frequency, np.ones(frequency.size), silent, Aperture(self.tx, self.rx))
+
+    def profiles(self, around: NDArray[np.float64]) -> Profiles:
+        paths = self.path_m(around.reshape(-1, 3))
+        step_m = C / BANDWIDTH_HZ / 2
+        start = paths.min(1) - GUARD * step_m
+        length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
+        at = start[:, None] + step_m * np.arange(length)
+        turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
+        samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
+        return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
+
+    def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
+        delay = self.path_m(places) / C
+        inner = np.einsum("pxn,pn->px", np.exp(2j * np.pi * delay[..., None] * self.offset_hz), self.transfer)
+        return (inner * np.exp(2j * np.pi * self.carrier_hz * delay)).sum(0)
+
+
+def fly(
+    targets: NDArray[np.float64],
+    *,
+    pulses: int = 70,
+    bistatic: bool = True,
+    carrier_hz: float = 1.2e9,
+    range_m: float = 12.0,
+) -> Scene:
+    """Echoes of targets (local metres, around x = range_m) seen from height range_m, aperture equal to the range."""
+    along = np.linspace(-0.5, 0.5, pulses)[:, None] * range_m
+    bend = np.sin(np.linspace(0, 7, pulses))[:, None]
+    tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
+    rx = ecef(np.hstack([-1.5 + along / 7, 3 + 0.8 * along, 1.2 * range_m - 0.04 * bend])) if bistatic else tx.copy()
+    empty = Scene(np.zeros((pulses, SUBCARRIERS), complex), tx, rx, carrier_hz)
+    amplitude = np.exp(2j * np.pi * np.arange(len(targets)) * 0.618)
+    delay = empty.path_m(ecef(targets)) / C
+    waves = np.exp(-2j * np.pi * delay[..., None] * (carrier_hz + empty.offset_hz))
+    return replace(empty, transfer=np.einsum("ptn,t->pn", waves, amplitude))
+
+
+def pixel_grid(
+    rows: int, columns: int, *, spacing_m: float = 0.05, turned_deg: float = 0.0, range_m: float = 12.0
+) -> NDArray[np.float64]:
+    """(y, x, 3) local pixels around (range_m, 0)."""
+    across, along = np.meshgrid(
+        spacing_m * (np.arange(columns) - columns / 2), spacing_m * (np.arange(rows) - rows / 2)
+    )
+    turn = np.radians(turned_deg)
+    x, y = across * np.cos(turn) - along * np.sin(turn), across * np.sin(turn) + along * np.cos(turn)
+    return np.stack([x + range_m, y, 0 * x], -1)
+
+
+def scatter(pixels: NDArray[np.float64], count: int = 25) -> NDArray[np.float64]:
+    """Random ones of the pixels, for targets to stand on."""
+    return pixels.reshape(-1, 3)[np.random.default_rng(2).integers(0, pixels[..., 0].size, count)]
+
+
+def error_db(scene: Scene, pixels: NDArray[np.float64], image: NDArray[np.complex64], count: int = 150) -> float:
+    """RMS error of random pixels, no gain taken out."""
+    pick = np.random.default_rng(3).integers(0, image.size, count)
+    truth = scene.exact(ecef(pixels).reshape(-1, 3)[pick])
+    return decibels(image.ravel()[pick] - truth, truth)
+
+
+def decibels(difference: NDArray[np.complexfloating], truth: NDArray[np.complexfloating]) -> float:
+    return float(10 * np.log10(np.sum(np.abs(difference) ** 2) / np.sum(np.abs(truth) ** 2) + 1e-30))
+
+
+# Antenna beams
+
+
+def side_beam(
+    width_deg: tuple[float, float] = (40.0, 60.0),
+    *,
+    boresight_deg: tuple[float, float] = (-90.0, -25.0),
+    pulses: int = 300,
+    cutoff_db: float = -20.0,
+) -> Beam:
+    """A beam to the left of a body that flies east: northward."""
+    body = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), (pulses, 3, 3))
+    cuts = (
+        gaussian_cut(w, cutoff_db=cutoff_db, limit_rad=x) for w, x in zip(width_deg, (np.pi, np.pi / 2), strict=True)
+    )
+    return Beam(antenna_axes(body, boresight_deg), *(part for cut in cuts for part in cut))
+
+
+def swaying_beam(
+    antenna: NDArray[np.float64], at: tuple[float, float, float], width_deg: float = 40.0, *, sway_deg: float = 15.0
+) -> Beam:
+    """A Gaussian beam (width at half power, cut where it has fallen to nothing) kept on one local place, swaying."""
+    boresight = ecef(np.array(at)) - antenna
+    boresight /= np.linalg.norm(boresight, axis=-1, keepdims=True)
+    sideways = np.cross(AXES[:, 2], boresight)
+    sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
+    axes = np.stack([boresight, sideways, np.cross(boresight, sideways)], 1)
+    sway = np.radians(sway_deg) * np.sin(np.arange(len(antenna)))
+    turn = np.zeros((len(antenna), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(sway)
+    turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = np.sin(sway), -np.sin(sway), 1
+    edge = np.radians(2.2 * width_deg)
+    angle = np.linspace(-edge, edge, 701)
+    gain = np.exp(-2 * np.log(2) * (angle / np.radians(width_deg)) ** 2)
+    return Beam(turn @ axes, angle, gain, angle[150:-150], gain[150:-150])

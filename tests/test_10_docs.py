@@ -1,0 +1,153 @@
+"""What the documents name is there: files, tests, commands, dotted names and keys of the config."""
+
+import json
+import pkgutil
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config/README.md"]
+)
+GUIDE = ROOT / "docs/finding_your_way.md"
+PLACES = (ROOT, ROOT / "src/apertura")
+SOURCES = ("src", "native", "tests", "workflow", "benchmarks")
+
+_FILE = re.compile(r"(?<![\w/<>.*-])((?:[\w.*-]+/)*[\w*-]+\.(?:py|hpp|cpp|smk|md|toml|yml|rst))\b(?![\w/])")
+_FOLDER = re.compile(r"(?<![\w/<>.-])((?:src|docs|tests|native|workflow|benchmarks|profiles|requirements)/[\w./*-]*)")
+_LINK = re.compile(r"\]\(([^)#:]+)\)")
+_TEST = re.compile(r"\btest_\w+(?![\w*]|\.py)")
+_DOTTED = re.compile(r"`((?:apertura|ap)\.[\w.]+(?::\w+)?)(?:\([^`]*)?`")
+_COMMAND = re.compile(r"\bapertura (step |study )?([a-z]+(?:-[a-z]+)*)\b")
+_KEY = re.compile(r"`((?:waveform|nodes|scene|processing|calibration)\.(?!py)[\w.<>]+)`")
+
+_CITED = re.compile(r"(docs/[\w/]+\.md)((?:[,;]? (?:and )?(?:eqs?\. [\w]+|\"[^\"]+\"))+)")
+
+_NAME_IN_FILE = re.compile(r"`(\w+)` (?:of `\w+` )?in `([\w/.]+\.(?:py|hpp|cpp|smk))`")
+
+ENTRY_POINTS = {"apertura.exports"}
+"""Groups of entry points: names, but not of modules."""
+
+parametrized = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+
+
+def text_of(document):
+    return document.read_text(encoding="utf-8")
+
+
+def is_there(name, document):
+    """A path counts from the root, src/apertura or the document; a name alone may stand anywhere in the code."""
+    if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
+        return True
+    return "/" not in name and any(any((ROOT / folder).rglob(name)) for folder in SOURCES)
+
+
+@parametrized
+def test_every_file_that_a_document_names_is_there(document):
+    text = text_of(document)
+    named = {*_FILE.findall(text), *(name for name in _FOLDER.findall(text) if "." not in Path(name).name)}
+    assert [name for name in sorted(named) if not is_there(name, document)] == []
+    assert [link for link in _LINK.findall(text) if not (document.parent / link).exists()] == []
+
+
+@parametrized
+def test_every_test_that_a_document_cites_exists(document):
+    written = set(re.findall(r"^\s*def (test_\w+)", "\n".join(map(text_of, ROOT.glob("tests/*.py"))), re.M))
+    assert sorted(set(_TEST.findall(text_of(document))) - written) == []
+
+
+@pytest.mark.parametrize(
+    "document", [*ROOT.glob("docs/theory/*.md"), *ROOT.glob("docs/[gt]*.md")], ids=lambda path: path.stem
+)
+def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code(document):
+    files = [
+        ROOT / "config/schema.json",
+        *(ROOT / "native").glob("*.?pp"),
+        *ROOT.glob("src/**/*.py"),
+        *ROOT.glob("tests/*.py"),
+    ]
+    code = set(re.findall(r"\w+", "\n".join(map(text_of, files))))
+    quoted = [name for name in re.findall(r"`([^`\n]+)`", text_of(document)) if not re.search(r"[/*{]|\.\w+$", name)]
+    words = {word for name in quoted for word in re.findall(r"[A-Za-z]\w*", name) if re.search(r"_|[a-z][A-Z]", word)}
+    assert sorted(words - code) == []
+
+
+@parametrized
+def test_every_dotted_name_in_a_document_resolves(document):
+    for name in sorted(set(_DOTTED.findall(text_of(document))) - ENTRY_POINTS):
+        assert pkgutil.resolve_name(re.sub(r"^ap\.", "apertura.", name)) is not None
+
+
+@parametrized
+def test_every_command_that_a_document_gives_exists(document):
+    from typer.main import get_command
+
+    from apertura.cli import app
+
+    commands = get_command(app).commands
+    shown = re.findall(r"`([^`\n]*)`|^(?:    |\$ )(.*)$", text_of(document), re.M)
+    for group, command in _COMMAND.findall("\n".join("".join(pair) for pair in shown)):
+        known = commands[group.strip()].commands if group else commands
+        assert command in known, f"apertura {group}{command}"
+
+
+@parametrized
+def test_every_key_of_the_config_that_a_document_names_exists(document):
+    schema = json.loads((ROOT / "config/schema.json").read_text(encoding="utf-8"))
+    parts = [schema, *schema["$defs"].values()]
+    keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "reference"}
+    named = {word for key in _KEY.findall(text_of(document)) for word in key.split(".") if not word.startswith("<")}
+    assert sorted(named - keys) == []
+
+
+@parametrized
+def test_a_name_that_a_document_puts_in_a_file_stands_there(document):
+    for name, file in _NAME_IN_FILE.findall(text_of(document)):
+        path = next(place / file for place in PLACES if (place / file).is_file())
+        assert re.search(rf"\b{name}\b", text_of(path)), f"{file} has no {name}"
+
+
+def test_the_first_name_of_every_answer_of_the_guide_stands_in_its_file():
+    rows = re.findall(r"^\| (.+\?) \| `([^`]+)` \|(.*)\|$", text_of(GUIDE), re.M)
+    assert len(rows) >= 20
+    for question, file, answer in rows:
+        names = re.match(r"(?: `\w+`,?)*", answer)[0]
+        for name in re.findall(r"\w+", names):
+            assert re.search(rf"\b{name}\b", text_of(ROOT / file)), f"{question} {file} has no {name}"
+
+
+def test_every_flag_is_explained_and_named_where_it_is_raised():
+    rows = re.findall(r"^\| (`.+`) \|.*\| `([\w/]+\.py)`.*\|$", text_of(ROOT / "docs/flags.md"), re.M)
+    explained = {name: file for names, file in rows for name in re.findall(r"`(\w+)`", names)}
+    for name, file in explained.items():
+        assert re.search(rf"\b{name}\b|\b{name.rpartition('_')[0]}_\{{", text_of(ROOT / file)), f"{file} has no {name}"
+    code = "\n".join(map(text_of, ROOT.glob("src/apertura/*/*.py")))
+    assert set(re.findall(r"(?:flags|crossed)\[\"(\w+)\"\] =", code)) <= explained.keys()
+
+
+def test_every_heading_that_the_code_cites_stands_in_its_document():
+    cited = 0
+    for source in [*ROOT.glob("src/**/*.py"), *ROOT.glob("native/*.?pp"), *ROOT.glob("tests/*.py")]:
+        for document, what in _CITED.findall(re.sub(r"\s+(?:// )?", " ", text_of(source))):
+            text = text_of(ROOT / document)
+            for heading in re.findall(r"\"([^\"]+)\"", what):
+                assert re.search(rf"^(#+ (\d\. )?|\*\*){re.escape(heading)}\b", text, re.M), (
+                    f"{source}: {document}, {heading}"
+                )
+                cited += 1
+            for number in re.findall(r"eqs?\. (\w+)", what):
+                assert re.search(rf"\({number}\)|eqs?\. {number}\b|to {number}\)", text), (
+                    f"{source}: {document}, eq. {number}"
+                )
+                cited += 1
+    assert cited > 50
+
+
+def test_the_floors_told_to_contributors_are_those_that_imports_are_checked_against():
+    contract = tomllib.loads(text_of(ROOT / "pyproject.toml"))["tool"]["importlinter"]["contracts"][0]
+    checked = [set(re.findall(r"apertura\.(\w+)", floor)) for floor in contract["layers"]]
+    told = re.findall(r"^\| \d+ \| ([^|]+) \|", text_of(ROOT / "CONTRIBUTING.md"), re.M)
+    assert [set(re.findall(r"`(\w+)(?:/|\.py)`", floor)) for floor in told] == checked

@@ -1,0 +1,191 @@
+"""Terrain: heights where they are true, datums never guessed, and what of it a radar can see."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+from rasterio.transform import from_origin
+from scenes import UTM_GRID
+
+from apertura.errors import CampaignError
+from apertura.scene import geoid
+from apertura.scene.dem_file import open_dem
+from apertura.scene.grid import SceneGrid
+
+
+def write_dem(path, heights, transform, crs="EPSG:32632", **profile):
+    rows, columns = heights.shape
+    shape = {"height": rows, "width": columns, "count": 1, "dtype": heights.dtype}
+    with rasterio.open(path, "w", "GTiff", crs=crs, transform=transform, **shape, **profile) as raster:
+        raster.write(heights, 1)
+    return path
+
+
+def plane_dem(path, slope=(0.0, 0.0), base=600.0, crs="EPSG:32632", **profile):
+    """Posts every 2 m from (500000, 5400100) to the south-east; `slope` east and north, metres per metre."""
+    east, north = 500001.0 + 2 * np.arange(60), 5400099.0 - 2 * np.arange(60)
+    heights = base + slope[0] * (east[None] - 500060) + slope[1] * (north[:, None] - 5400040)
+    return write_dem(path, heights, from_origin(500000, 5400100, 2, 2), crs, **profile)
+
+
+# Heights
+
+
+def test_a_plane_comes_out_of_the_dem_as_a_plane(tmp_path):
+    heights = open_dem(plane_dem(tmp_path / "dem.tif", (0.3, -0.2)), UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
+    expected = 600 + 0.3 * (UTM_GRID.x_m[None] - 500060) - 0.2 * (UTM_GRID.y_m[:, None] - 5400040)
+    np.testing.assert_allclose(heights, expected, atol=1e-6)
+
+
+def test_a_dem_in_another_crs_puts_its_posts_where_they_are(shared):
+    """Each post of the isce3 DEM, looked up at its own place in UTM, has its own height."""
+    path = shared / "dem_isce3" / "SanAnd_dem.tif"
+    with rasterio.open(path) as raster:
+        posts, transform = raster.read(1), raster.transform
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32611", always_xy=True)
+    terrain = open_dem(path, "EPSG:32611", datum="ellipsoid")
+    for row, column in ((0, 0), (120, 50), (251, 107)):
+        x, y = to_utm.transform(*(transform @ (column + 0.5, row + 0.5)))
+        place = SceneGrid("EPSG:32611", x - 0.5, y + 0.5, 1.0, (1, 1))
+        assert terrain.heights(place)[0, 0] == pytest.approx(posts[row, column], abs=2e-3)
+
+
+def test_egm96_heights_become_ellipsoidal_by_the_undulation_in_the_grid_file(shared):
+    """Against the .gtx read directly, without PROJ."""
+    path, gtx = shared / "dem_isce3" / "SanAnd_dem.tif", shared / "dem_isce3" / "egm96_15.gtx"
+    grid = SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (60, 50))
+    raised = open_dem(path, grid.crs, datum="egm96", geoid=gtx).heights(grid)
+    raw = open_dem(path, grid.crs, datum="ellipsoid").heights(grid)
+    with rasterio.open(gtx) as raster:
+        undulations, inverse = raster.read(1).astype(float), ~raster.transform
+    x, y = np.meshgrid(grid.x_m, grid.y_m)
+    longitude, latitude = Transformer.from_crs(grid.crs, "EPSG:4326", always_xy=True).transform(x, y)
+    column, row = inverse @ (longitude, latitude)
+    column, row = column - 0.5, row - 0.5
+    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+    low, high = ((1 - column % 1) * undulations[k, j] + column % 1 * undulations[k, j + 1] for k in (i, i + 1))
+    np.testing.assert_allclose(raised - raw, (1 - row % 1) * low + row % 1 * high, atol=1e-3)
+    assert -36 < (raised - raw).mean() < -34
+
+
+def test_a_pixel_has_the_same_height_in_whatever_window(shared):
+    path, gtx = shared / "dem_isce3" / "SanAnd_dem.tif", shared / "dem_isce3" / "egm96_15.gtx"
+    grid = SceneGrid("EPSG:32611", 368000.0, 3783000.0, 7.0, (100, 130))
+    terrain = open_dem(path, grid.crs, datum="egm96", geoid=gtx)
+    whole = terrain.heights(grid)
+    for window in grid.tiles(48):
+        np.testing.assert_array_equal(terrain.heights(grid[window]), whole[window])
+
+
+def test_a_missing_geoid_grid_is_an_error_that_names_it(shared, monkeypatch, tmp_path):
+    monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
+    path = shared / "dem_isce3" / "SanAnd_dem.tif"
+    with pytest.raises(CampaignError, match=r"us_nga_egm96_15\.tif or egm96_15\.gtx.*scene\.geoid"):
+        open_dem(path, "EPSG:32611", datum="egm96")
+    with pytest.raises(CampaignError, match=r"us_nga_egm08_25\.tif"):
+        open_dem(path, "EPSG:32611", datum="egm2008")
+    with pytest.raises(CampaignError, match=r"nowhere\.gtx: no such file"):
+        open_dem(path, "EPSG:32611", datum="egm96", geoid=tmp_path / "nowhere.gtx")
+
+
+def test_a_geoid_grid_is_taken_from_the_search_path_of_proj(shared, monkeypatch, tmp_path):
+    folder = tmp_path / "with space"
+    folder.mkdir()
+    (folder / "egm96_15.gtx").write_bytes((shared / "dem_isce3" / "egm96_15.gtx").read_bytes())
+    monkeypatch.setenv("PROJ_DATA", str(folder))
+    terrain = open_dem(shared / "dem_isce3" / "SanAnd_dem.tif", "EPSG:32611", datum="egm96")
+    assert terrain.geoid == folder / "egm96_15.gtx"
+    assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3)))).all()
+
+
+def test_a_geoid_grid_in_the_working_folder_opens_by_its_bare_name(shared, monkeypatch):
+    """As the workflow names it, from inside the campaign folder."""
+    monkeypatch.chdir(shared / "dem_isce3")
+    terrain = open_dem(Path("SanAnd_dem.tif"), "EPSG:32611", datum="egm96", geoid=Path("egm96_15.gtx"))
+    assert np.isfinite(terrain.heights(SceneGrid("EPSG:32611", 368000.0, 3783000.0, 40.0, (3, 3)))).all()
+
+
+def test_the_grid_of_another_geoid_is_refused(shared):
+    with pytest.raises(CampaignError, match="another geoid than egm2008"):
+        geoid.geoid_file("egm2008", shared / "dem_isce3" / "egm96_15.gtx")
+
+
+def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypatch):
+    monkeypatch.setattr(geoid, "grid_folders", lambda: [tmp_path])
+    gtx = shared / "dem_isce3" / "egm96_15.gtx"
+    carrying = plane_dem(tmp_path / "carrying.tif", crs="EPSG:32632+5773")
+    silent = plane_dem(tmp_path / "silent.tif")
+    carried = open_dem(carrying, UTM_GRID.crs, datum="carried", geoid=gtx).heights(UTM_GRID)
+    stated = open_dem(silent, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
+    np.testing.assert_allclose(carried, stated, atol=1e-6)
+    assert 45 < (carried - 600).mean() < 50
+    with pytest.raises(CampaignError, match="heights of egm96 by its own CRS"):
+        open_dem(carrying, UTM_GRID.crs, datum="ellipsoid")
+    with pytest.raises(CampaignError, match="a CRS without heights"):
+        open_dem(silent, UTM_GRID.crs, datum="carried")
+    with pytest.raises(CampaignError, match=r"de_bkg_gcg2016\.tif"):
+        open_dem(plane_dem(tmp_path / "de.tif", crs="EPSG:25832+7837"), UTM_GRID.crs, datum="carried")
+
+
+@pytest.mark.parametrize(
+    ("west", "sides"), [(499990.0, "to the west"), (500100.0, "to the east"), (500200.0, "100.0 % of the scene")]
+)
+def test_a_dem_that_does_not_reach_says_how_much_is_missing_and_where(tmp_path, west, sides):
+    terrain = open_dem(plane_dem(tmp_path / "dem.tif"), UTM_GRID.crs, datum="ellipsoid")
+    terrain.check_cover(UTM_GRID)
+    grid = SceneGrid(UTM_GRID.crs, west, 5400060.0, 0.5, (70, 90))
+    with pytest.raises(CampaignError, match=sides) as caught:
+        terrain.check_cover(grid)
+    share = float(str(caught.value).split(": ")[1].split(" %")[0])
+    missing = np.mean((grid.x_m < 500000) | (grid.x_m > 500120))
+    assert share == pytest.approx(100 * missing, abs=1.5)
+    assert np.isnan(terrain.heights(grid)).mean() == pytest.approx(missing, abs=0.02)
+
+
+@pytest.mark.parametrize("void", ["nan", "nodata"])
+def test_a_void_reaches_as_far_as_its_post_counts_and_no_further(tmp_path, void):
+    heights = np.full((60, 60), 600.0, np.float32)
+    heights[30, 20] = np.nan if void == "nan" else -9999
+    nodata = {} if void == "nan" else {"nodata": -9999}
+    path = write_dem(tmp_path / "dem.tif", heights, from_origin(500000, 5400100, 2, 2), **nodata)
+    heights_m = open_dem(path, UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
+    x, y = np.meshgrid(UTM_GRID.x_m, UTM_GRID.y_m)
+    near = (np.abs(x - 500041) < 2) & (np.abs(y - 5400039) < 2)
+    np.testing.assert_array_equal(np.isnan(heights_m), near)
+
+
+@pytest.mark.parametrize("wild", [-9999.0, -32768.0, 3.4e38, 29029.0])
+def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
+    """Posts 20 and 21 of row 30 are under the scene, row 2 is not; in a local frame anything goes."""
+    heights = np.full((60, 60), 600.0)
+    heights[2] = wild
+    path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
+    assert np.all(open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID) == 600)
+    heights[30, 20:22] = wild
+    terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
+    with pytest.raises(CampaignError, match=r"dem\.tif: 2 of the \d+ posts in rows ") as caught:
+        terrain.heights(UTM_GRID)
+    assert f"most often {wild:g} m" in str(caught.value)
+    local = open_dem(write_dem(path, heights, corner, crs=None), "local", datum="carried")
+    assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90)))).all()
+
+
+def test_a_file_that_is_no_dem_is_refused(tmp_path):
+    (tmp_path / "dem.tif").write_text("not a raster")
+    for path, expected in (
+        (tmp_path / "dem.tif", "not readable"),
+        (tmp_path / "none.tif", "no such file"),
+        (write_dem(tmp_path / "bare.tif", np.zeros((4, 4)), from_origin(0, 4, 1, 1), crs=None), "no CRS on Earth"),
+    ):
+        with pytest.raises(CampaignError, match=expected):
+            open_dem(path, UTM_GRID.crs, datum="ellipsoid")
+    with pytest.raises(CampaignError, match="under a scene in the local frame"):
+        open_dem(plane_dem(tmp_path / "utm.tif"), "local", datum="carried")
+
+
+# Focusing
+
+
+# Seeing

@@ -1,0 +1,125 @@
+"""The grid of a campaign: pixels, windows and positions; automatic bounds and spacing; the range it takes up."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyproj import Geod, Transformer
+from scenes import UTM_GRID
+
+from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
+from apertura.geometry.geodesy import ecef_from_projected, projected_from_ecef
+from apertura.scene.auto_grid import auto_bounds, utm_crs
+from apertura.scene.grid import SceneGrid
+from apertura.scene.pixel_positions import block
+from apertura.scene.swath import swath
+from apertura.scene.terrain import FlatGround
+
+
+def test_places_above_the_scene_come_back_as_rows_columns_and_heights():
+    antenna = UTM_GRID.positions_at([3.0], [-20.0], 650.0)
+    np.testing.assert_allclose(UTM_GRID.pixel_below(antenna), [[3.0, -20.0, 650.0]], atol=1e-6)
+    np.testing.assert_allclose(projected_from_ecef(UTM_GRID.crs, antenna)[0, 2], 650.0, atol=1e-6)
+
+
+def test_the_grid_is_anchored_at_its_north_west_corner():
+    grid = SceneGrid.from_bounds("EPSG:32632", (570656.9, 5363687.65, 570670.9, 5363701.65), spacing_m=0.05)
+    assert grid.shape == (280, 280)
+    np.testing.assert_allclose(grid.bounds_m, (570656.9, 5363687.65, 570670.9, 5363701.65), atol=1e-6)
+    assert grid.x_m[0] == pytest.approx(570656.925)
+    assert grid.y_m[0] == pytest.approx(5363701.625)
+
+
+def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
+    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (100, 70))
+    count = np.zeros(grid.shape, int)
+    whole = grid.positions(620.0)
+    for window in grid.tiles(32):
+        count[window] += 1
+        np.testing.assert_array_equal(grid[window].positions(620.0), whole[window])
+    assert (count == 1).all()
+
+
+@given(
+    crs=st.sampled_from(["local", "EPSG:32632"]),
+    spacing_m=st.floats(0.01, 50.0),
+    shape=st.tuples(st.integers(1, 600), st.integers(1, 600)),
+    side=st.integers(40, 300),
+    data=st.data(),
+)
+@settings(max_examples=40, deadline=None)
+def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordinates_of_the_whole(
+    crs, spacing_m, shape, side, data
+):
+    grid = SceneGrid(crs, 570656.9, 5363701.65, spacing_m, shape)
+    window = data.draw(st.sampled_from(list(grid.tiles(side))))
+    part = grid[window]
+    np.testing.assert_array_equal(part.x_m, grid.x_m[window[1]])
+    np.testing.assert_array_equal(part.y_m, grid.y_m[window[0]])
+    row, column, height_m = (data.draw(st.floats(-5.0, 700.0)) for _ in range(3))
+    tolerance_px = 1e-8 / spacing_m + 1e-9  # coordinates of millions of metres hold a nanometre or so
+    np.testing.assert_allclose(part.pixel_of(*part.map_at(row, column)), (row, column), atol=tolerance_px)
+    place = part.pixel_below(part.positions_at(row, column, height_m))
+    np.testing.assert_allclose(place, (row, column, height_m), rtol=0, atol=10 * tolerance_px + 1e-8)
+    whole = grid.pixel_of(*part.map_at(row, column))
+    np.testing.assert_allclose(whole, (row + window[0].start, column + window[1].start), atol=tolerance_px)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
+@pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
+def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):
+    """To 10 nm, far below the wavelength; in between nodes, across blocks, on and high above the ellipsoid."""
+    west_m, north_m = {"EPSG:32632": (330e3, 9.2e6), "EPSG:2056": (2.6e6, 1.2e6)}.get(crs, (1e6, -2e6))
+    grid = SceneGrid(crs, west_m, north_m, spacing_m, (300, 270))[3:, 5:]
+    height = np.random.default_rng(1).uniform(-400, 4000, grid.shape)
+    for above in (620.0, height):
+        exact = ecef_from_projected(crs, *np.meshgrid(grid.x_m, grid.y_m), np.broadcast_to(above, grid.shape))
+        np.testing.assert_allclose(grid.positions(above), exact, rtol=0, atol=1e-8)
+
+
+def test_blocks_too_wide_for_polynomials_are_placed_by_proj():
+    options = ("EPSG:32632", (9.2e6, 330e3))
+    assert block(*options, 1.0, (0, 0)).exact
+    assert not block(*options, 300.0, (0, 0)).exact
+
+
+def test_pixels_are_where_their_coordinates_say():
+    grid = SceneGrid("EPSG:32632", 570656.9, 5363701.65, 0.05, (4, 4))
+    np.testing.assert_allclose(
+        projected_from_ecef("EPSG:32632", grid.positions(620.0))[1, 2], [570657.025, 5363701.575, 620.0], atol=1e-4
+    )
+    longitude, latitude = Transformer.from_crs(32632, 4326, always_xy=True).transform(grid.x_m[:2], grid.y_m[[0, 0]])
+    ground = Geod(ellps="WGS84").inv(longitude[0], latitude[0], longitude[1], latitude[1])[2]
+    ecef = np.linalg.norm(
+        np.diff(ecef_from_projected("EPSG:32632", grid.x_m[:2], grid.y_m[[0, 0]], np.zeros(2)), axis=0)
+    )
+    assert ecef == pytest.approx(ground, rel=1e-6)
+
+
+@pytest.mark.parametrize(("crs", "expected"), [("EPSG:4326", "not projected"), ("EPSG:99999", "unknown to PROJ")])
+def test_a_crs_that_is_no_map_in_metres_is_refused(crs, expected):
+    with pytest.raises(CampaignError, match=expected):
+        SceneGrid.from_bounds(crs, (0, 0, 1, 1), spacing_m=1)
+
+
+def test_the_swath_holds_every_pixel_and_little_more():
+    grid = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80))
+    tx = np.array([[0.0, 0.0, 5.0], [1.0, 11.0, 3.0]])
+    rx = tx + [1.0, 2.0, 0.0]
+    near, far = swath(grid, FlatGround(0.0), Aperture(tx, rx))
+    pixels = grid.positions(0.0).reshape(-1, 3)
+    path = np.linalg.norm(pixels - tx[:, None], axis=-1) + np.linalg.norm(pixels - rx[:, None], axis=-1)
+    assert (near <= path.min(axis=1)).all()
+    assert (far >= path.max(axis=1)).all()
+    assert (far - near - np.ptp(path, axis=1)).max() < 1.5
+
+
+def test_automatic_bounds_hold_ground_on_both_sides_of_the_track():
+    tx = np.stack([np.linspace(-4, 4, 5), np.zeros(5), np.full(5, 5.0)], -1)
+    _, ymin, _, ymax = auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=np.inf)
+    assert ymax == -ymin == pytest.approx(5 / np.tan(np.radians(10)), abs=1)
+    assert auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=20.0)[3] == pytest.approx(
+        np.sqrt(75), abs=1
+    )
+    assert utm_crs(ecef_from_projected("EPSG:32755", *map(np.array, (5e5, 6.1e6, 0.0)))) == "EPSG:32755"

@@ -1,0 +1,40 @@
+"""Tiles and blocks of pulses: the same image, however it is cut, and one block's tables at a time."""
+
+import numpy as np
+import pytest
+import toy_engine
+from campaigns import draw
+
+from apertura.focus.engines import load_engine
+from apertura.focus.engines.engine import Setting
+from apertura.focus.tiles import compute_tiles, image_array
+from apertura.quality.measures import numerical_error
+from apertura.scene.terrain import FlatGround
+
+
+@pytest.mark.parametrize(
+    ("engine", "form_options"), [("native", {"accumulate": "complex128", "tolerance_rad": 1e-5}), ("numba", {})]
+)
+def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_options):
+    """Blocks are added in complex64: below -130 dB, far below what any table errs by."""
+    if not load_engine(engine).available():
+        pytest.skip("apertura was installed without a compiler")
+    drawn = draw(np.random.default_rng(2), pixels=48, pulses=90)
+    images = []
+    for blocks in (1, 5):
+        setting = Setting(engine, {"oversampling": 16}, form_options, -80.0, 1.0, pulse_blocks=blocks)
+        image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=16)
+        images.append(np.zeros(drawn.grid.shape, np.complex64))
+        compute_tiles(image, list(drawn.grid.tiles(16)), images[-1], threads=2)
+    assert numerical_error(images[1].ravel(), images[0].ravel().astype(np.complex128)).rms_db < -130
+
+
+def test_blocks_of_pulses_are_prepared_one_after_the_other(toy):
+    """The next block's tables wait for every tile of the block before: one block's tables are held at a time."""
+    drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
+    setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0, pulse_blocks=3)
+    toy_engine.CALLS.clear()
+    image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=32).compute(scheduler="threads")
+    tiles = len(list(drawn.grid.tiles(32)))
+    assert tiles > 1
+    assert (["prepare"] + ["form"] * tiles) * 3 == toy_engine.CALLS

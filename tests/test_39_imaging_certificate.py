@@ -1,0 +1,94 @@
+"""The certificate of an image: tiles that miss the accuracy are formed again, and what is still missed is flagged."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from campaigns import compressed, draw
+from scenes import TARGET, TARGET_GRID, point_history
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.imaging.certify import certified, measures
+from apertura.imaging.formation import Formation
+from apertura.imaging.job import imaging_job
+from apertura.imaging.range_profiles import range_compress
+from apertura.planning.planner import make_plan
+from apertura.quality.measures import numerical_error
+from apertura.scene.ground_models import GroundModels
+
+SIDE_PX = 32
+
+
+@pytest.fixture(scope="module")
+def speckle() -> Formation:
+    """An image of noise alone, nine tiles of the same brightness."""
+    drawn = draw(np.random.default_rng(4), pixels=80, pulses=60)
+    noise = np.random.default_rng(6).standard_normal((2, *drawn.history.transfer.shape))
+    history = replace(drawn.history, transfer=(noise[0] + 1j * noise[1]).astype(np.complex64))
+    profiles = compressed(history, drawn.grid, "none")
+    history = replace(history, weight=np.full(history.frequency_hz.shape, 1 / len(history.frequency_hz)))
+    plan = make_plan(drawn.job, accuracy_db=-60.0)
+    return Formation(history, profiles, drawn.grid, plan, SIDE_PX)
+
+
+def certify(formation, target, accuracy_db=-60.0):
+    return certified(formation, target, accuracy_db=accuracy_db, threads=1)
+
+
+def test_an_image_as_exact_as_asked_is_left_as_it_is(speckle):
+    target = speckle.image.compute()
+    before = target.copy()
+    report = certify(speckle, target)
+    assert report["redone"] == []
+    assert report["flags"] == {}
+    assert report["numerical_error_db"] < -60
+    np.testing.assert_array_equal(target, before)
+
+
+def test_the_error_reported_is_that_of_other_pixels_too(speckle):
+    target = speckle.image.compute()
+    pixels = np.random.default_rng(8).integers(0, target.shape, (400, 2))
+    measured = numerical_error(target[tuple(pixels.T)], speckle.exact(pixels))
+    assert certify(speckle, target)["numerical_error_db"] == pytest.approx(measured.rms_db, abs=1.0)
+
+
+def test_a_tile_that_misses_is_formed_again_with_the_first_fallback_and_no_other_tile(speckle):
+    good = speckle.image.compute()
+    spoilt, window = good.copy(), speckle.windows[4]
+    spoilt[window] *= 1.01
+    report = certify(speckle, spoilt)
+    fallback = speckle.plan.fallbacks[0]
+    assert report["redone"] == [{"tiles": 1, "with": f"{fallback.line}, every pulse"}]
+    assert report["numerical_error_db"] < -60
+    assert report["flags"] == {}
+    np.testing.assert_array_equal(spoilt[window], speckle.image_by(fallback)[window].compute())
+    spoilt[window] = good[window]
+    np.testing.assert_array_equal(spoilt, good)
+
+
+def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speckle):
+    """At -125 dB only the double sum in float64, kept as complex64, is left; at -200 dB not even that suffices."""
+    target = speckle.image.compute()
+    report = certify(speckle, target, accuracy_db=-125.0)
+    assert report["redone"][-1]["with"] == "reference, every pulse"
+    assert report["numerical_error_db"] < -125
+    assert len(report["redone"]) == len(speckle.plan.fallbacks)
+    report = certify(speckle, target, accuracy_db=-200.0)
+    assert report["flags"] == {
+        "accuracy_missed": f"numerical error {report['numerical_error_db']:.1f} dB, -200.0 dB asked"
+    }
+
+
+def test_the_brightest_target_is_measured_where_it_stands_with_its_amplitude_and_width():
+    history, ground = point_history(), GroundModels.flat(0.0)
+    aperture, frequency = history.aperture, history.frequency_hz
+    job = imaging_job(aperture, frequency, history.weight, TARGET_GRID, ground, history=history)
+    plan = make_plan(job, accuracy_db=-60.0)
+    formation = Formation(history, range_compress(history, TARGET_GRID, ground.full), TARGET_GRID, plan, SIDE_PX)
+    brightest = measures(formation, formation.image.compute())["brightest"]
+    assert (brightest["x_m"], brightest["y_m"]) == pytest.approx(TARGET[0, :2], abs=0.003)
+    assert brightest["amplitude"] == pytest.approx(1.0, abs=0.005)
+    assert brightest["coherence_factor"] == pytest.approx(1.0, abs=1e-4)
+    half_angle = np.arctan2(4.0, np.hypot(20.0 + TARGET[0, 1], 10.0))  # 8 m of track
+    cell_m = C / frequency.mean() / (4 * np.sin(half_angle))
+    assert brightest["cross_range_width_m"] == pytest.approx(0.886 * cell_m, rel=0.03)

@@ -1,0 +1,62 @@
+"""A finished campaign opened from Python: pairs, stages, images, reports and flags by name."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import rasterio
+from folders import copy_writable
+
+from apertura.errors import CampaignError
+from apertura.load.results import OpenCampaign, open_campaign
+
+PAIR = ("f01", "uav1-uav2")
+
+
+@pytest.fixture
+def opened(finished_tiny) -> OpenCampaign:
+    return open_campaign(finished_tiny.root)
+
+
+def test_pairs_are_those_of_the_flights_that_become_images(opened):
+    assert opened.pairs == {"f01": ("uav1-uav1", "uav1-uav2")}
+
+
+def test_an_image_is_that_of_the_raster_on_the_same_grid(opened):
+    image = opened.image(*PAIR)
+    with rasterio.open(opened.campaign.results / "f01" / "uav1-uav2" / "slc.tif") as raster:
+        np.testing.assert_array_equal(image.values, raster.read(1))
+        assert (raster.transform.c, raster.transform.f) == (opened.scene.grid.west_m, opened.scene.grid.north_m)
+        assert raster.transform.a == opened.scene.grid.spacing_m
+        middle = raster.xy(0, 0)
+    assert (float(image.x[0]), float(image.y[0])) == pytest.approx(middle, abs=1e-6)
+    assert "UTM zone 32N" in image.spatial_ref.attrs["crs_wkt"]
+
+
+def test_stages_go_by_name_and_by_what_they_are_of(opened):
+    assert opened.stage("raw", "f01", "uav1").attrs["node"] == "uav1"
+    assert opened.stage("echo", *PAIR).sizes["subcarrier"] == 1024
+    assert opened.stage("profile", *PAIR).sizes["pulse"] == opened.stage("echo", *PAIR).sizes["pulse"]
+    assert opened.stage("cube").attrs["pairs"] == ["uav1-uav1", "uav1-uav2"]
+
+
+def test_a_report_is_image_json_of_a_pair_or_of_what_was_fused(finished_tiny, tmp_path):
+    opened = open_campaign(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    for pair in ("uav1-uav2", "fused"):
+        path = opened.campaign.results / "f01" / pair / "image.json"
+        written = json.loads(path.read_text()) | {"flags": {"clipped": f"in {pair}"}}
+        path.write_text(json.dumps(written))
+        assert opened.report("f01", pair) == written
+        assert opened.flags("f01", pair) == {"clipped": f"in {pair}"}
+
+
+def test_what_the_workflow_did_not_make_is_named(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    shutil.rmtree(root / "results" / "f01" / "uav1-uav2")
+    opened = open_campaign(root)
+    with pytest.raises(CampaignError, match=r"image\.json: no such file; .*Run the workflow first"):
+        opened.report(*PAIR)
+    with pytest.raises(CampaignError, match=r"uav1-uav2"):
+        opened.image(*PAIR)
+    assert opened.report("f01", "uav1-uav1")["engine"]

@@ -1,0 +1,54 @@
+"""What the planner flags or refuses before anything is computed."""
+
+import numpy as np
+import pytest
+from scenes import ground_points, monostatic, plan, planning_job, straight_track
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
+from apertura.planning.checks import check_geometry
+
+
+def test_a_spacing_coarser_than_the_cell_is_flagged_with_the_number():
+    cell_m = monostatic(straight_track()).resolution_cell_m(ground_points(), band_hz=(1.0e9, 1.4e9))
+    assert 0.2 < cell_m < 0.5  # λ/(4 sin(θ/2)) for 6 m of aperture at 22 m: 0.43 m
+    finer, coarser = (check_geometry(planning_job(spacing_m=factor * cell_m)) for factor in (0.98, 1.02))
+    assert "spacing_coarse" not in finer
+    assert f"{cell_m:.3g} m" in coarser["spacing_coarse"]
+
+
+def test_a_platform_over_the_scene_is_flagged():
+    over = straight_track() + np.array([0.0, 25.0, 0.0])
+    assert "300 of 300 pulses" in plan(aperture=monostatic(over)).flags["platform_inside_scene"]
+    assert "platform_inside_scene" not in plan().flags
+    for narrow in (np.s_[4:5, 4:5], np.s_[4:5], np.s_[:, 4:5]):  # a row, a column or a pixel has no side of its own
+        assert "platform_inside_scene" not in plan(ground_m=ground_points()[narrow]).flags
+
+
+def test_no_pulses_and_pulses_without_a_place_are_refused():
+    with pytest.raises(CampaignError, match="zero pulses"):
+        plan(aperture=monostatic(np.zeros((0, 3))))
+    lost = straight_track()
+    lost[7, 1] = np.nan
+    with pytest.raises(CampaignError, match="1 of 300 phase centres are not finite, first at pulse 7"):
+        plan(aperture=Aperture(lost, straight_track()))
+    with pytest.raises(CampaignError, match="zero pulses see the scene"):
+        plan(path_limit_m=30.0)
+    assert "beyond_cyclic_prefix" in plan(path_limit_m=55.0).flags
+
+
+@pytest.mark.parametrize(("spread", "flagged"), [(0.97, False), (1.03, True)])
+def test_an_aperture_sampled_below_the_scenes_doppler_band_is_flagged(spread, flagged):
+    fine, _ = monostatic(straight_track()).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
+    apart = straight_track(300, length_m=6.0 * spread / fine)
+    for _ in range(3):  # a longer track sees steeper angles too
+        rate, _ = monostatic(apart).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
+        apart[:, 0] *= spread / rate
+    assert ("pulses_sparse" in plan(aperture=monostatic(apart)).flags) == flagged
+
+
+def test_an_override_that_is_predicted_to_miss_is_flagged():
+    missed = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
+    assert "dB, -60 dB asked: tiles that miss it are formed again" in missed.flags["prediction_misses"]
+    assert "prediction_misses" not in plan().flags
