@@ -29,13 +29,7 @@ PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura
 
 
 def open_recording(files: Sequence[Path]) -> "Recording":
-    """Open a recording; metadata and sizes are checked, samples are memory-mapped and not read.
-
-    Parameters
-    ----------
-    files
-        In the order of a row of `RECORDERS`.
-    """
+    """Open the files of a row of `RECORDERS`; metadata and sizes are checked, samples memory-mapped and not read."""
     row = next(row for row in RECORDERS if all(file.name.endswith(end) for file, end in zip(files, row, strict=True)))
     opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
     return opened
