@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from apertura.ingest.recording import Recording
 
 RECORDERS: Mapping[tuple[str, ...], str] = {(".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf:open_sigmf"}
-"""Suffixes of the files of a recording, <node><suffix> → opener(*files) → `Recording`."""
+"""Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
 TRACKS: Mapping[str, str] = {
     ".csv": "apertura.ingest.csv_track:read_csv_track",
@@ -36,7 +36,8 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     files
         In the order of a row of `RECORDERS`.
     """
-    row = next(row for row in RECORDERS if all(file.name.endswith(end) for file, end in zip(files, row, strict=True)))
+    names = [file.name for file in files]
+    row = next(row for row in RECORDERS if len(row) == len(names) and all(map(str.endswith, names, row)))
     opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
     return opened
 
