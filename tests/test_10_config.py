@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -87,3 +88,11 @@ def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
     assert not {"window", "sidelink"} & finished_tiny.relevant("image").keys()
     assert set(finished_tiny.relevant("echo", "uav1-uav1")["nodes"]) == {"uav1"}
     assert "window" not in finished_tiny.relevant("echo", "uav1-uav1")
+
+
+def test_a_wing_that_sees_no_settings_names_no_config_file():
+    rules = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    wings = next(rule["source_modules"] for rule in rules if rule["name"] == "wings see arrays, not settings")
+    files = [file for wing in wings for file in (ROOT / "src" / wing.replace(".", "/")).rglob("*.py")]
+    assert len(files) > 80
+    assert [file for file in files if "config/config.yaml" in file.read_text(encoding="utf-8")] == []

@@ -13,8 +13,9 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.contracts import check
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import TRACKS, open_recording, read_phase_history, read_track
+from apertura.ingest import RECORDERS, TRACKS, open_recording, read_phase_history, read_track
 from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.recording import Captures, Recording
 from apertura.ingest.track import make_track
 
 QUICK = settings(max_examples=30, deadline=None, derandomize=True)
@@ -250,6 +251,36 @@ def read_toy_track(path, *, node):
     geodetic = np.loadtxt(path)
     time = np.datetime64("2025-05-14T09:30", "ns") + np.arange(len(geodetic)) * np.timedelta64(1, "s")
     return make_track(time, geodetic, node=node, where=path)
+
+
+def test_a_recorder_of_one_file_is_one_function_and_one_row(tmp_path, monkeypatch):
+    """Found in its folder, opened, its hash checked, its captures cut; messages name its one file."""
+    monkeypatch.setitem(RECORDERS, (".toy",), f"{__name__}:open_toy_recording")
+    path = tmp_path / "raw" / "f01" / "a.toy"
+    path.parent.mkdir(parents=True)
+    np.arange(1, 13, dtype="<i2").tofile(path)
+    opened = open_recording(Campaign(tmp_path, None, ()).recording_files("f01", "a"))
+    opened.check_hash()
+    raw = check(opened.cut(opened.captures, node="a"), "raw")
+    np.testing.assert_array_equal(raw.iq.values[0, 1], [[7, 8], [9, 10], [11, 12]])
+    np.zeros(12, "<i2").tofile(path)
+    for work in (opened.check_hash, lambda: opened.cut(opened.captures, node="a")):
+        with pytest.raises(CampaignError, match=r"a\.toy: "):
+            work()
+
+
+def open_toy_recording(path):
+    time = np.array(["2025-05-14T09:30:00", "2025-05-14T09:30:01"], "datetime64[ns]")
+    return Recording(
+        samples=np.memmap(path, "<i2", "r", shape=(6, 1, 2)),
+        channels=["radar"],
+        sample_rate_hz=1e6,
+        frequency_hz=1e9,
+        captures=Captures(np.array([0, 3]), 3, time, np.array([-1, -1])),
+        framing=None,
+        files=(path,),
+        sha512=hashlib.sha512(path.read_bytes()).hexdigest(),
+    )
 
 
 @pytest.mark.parametrize(

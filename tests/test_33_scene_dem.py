@@ -9,7 +9,10 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 from scenes import UTM_GRID
 
+import apertura as ap
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
+from apertura.geometry.geodesy import frame_from_map
 from apertura.scene import geoid
 from apertura.scene.dem_file import open_dem
 from apertura.scene.grid import SceneGrid
@@ -189,3 +192,52 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
 
 
 # Seeing
+
+
+# From Python
+
+
+def test_from_python_a_target_on_a_slope_is_imaged_where_it_stands_by_its_dem(tmp_path):
+    """1.8 m lower flat ground puts it elsewhere; the raster lies in geographic coordinates, the scene in UTM."""
+    grid = ap.SceneGrid("EPSG:32632", 500056.0, 5400044.0, 0.1, (80, 80))
+    path = geographic_dem(tmp_path / "dem.tif", slope=(0.3, -0.2))
+    terrain = ap.open_dem(str(path), grid, datum="ellipsoid")
+    track = frame_from_map(grid.crs, np.linspace(500052, 500068, 96), np.full(96, 5400020.0), np.full(96, 618.0))
+    target = frame_from_map(grid.crs, 500061.0, 5400039.0, 600 + 0.3 * 1.0 + 0.2 * 1.0)
+    frequency, flown = 1.2e9 + 2e6 * np.arange(200), ap.Aperture(track, track)
+    echo = np.exp(-2j * np.pi * frequency * flown.path(target[None]) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+    history = ap.PhaseHistory(echo, frequency, np.full(200, 1 / 200), np.zeros(96), flown)
+    places = {}
+    for name, ground in (("dem", terrain), ("flat", ap.FlatGround(598.7))):
+        level = abs(ap.backproject(history, grid, terrain=ground)).compute()
+        peak = level[level.argmax(...)]
+        places[name] = np.hypot(float(peak.x) - 500061.0, float(peak.y) - 5400039.0)
+    assert places["dem"] < 0.1
+    assert places["flat"] > 0.5
+
+
+def geographic_dem(path, slope):
+    """Posts 0.00002° apart around (500060, 5400040) on a plane of the map of 600 m there."""
+    to_map = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    longitude, latitude = to_map.transform(500060, 5400040, direction="INVERSE")
+    step = 2e-5
+    places = np.meshgrid(longitude + step * np.arange(-40, 41), latitude - step * np.arange(-40, 41))
+    x, y = to_map.transform(*places)
+    heights = 600 + slope[0] * (x - 500060) + slope[1] * (y - 5400040)
+    return write_dem(
+        path, heights, from_origin(longitude - 40.5 * step, latitude + 40.5 * step, step, step), "EPSG:4326"
+    )
+
+
+def test_from_python_a_datum_that_nothing_states_is_asked_for(tmp_path):
+    with pytest.raises(
+        CampaignError, match=r"without heights.*ellipsoid, egm96 or egm2008.*from Python: path and datum"
+    ):
+        ap.open_dem(plane_dem(tmp_path / "dem.tif"), UTM_GRID.crs)
+
+
+def test_from_python_a_dem_that_ends_inside_the_scene_is_refused(tmp_path):
+    path, beyond = plane_dem(tmp_path / "dem.tif"), ap.SceneGrid("EPSG:32632", 500100.0, 5400060.0, 0.5, (40, 80))
+    with pytest.raises(CampaignError, match=r"dem\.tif: .* % of the scene lies outside the DEM, to the east"):
+        ap.open_dem(path, beyond, datum="ellipsoid")
+    assert np.isnan(ap.open_dem(path, beyond.crs, datum="ellipsoid").heights(beyond)).any()

@@ -6,10 +6,11 @@ import shutil
 import numpy as np
 import pytest
 import rasterio
-from folders import copy_writable
+from folders import complaint, copy_writable
 
 from apertura.errors import CampaignError
 from apertura.load.results import OpenCampaign, open_campaign
+from apertura.steps.verify import verify
 
 PAIR = ("f01", "uav1-uav2")
 
@@ -60,3 +61,32 @@ def test_what_the_workflow_did_not_make_is_named(finished_tiny, tmp_path):
     with pytest.raises(CampaignError, match=r"uav1-uav2"):
         opened.image(*PAIR)
     assert opened.report("f01", "uav1-uav1")["engine"]
+
+
+def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(tiny):
+    opened = open_campaign(tiny)
+    for work in (lambda: opened.scene, lambda: verify(opened.campaign)):
+        message = complaint(work)
+        assert message.startswith(f"{tiny}/results/scene.json: no such file")
+        assert f"`apertura run {tiny}`" in message
+    message = complaint(lambda: opened.stage("echo", *PAIR))
+    assert "Run the workflow" in message
+    assert "Delete" not in message
+
+
+def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
+    names = "expected one of raw, track, echo, profile, terrain, image, cube."
+    assert names in complaint(lambda: opened.stage("ecko", *PAIR))
+    assert "no flight 'f02'; expected one of f01." in complaint(lambda: opened.stage("echo", "f02", "uav1-uav2"))
+    pairs = "no pair 'uav2-uav1'; expected one of uav1-uav1, uav1-uav2."
+    assert pairs in complaint(lambda: opened.image("f01", "uav2-uav1"))
+    assert pairs in complaint(lambda: opened.flags("f01", "uav2-uav1"))
+    assert "no flight 'f02'" in complaint(lambda: opened.report("f02", "fused"))
+    assert "no node 'uav3'; expected one of uav1, uav2." in complaint(lambda: opened.stage("raw", "f01", "uav3"))
+
+
+def test_a_stage_that_is_asked_for_without_its_place_says_what_is_missing(opened):
+    message = complaint(lambda: opened.stage("echo", "f01"))
+    assert "campaign.stage('echo'): given f01; expected a flight and a pair" in message
+    assert "given nothing more; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
+    assert "given f01; expected the stage alone" in complaint(lambda: opened.stage("cube", "f01"))

@@ -118,7 +118,17 @@ def test_a_lever_arm_with_a_log_that_holds_no_attitude_is_refused(tiny):
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     assert "no attitude" in message
-    assert "uav1.track" in message
+    assert message.startswith("raw/f01/uav1.track.csv")
+
+
+def test_a_recording_at_another_carrier_names_its_own_files(tiny):
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    edit_config(tiny, lambda document: document["waveform"].update(carrier_hz=1.3e9))
+    message = complaint(lambda: echo.echo(Campaign.load(tiny), "f01", "uav1-uav1"))
+    assert message.startswith("raw/f01/uav1.sigmf-data and raw/f01/uav1.sigmf-meta: recorded with carrier_hz")
+    for stem in message.split(": ")[0].split(" and "):
+        assert (tiny / stem).is_file()
 
 
 BEAM = {"boresight_deg": [90, -20], "beamwidth_deg": [40, 60]}

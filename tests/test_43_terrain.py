@@ -13,6 +13,7 @@ from folders import complaint, copy_writable, run_steps, settle_ground
 from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
+from apertura.cli import main
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.imaging.stages import profiles_of
@@ -284,8 +285,17 @@ def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     assert "below the lowest ground of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
     campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
-    assert "config/config.yaml: scene.height_m: " in message
+    assert message.startswith("scene.height_m: ")
     assert "the ground has 2034.00 m" in message
+
+
+def test_the_command_line_says_in_which_file_a_key_stands(tiny, monkeypatch, capsys):
+    """A wing knows the key alone: who calls it from Python has no such file."""
+    edit_scene(tiny, height_m=2034.0)
+    monkeypatch.setattr("sys.argv", ["apertura", "plan", str(tiny)])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert capsys.readouterr().err.startswith("error: config/config.yaml: scene.height_m: ")
 
 
 def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):

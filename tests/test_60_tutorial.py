@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+import rasterio
 
 from apertura.focus.engines import native
 
@@ -52,4 +53,6 @@ def test_every_block_of_the_tutorial_runs_and_prints_what_it_shows(tmp_path, mon
         (words, numbers), (shown_words, shown_numbers) = parts(printed.getvalue()), parts(shown)
         assert words == shown_words, f"{TUTORIAL.name}:{line} prints\n{printed.getvalue()}"
         assert numbers == pytest.approx(shown_numbers, rel=0.05), f"{TUTORIAL.name}:{line}"
-    assert (tmp_path / "both.tif").is_file()
+    with rasterio.open(tmp_path / "both.tif") as raster:
+        certified = [pair.attrs["numerical_error_db"] for pair in names["pairs"]]
+        assert raster.tags()["APERTURA_ERROR_DB"] == f"{max(certified):.2f}"

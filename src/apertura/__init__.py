@@ -27,6 +27,7 @@ _PUBLIC = {
     "SceneGrid": "apertura.scene.grid",
     "backproject": "apertura.imaging.backproject",
     "open_campaign": "apertura.load.results",
+    "open_dem": "apertura.scene.dem_file",
     "range_compress": "apertura.imaging.range_profiles",
     "simulate": "apertura.simulation",
 }

@@ -51,7 +51,9 @@ def main() -> None:
     try:
         app()
     except CampaignError as error:
-        print(f"error: {error}", file=sys.stderr)
+        from apertura.settings import located
+
+        print(f"error: {located(str(error))}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

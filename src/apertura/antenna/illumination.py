@@ -14,7 +14,7 @@ _AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Illumination:
-    """How many pulses see each place of a net over the scene.
+    """How many pulses see each point of a grid over the scene.
 
     Attributes
     ----------

@@ -185,7 +185,7 @@ def placed(image: Raster, transform: Affine, crs: str) -> dict[str, Any]:
     except CRSError as error:
         raise CampaignError(
             f"crs {crs!r}",
-            where="config/config.yaml: scene",
+            where="scene",
             expected="an EPSG code, or local axes as LOCAL_CS",
             remedy="Check scene.crs.",
         ) from error

@@ -89,7 +89,7 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
 
 
 def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.float64], *, highest_hz: float) -> float:
-    """Return the RMS error of interpolating what pixels read, over all pulses and a net of places, dB.
+    """Return the RMS error of interpolating what pixels read, over all pulses and a grid of points, dB.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.floa
     aperture
         Of all pulses.
     place_m
-        (place, 3) float64, metres: a net over the scene, its middle at the middle of the array.
+        (place, 3) float64, metres: a grid of points over the scene, its middle at the middle of the array.
     highest_hz
         Upper edge of the band, where phases turn fastest.
     """

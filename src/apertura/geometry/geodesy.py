@@ -83,7 +83,7 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     if not np.isfinite(position).all():
         raise CampaignError(
             f"positions in {crs} that have no place on Earth",
-            where="config/config.yaml: scene",
+            where="scene",
             expected="coordinates inside the area of use of the CRS",
             remedy="Check scene.crs and scene.bounds_m.",
         )

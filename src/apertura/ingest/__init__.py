@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from apertura.ingest.recording import Recording
 
 RECORDERS: Mapping[tuple[str, ...], str] = {(".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf:open_sigmf"}
-"""Suffixes of the files of a recording, <node><suffix> → opener(*files) → `Recording`."""
+"""Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
 TRACKS: Mapping[str, str] = {
     ".csv": "apertura.ingest.csv_track:read_csv_track",
@@ -29,8 +29,15 @@ PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura
 
 
 def open_recording(files: Sequence[Path]) -> "Recording":
-    """Open the files of a row of `RECORDERS`; metadata and sizes are checked, samples memory-mapped and not read."""
-    row = next(row for row in RECORDERS if all(file.name.endswith(end) for file, end in zip(files, row, strict=True)))
+    """Open a recording; metadata and sizes are checked, samples are memory-mapped and not read.
+
+    Parameters
+    ----------
+    files
+        In the order of a row of `RECORDERS`.
+    """
+    names = [file.name for file in files]
+    row = next(row for row in RECORDERS if len(row) == len(names) and all(map(str.endswith, names, row)))
     opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
     return opened
 

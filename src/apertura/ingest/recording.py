@@ -49,8 +49,10 @@ class Recording:
         As the recorder was triggered; one, of all samples, if it ran through.
     framing
         What was sent before each symbol, where the recorder ran through; else None.
-    files, sha512
-        Metadata and samples, and the hash of the samples as the recorder stated it.
+    files
+        Metadata first, samples last, for messages and hashes; one file may hold both.
+    sha512
+        Of the file of samples as the recorder stated it.
     """
 
     samples: NDArray[np.int16]
@@ -59,7 +61,7 @@ class Recording:
     frequency_hz: float
     captures: Captures
     framing: Mapping[str, Any] | None
-    files: tuple[Path, Path]
+    files: tuple[Path, ...]
     sha512: str | None
 
     def captures_at(self, start: NDArray[np.int64], length: int, frame: NDArray[np.int64]) -> Captures:
@@ -71,12 +73,12 @@ class Recording:
         """Raise CampaignError unless the samples are those that the recorder hashed."""
         if self.sha512 is None:
             return
-        with self.files[1].open("rb") as stream:
+        with self.files[-1].open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha512").hexdigest()
         if digest != self.sha512:
             raise CampaignError(
                 f"sha512 {digest[:12]}…",
-                self.files[1],
+                self.files[-1],
                 f"{self.sha512[:12]}… (core:sha512 of the metadata)",
                 "The data were changed or damaged; copy them again.",
             )
@@ -95,7 +97,7 @@ class Recording:
             if dead.size:
                 raise CampaignError(
                     f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
-                    self.files[1],
+                    self.files[-1],
                     "samples",
                     "The receiver or the copy failed; record or copy again, or remove those captures.",
                 )

@@ -29,6 +29,8 @@ class Acquisition:
         Its stages.
     files
         raw/<flight>/<node>, what its files' names begin with.
+    recording, log
+        Its files of samples, and its flight log, for messages.
     numerology
         Of the symbol.
     """
@@ -38,6 +40,8 @@ class Acquisition:
     track: xr.Dataset
     settings: Node
     files: Path
+    recording: str
+    log: str
     numerology: Numerology
 
     def captures(self, channel: str, pulses: NDArray[np.int64]) -> NDArray[np.int16]:
@@ -52,7 +56,7 @@ class Acquisition:
         if channel not in channels:
             raise CampaignError(
                 f"channels {channels}",
-                where=f"{self.files}.sigmf-meta: apertura:channels",
+                where=self.recording,
                 expected=f"a channel named {channel!r}",
                 remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
             )
@@ -61,7 +65,7 @@ class Acquisition:
         if iq.shape[1] < needed:
             raise CampaignError(
                 f"captures of {iq.shape[1]} samples",
-                where=f"{self.files}.sigmf-meta",
+                where=self.recording,
                 expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz",
                 remedy="Correct the waveform in config/config.yaml or record longer captures.",
             )
@@ -78,7 +82,7 @@ class Acquisition:
             at=self.raw.time.values[pulses],
             lever_arm_m=getattr(self.settings.lever_arms_m, name),
             attitude_from=self.settings.attitude,
-            where=f"{self.files}.track",
+            where=self.log,
         )
 
     def body_axes(self, pulses: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -89,7 +93,7 @@ class Acquisition:
             self.track.attitude.values,
             at=self.raw.time.values[pulses],
             attitude_from=self.settings.attitude,
-            where=f"{self.files}.track",
+            where=self.log,
         )
 
 
@@ -103,16 +107,22 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmW
     """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     files = Path("raw") / flight / node
+    recording, log = (_read_from(stage, files) for stage in (raw, track))
     for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
         asked = getattr(waveform, key)
         if abs(recorded - asked) > 1e-9 * asked:
             raise CampaignError(
                 f"recorded with {key} {recorded:.6f}",
-                where=f"{files}.sigmf-meta",
+                where=recording,
                 expected=f"{asked:.6f}, as config/config.yaml: waveform.{key}",
                 remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
             )
-    return Acquisition(node, raw, track, campaign.settings.nodes[node], files, numerology_of(waveform))
+    return Acquisition(node, raw, track, campaign.settings.nodes[node], files, recording, log, numerology_of(waveform))
+
+
+def _read_from(stage: xr.Dataset, files: Path) -> str:
+    """Return the node's own files that a stage was read from; a preamble lies elsewhere."""
+    return " and ".join(name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}."))
 
 
 def numerology_of(waveform: OfdmWaveform) -> Numerology:

@@ -1,17 +1,25 @@
 """A campaign from Python: its flights and pairs, and what the workflow made of them, by name."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
+from apertura.contracts import STAGES
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
+from apertura.settings import FLIGHTS
 from apertura.store import open_stage
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+_OF_NODES = {"raw", "track"}
+_OF_THE_CAMPAIGN = {"cube", "terrain"}
+"""Stages of a node in a flight, and of the whole campaign; the others are of a pair in a flight."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +57,15 @@ class OpenCampaign:
         Raises
         ------
         CampaignError
-            If it is not there, or not as the workflow left it.
+            If there is no such stage, flight, node or pair, or it is not there as the workflow left it.
         """
+        _check_name(name, "stage", STAGES, where="campaign.stage")
+        if name in _OF_THE_CAMPAIGN:
+            _check_count(where, 0, name, "the stage alone: it is of the whole campaign")
+        else:
+            kind = "node" if name in _OF_NODES else "pair"
+            _check_count(where, 2, name, f"a flight and a {kind}")
+            self._check_place(*where, kind=kind)
         return open_stage(self.campaign.stage(name, *where), name)
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":
@@ -60,6 +75,10 @@ class OpenCampaign:
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
+        if pair == "fused":
+            _check_name(flight, "flight", self.pairs, where=self.campaign.root / FLIGHTS)
+        else:
+            self._check_place(flight, pair, kind="pair")
         path = self.campaign.results / flight / pair / "image.json"
         if not path.is_file():
             raise CampaignError(
@@ -72,6 +91,31 @@ class OpenCampaign:
         """Return the limits that an image exceeds: name → what was measured, in one line."""
         flags: dict[str, str] = self.report(flight, pair)["flags"]
         return flags
+
+    def _check_place(self, flight: str, member: str, *, kind: str) -> None:
+        """Raise CampaignError unless there is such a flight, with such a node or pair in it."""
+        where = self.campaign.root / FLIGHTS
+        flights = {one.name: one for one in self.campaign.flights}
+        _check_name(flight, "flight", flights, where=where)
+        members = flights[flight].pairs if kind == "pair" else flights[flight].nodes
+        _check_name(member, kind, members, where=f"{where}: flight {flight}")
+
+
+def _check_name(name: str, kind: str, known: Iterable[str], *, where: object) -> None:
+    if name not in known:
+        raise CampaignError(
+            f"no {kind} {name!r}", where=where, expected=f"one of {', '.join(known)}", remedy=f"Correct the {kind}."
+        )
+
+
+def _check_count(given: tuple[str, ...], count: int, stage: str, expected: str) -> None:
+    if len(given) != count:
+        raise CampaignError(
+            f"given {', '.join(given) or 'nothing more'}",
+            where=f"campaign.stage({stage!r})",
+            expected=expected,
+            remedy="Name these after the stage.",
+        )
 
 
 def open_campaign(path: str | Path) -> OpenCampaign:

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import map_from_frame
 from apertura.load.ground import Ground
@@ -83,8 +84,22 @@ class OpenScene:
 
 
 def settled_scene(campaign: Campaign) -> OpenScene:
-    """Return what results/scene.json settled, on level ground: whoever needs the ground itself opens the scene."""
-    document = json.loads((campaign.root / PATH).read_text(encoding="utf-8"))
+    """Return what results/scene.json settled, on level ground: whoever needs the ground itself opens the scene.
+
+    Raises
+    ------
+    CampaignError
+        If the grid is not settled yet.
+    """
+    path = campaign.root / PATH
+    if not path.is_file():
+        raise CampaignError(
+            "no such file",
+            where=path,
+            expected="the grid that the workflow settles",
+            remedy=f"Run `apertura run {campaign.root}` first.",
+        )
+    document = json.loads(path.read_text(encoding="utf-8"))
     grid, level = document["grid"], FlatGround(document["height_m"])
     grid = SceneGrid(**{**grid, "shape": tuple(grid["shape"]), "first": tuple(grid["first"])})
     return OpenScene(grid, level, level, (), document["inputs"], document["chosen"])

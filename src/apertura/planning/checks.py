@@ -60,7 +60,7 @@ def check_positions(aperture: Aperture) -> None:
             f"{int(lost.sum())} of {len(lost)} phase centres are not finite, first at pulse {int(lost.argmax())}",
             where="track",
             expected="a position for every pulse",
-            remedy="Mend the flight log.",
+            remedy="Correct the flight log.",
         )
 
 
@@ -89,7 +89,7 @@ def _unseen(aperture: Aperture, points_m: NDArray[np.float64], path_limit_m: flo
     if beyond.all():
         raise CampaignError(
             f"zero pulses see the scene: the shortest total path is {shortest.min():.1f} m",
-            where="config/config.yaml: scene.bounds_m",
+            where="scene.bounds_m",
             expected=f"at most {path_limit_m:.1f} m, the cyclic prefix",
             remedy="Correct scene.bounds_m (easting before northing), scene.crs, or the height of the ground: "
             "scene.height_m, or unit and datum of scene.dem.",

@@ -79,7 +79,7 @@ def _below_ground(
         f"{which} is in or below the ground of the scene, worst at pulse {pulse}: {above[pulse]:.2f} m above it, its "
         f"height {above[pulse] + ground[pulse]:.2f} m where {'the ground' if flat else 'the DEM'} has "
         f"{ground[pulse]:.2f} m",
-        where=f"config/config.yaml: scene.{'height_m' if flat else 'dem'}",
+        where="scene.height_m" if flat else "scene.dem",
         expected="an antenna above the ground",
         remedy=f"Check {keys}, and the heights in the flight log (logs may count from the geoid).",
     )

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Dem(Terrain):
-    """A DEM and what its heights count from; `apertura.scene.dem_file.open_dem` opens one.
+    """A DEM and what its heights count from; `ap.open_dem` opens one.
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
     except ProjError as error:
         raise CampaignError(
             f"PROJ knows no exact way from {CRS(source).name} to {CRS(target).name}",
-            where="config/config.yaml: scene.dem",
+            where="scene.dem",
             expected="a DEM whose CRS PROJ can relate to the scene's",
             remedy="Warp the DEM into scene.crs with a GIS, and state its datum.",
         ) from error

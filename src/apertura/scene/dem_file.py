@@ -9,17 +9,20 @@ from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
 from apertura.scene.dem import Dem
 from apertura.scene.geoid import carried_datum, geoid_file, grid_names
+from apertura.scene.grid import SceneGrid
 
 
-def open_dem(path: Path, crs: str, *, datum: str, geoid: Path | None = None) -> Dem:
-    """Return a DEM to be read onto grids in `crs`.
+def open_dem(
+    path: str | Path, scene: str | SceneGrid, *, datum: str = "carried", geoid: str | Path | None = None
+) -> Dem:
+    """Return a DEM as the ground of a scene, whatever CRS the raster is in.
 
     Parameters
     ----------
     path
         A raster that GDAL reads, heights in band 1.
-    crs
-        Of the scene: what pyproj reads, or 'local'.
+    scene
+        The grid that the DEM must reach over; or the CRS alone, what pyproj reads or 'local', of whatever grid is read.
     datum
         What the heights count from: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (the raster's CRS says it; in a local
         scene: z of the frame).
@@ -29,8 +32,32 @@ def open_dem(path: Path, crs: str, *, datum: str, geoid: Path | None = None) -> 
     Raises
     ------
     CampaignError
-        If the file is no DEM, its CRS says otherwise than `datum`, or the grid of undulations is not here.
+        If the file is no DEM, its CRS says otherwise than `datum` or nothing, the grid of undulations is not here, or
+        the DEM ends inside the scene.
+
+    Examples
+    --------
+    A DEM in UTM whose heights are ellipsoidal, under a scene of 4 × 4 pixels:
+
+    >>> import numpy as np, rasterio
+    >>> from tempfile import TemporaryDirectory
+    >>> kind = {"width": 9, "height": 9, "count": 1, "dtype": "float32", "crs": "EPSG:32632"}
+    >>> place = rasterio.Affine(5, 0, 500000, 0, -5, 5400045)
+    >>> with TemporaryDirectory() as folder:
+    ...     with rasterio.open(f"{folder}/dem.tif", "w", "GTiff", transform=place, **kind) as raster:
+    ...         raster.write(np.full((9, 9), 612.5, np.float32), 1)
+    ...     grid = SceneGrid("EPSG:32632", 500020.0, 5400020.0, 0.5, (4, 4))
+    ...     float(open_dem(f"{folder}/dem.tif", grid, datum="ellipsoid").heights(grid)[0, 0])
+    612.5
     """
+    crs = scene if isinstance(scene, str) else scene.crs
+    dem = _dem(Path(path), crs, datum=datum, geoid=None if geoid is None else Path(geoid))
+    if not isinstance(scene, str):
+        dem.check_cover(scene)
+    return dem
+
+
+def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
     with _opened(path) as raster:
         inverse, shape, unit = ~raster.transform, raster.shape, (raster.units[0] or "metre").lower()
         system = CRS.from_user_input(raster.crs) if raster.crs else None
@@ -71,7 +98,10 @@ def _opened(path: Path) -> Any:
 
 def _wrong(path: Path, found: str, expected: str) -> CampaignError:
     return CampaignError(
-        found, where=path, expected=expected, remedy="Correct the DEM or scene.dem and scene.dem_datum."
+        found,
+        where=path,
+        expected=expected,
+        remedy="Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum).",
     )
 
 
@@ -79,10 +109,12 @@ def _datum(path: Path, system: CRS, stated: str) -> str:
     carried = carried_datum(system)
     if stated == "carried":
         if carried is None:
-            raise _wrong(path, f"a CRS without heights ({system.name})", "dem_datum ellipsoid, egm96 or egm2008")
+            raise _wrong(
+                path, f"a CRS without heights ({system.name})", "a datum that is stated: ellipsoid, egm96 or egm2008"
+            )
         return carried
     if carried not in {None, stated}:
-        raise _wrong(path, f"heights of {carried} by its own CRS", f"{stated}, as scene.dem_datum says, or carried")
+        raise _wrong(path, f"heights of {carried} by its own CRS", f"{stated}, as stated, or carried")
     return stated
 
 

@@ -55,7 +55,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
             return paths[0]
         raise CampaignError(
             f"heights count from {datum}, but its geoid grid is not here",
-            where="config/config.yaml: scene.geoid",
+            where="scene.geoid",
             expected=wanted,
             remedy=f"Get {names[0] if names else 'that grid'} from PROJ's grid collection (`projsync`), "
             "put it beside the DEM, and name it in scene.geoid.",

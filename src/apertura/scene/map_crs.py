@@ -6,7 +6,7 @@ from pyproj.exceptions import CRSError
 
 from apertura.errors import CampaignError
 
-_WHERE = "config/config.yaml: scene"
+_WHERE = "scene"
 
 
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
@@ -25,7 +25,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     >>> check_crs("EPSG:4326", (0, 0, 1, 1))
     Traceback (most recent call last):
     ...
-    apertura.errors.CampaignError: config/config.yaml: scene: crs EPSG:4326 (WGS 84) is not projected in metres; ...
+    apertura.errors.CampaignError: scene: crs EPSG:4326 (WGS 84) is not projected in metres; ...
     """
     try:
         system = CRS(crs)

@@ -3,7 +3,7 @@
 Only `load`, `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
 """
 
-from apertura.settings.config import CONFIG, Settings, read_settings, validated
+from apertura.settings.config import CONFIG, Settings, located, read_settings, validated
 from apertura.settings.flights import FLIGHTS, Flight, read_flights
 from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
 from apertura.settings.processing import Calibration, Processing
@@ -29,6 +29,7 @@ __all__ = [
     "Section",
     "Settings",
     "Waveform",
+    "located",
     "read_flights",
     "read_settings",
     "validated",

@@ -56,6 +56,20 @@ def read_settings(path: Path) -> Settings:
     return validated(validation.read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
 
 
+def located(message: str) -> str:
+    """Return a message with the config's place before it, where it begins with a key of it: wings know no files.
+
+    Examples
+    --------
+    >>> located("scene.dem: no such file; ..."), located("scene.tif: no such file; ...")
+    ('config/config.yaml: scene.dem: no such file; ...', 'scene.tif: no such file; ...')
+    """
+    section, _, key = message.partition(": ")[0].partition(".")
+    field = Settings.model_fields.get(section)
+    known = field is not None and (not key or key in getattr(field.annotation, "model_fields", {}))
+    return f"{CONFIG}: {message}" if known else message
+
+
 def validated(document: object, *, where: object) -> Settings:
     """Return `document` as Settings; one message names every wrong key and the nearest valid one.
 

@@ -61,7 +61,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     if not captures.start.size:
         raise CampaignError(
             f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",
-            where=recording.files[1],
+            where=recording.files[-1],
             expected=f"preambles of {described['preamble']} in channel {channel}",
             remedy="Check the preamble file and apertura:framing, or record with more signal.",
         )

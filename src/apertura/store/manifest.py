@@ -32,7 +32,7 @@ def check_files(folder: Path) -> None:
             "not there, or not finished",
             where=folder,
             expected="a finished stage with its manifest",
-            remedy=f"Delete {manifest} if it exists and run the workflow again.",
+            remedy=f"{f'Delete {manifest} and run' if manifest.is_file() else 'Run'} the workflow (`apertura run`).",
         )
     expected = json.loads(manifest.read_text(encoding="utf-8"))["files"]
     present = sha256_tree(folder)
