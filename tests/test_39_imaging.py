@@ -95,9 +95,7 @@ def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
     assert rough.attrs["numerical_error_db"] < -20
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
     asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-12.0, engine_options={"toy": {"refine": 2}})
-    assert (
-        json.loads(asked.attrs["models"])["refine"] == "2: asked for in the config; nearest sample of a refined profile"
-    )
+    assert json.loads(asked.attrs["models"])["refine"] == "2: asked for; nearest sample of a refined profile"
 
 
 def test_a_setting_that_misses_on_pixels_gives_way_to_the_next(toy):

@@ -103,7 +103,7 @@ def transfer_by_sidelink(
     captures, clock, clock_flags = _clock_corrected(captures, numerology, accuracy_db)
     radar, sidelink = (demodulate(captures[name], numerology) / codes for name in ("radar", "sidelink"))
     state = measure(sidelink, where=f"{where}: sidelink")
-    chosen, reason = choose(state) if method == "auto" else (method, "asked for in the config")
+    chosen, reason = choose(state) if method == "auto" else (method, "asked for")
     locked = state.locked
     return Transfer(
         METHODS[chosen](radar[locked], sidelink[locked], state.path.select(locked)),

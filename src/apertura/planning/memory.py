@@ -39,7 +39,7 @@ def block_decision(chosen: Setting, job: Job, *, asked: bool) -> Decision:
     if not chosen.table_bytes:
         why = "the double sum needs no table"
     elif asked:
-        why = f"asked for in the config, in blocks of {_LEAST_PULSES} pulses or more; {size} in all"
+        why = f"asked for, in blocks of {_LEAST_PULSES} pulses or more; {size} in all"
     elif chosen.pulse_blocks > 1:
         why = f"{size} do not fit into {decimal(int(job.memory_bytes))} of memory with all else"
     else:

@@ -97,7 +97,7 @@ def _decide_presum(
         return Decision("presum", 1, f"{oversampled}; {why}"), None, every_pulse
 
     if asked == 1:
-        return keep("asked for in the config")
+        return keep("asked for")
     if job.beams is not None:
         if asked is not None:
             raise _no_presum(asked, search.where)

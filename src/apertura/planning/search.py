@@ -124,10 +124,10 @@ class Search:
         asked = {name for name, value in self.options.get(chosen.engine, {}).items() if value is not None}
         met = "meets" if chosen.error_db <= accuracy_db else "does not meet"
         rank = "what was asked for" if asked or self.engine else "cheapest of every engine and setting, to 5 %"
-        why = "asked for in the config; " if self.engine else ""
+        why = "asked for; " if self.engine else ""
         yield Decision("engine", chosen.engine, f"{why}{rank}, {met} {accuracy_db:.0f} dB", chosen.error_db)
         for name, reason in chosen.reasons.items():
-            why = "asked for in the config; " if name in asked else ""
+            why = "asked for; " if name in asked else ""
             yield Decision(name, chosen.all_options[name], why + reason)
 
     def _engines(self) -> list[str]:

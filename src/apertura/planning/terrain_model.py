@@ -44,7 +44,7 @@ def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processi
             expected="plane or auto: the scene has no DEM",
             remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
         )
-    return Decision("terrain", asked, f"asked for in the config; the rule says {chosen.value}: {chosen.reason}")
+    return Decision("terrain", asked, f"asked for; the rule says {chosen.value}: {chosen.reason}")
 
 
 def _by_rule(job: Job) -> Decision:
