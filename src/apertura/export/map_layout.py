@@ -120,14 +120,14 @@ class MapLayout:
         room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
         self._write(LEFT, height - 0.65, subtitle, size=9)
-        self._write(LEFT, 0.2, footer, size=7, color="0.3")
+        self._write(LEFT, 0.16, footer, size=7, color="0.3")
 
     def write_flags(self, flags: Sequence[str]) -> None:
         """Write the number and the names of an image's flags above the footer, on two lines where one is too short."""
         most = int((self.figure.get_size_inches()[0] - LEFT - 0.1) * 72 / (0.64 * 7))  # letters of a line
         lines = wrap(flag_words(flags, 2 * most - LONGEST_FLAG), most, max_lines=2)
         style = {"size": 7, "color": "firebrick" if flags else "0.3"}
-        for line, height in zip(lines, (0.46, 0.34) if len(lines) > 1 else (0.34,), strict=True):
+        for line, height in zip(lines, (0.42, 0.3) if len(lines) > 1 else (0.3,), strict=True):
             self._write(LEFT, height, line, **style)
 
     def _write(self, x: float, y: float, words: str, **style: Any) -> None:
