@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import max_len_seq
 from scipy.stats import ncx2
 
-from apertura.echo.continuous import triggered_rate
 from apertura.echo.framing import Framing
 from apertura.echo.trigger import find_preambles, score_threshold
 
@@ -148,14 +147,6 @@ def test_a_recording_shorter_than_its_preamble_holds_none():
 
 def test_silence_does_not_trigger():
     assert find(np.zeros((100_000, 2), np.int16)) == []
-
-
-def test_rates_of_the_paper():
-    """100 and 20 Hz of 16000 samples at 1.024 GS/s and 14 bit: 0.15625 and 0.03125 %, 44.8 and 8.96 Mbit/s."""
-    for captures, duty, rate in ((100, 0.0015625, 44.8e6), (20, 0.0003125, 8.96e6)):
-        detections = triggered_rate(captures, 16000, recorded_samples=1_024_000_000, sample_rate_hz=1.024e9, bits=14)
-        assert detections.duty_cycle == pytest.approx(duty)
-        assert detections.mean_rate_bit_s == pytest.approx(rate)
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, 2e8])

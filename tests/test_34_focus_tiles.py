@@ -38,3 +38,20 @@ def test_blocks_of_pulses_are_prepared_one_after_the_other(toy):
     tiles = len(list(drawn.grid.tiles(32)))
     assert tiles > 1
     assert (["prepare"] + ["form"] * tiles) * 3 == toy_engine.CALLS
+
+
+@pytest.mark.parametrize("way", ["lazy", "stored"])
+def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
+    drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
+    setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0, pulse_blocks=3)
+    image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=32)
+    whole = image.compute(scheduler="threads")
+    toy_engine.CALLS.clear()
+    window = (slice(0, 32), slice(32, 40))
+    tile = np.zeros(drawn.grid.shape, np.complex64)
+    if way == "lazy":
+        tile[window] = image[window].compute(scheduler="threads")
+    else:
+        compute_tiles(image, [window], tile, threads=2)
+    assert toy_engine.CALLS == ["prepare", "form"] * 3
+    np.testing.assert_array_equal(tile[window], whole[window])

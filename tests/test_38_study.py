@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
+from apertura.errors import CampaignError
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.observation import observe
 from apertura.simulation.synthesis import samples
@@ -388,6 +389,22 @@ def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
     assert rows[1].pulses_used < 0.7 < rows[0].pulses_used
     CliRunner().invoke(commands.app, ["paper-part", "parameters", "--folder", str(tmp_path)])
     assert len(read_table(tmp_path / "parts" / "parameters.csv", Claim)) > 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("paper-part", "loss_x"), "loss_timing"),
+        (("paper-figure", "x"), "carrier_phase"),
+        (("stability-sweep", "x", "divide"), "missed_triggers"),
+        (("stability-sweep", "timing", "x"), "two_parameter"),
+        (("stability-chart", "x"), "missed_triggers"),
+    ],
+)
+def test_a_job_of_the_study_that_does_not_exist_is_told_those_that_do(arguments, named):
+    error = CliRunner().invoke(commands.app, arguments).exception
+    assert isinstance(error, CampaignError)
+    assert named in str(error)
 
 
 def test_a_localization_error_moves_antennas_and_not_the_logs():

@@ -1,5 +1,6 @@
 """The front door from Python: lazy, planned, certified, and the same bits on every scheduler."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import apertura as ap
 from apertura.errors import CampaignError
 from apertura.focus.engines import reference
 from apertura.quality.measures import numerical_error
+from apertura.scene.grid import SceneGrid
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,7 @@ def test_an_image_is_lazy_and_its_chunks_are_the_tiles(image):
     assert image.chunks == ((64, 64, 32), (64, 64, 32))
     assert image.dtype == np.complex64
     assert image.attrs["units"] == "1"
-    assert set(image.attrs["models"]) >= {"engine", "presum", "terrain"}
+    assert set(json.loads(image.attrs["models"])) >= {"engine", "presum", "terrain"}
     assert image.spatial_ref.attrs["crs_wkt"].startswith("LOCAL_CS")
 
 
@@ -92,10 +94,95 @@ def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
     assert rough.attrs["setting"].startswith("toy refine=")
     assert rough.attrs["numerical_error_db"] < -20
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
-    asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-20.0, engine_options={"toy": {"refine": 2}})
-    assert asked.attrs["models"]["refine"] == "2: asked for in the config; nearest sample of a refined profile"
+    asked = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-12.0, engine_options={"toy": {"refine": 2}})
+    assert (
+        json.loads(asked.attrs["models"])["refine"] == "2: asked for in the config; nearest sample of a refined profile"
+    )
 
 
-def test_an_antenna_in_the_ground_is_refused():
-    with pytest.raises(CampaignError, match="in or below the ground of the scene"):
-        ap.backproject(point_history(), TARGET_GRID, terrain=ap.FlatGround(1e4))
+def test_a_setting_that_misses_on_pixels_gives_way_to_the_next(toy):
+    """The toy engine's sample of a profile, its prediction flattered."""
+    asked = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}}
+    missed = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0, **asked)
+    assert not missed.attrs["setting"].startswith("toy")
+    assert missed.attrs["numerical_error_db"] < -60
+    models = json.loads(missed.attrs["models"])
+    assert "missed the accuracy asked" in models["engine"]
+    assert "refine" not in models
+    assert "accuracy_missed" not in json.loads(missed.attrs["flags"])
+
+
+def test_what_no_setting_meets_is_flagged():
+    """Profiles without the double sum to fall back on."""
+    profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
+    flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
+    assert "-120 dB asked" in flags["accuracy_missed"]
+
+
+def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):
+    parts = xr.Dataset({"real": image.real, "imag": image.imag}, attrs=image.attrs)
+    parts.to_netcdf(tmp_path / "image.nc", engine="scipy")
+    assert xr.open_dataset(tmp_path / "image.nc", engine="scipy").attrs["models"] == image.attrs["models"]
+
+
+def spoiled(**fields):
+    return replace(point_history(), **fields)
+
+
+def moved(by_m):
+    aperture = point_history().aperture
+    return spoiled(aperture=ap.Aperture(aperture.tx_m + by_m, aperture.rx_m + by_m))
+
+
+@pytest.mark.parametrize(
+    ("given", "grid", "options", "complaint"),
+    [
+        (point_history, TARGET_GRID, {"terrain": 12.0}, "in or below the ground of the scene"),
+        (point_history, TARGET_GRID, {"terrain": np.nan}, "heights of the terrain are not finite"),
+        (lambda: moved(np.nan), TARGET_GRID, {}, "phase centres are not finite"),
+        (lambda: moved(1e6), TARGET_GRID, {}, "no echo of the scene is in the samples"),
+        (point_history, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {"terrain": 0.0}, "no echo of the scene"),
+        (point_history, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a grid on Earth"),
+        (point_history, SceneGrid("EPSG:4326", 5.0, 5.0, 0.5, (9, 9)), {"terrain": 0.0}, "not projected in metres"),
+        (lambda: spoiled(transfer=np.full((96, 200), np.nan, np.complex64)), TARGET_GRID, {}, "samples of 96 of 96"),
+        (lambda: spoiled(transfer=np.zeros((96, 200), np.complex64)), TARGET_GRID, {}, "all samples are zero"),
+        (point_history, TARGET_GRID, {"accuracy_db": 60.0}, "accuracy_db: Input should be less than or equal to -10"),
+        (point_history, TARGET_GRID, {"presumm": 3}, "presumm: unknown key .did you mean 'presum'"),
+        (point_history, TARGET_GRID, {"tile_px": 100}, "tile_px: Input should be a multiple of 16"),
+        (point_history, TARGET_GRID, {"engine": "fast"}, "engine: no such engine; choose auto, native"),
+        (point_history, TARGET_GRID, {"engine_options": {"native": {"degree": 99}}}, "engine_options.native.degree"),
+    ],
+)
+def test_what_cannot_be_imaged_is_refused_with_one_message(given, grid, options, complaint):
+    with pytest.raises(CampaignError, match=complaint):
+        ap.backproject(given(), grid, **options)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"weight": np.ones(3)}, {"reference_delay_s": np.zeros(3)}, {"transfer": np.zeros((95, 200), np.complex64)}],
+)
+def test_a_history_of_shapes_that_do_not_belong_together_is_refused(fields):
+    with pytest.raises(ValueError, match="must be"):
+        spoiled(**fields)
+
+
+def test_frequencies_that_do_not_ascend_in_equal_steps_are_refused():
+    with pytest.raises(ValueError, match="ascend in equal steps"):
+        ap.backproject(spoiled(frequency_hz=point_history().frequency_hz[::-1].copy()), TARGET_GRID)
+
+
+def test_profiles_that_end_within_the_scene_are_flagged():
+    profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
+    short = replace(profiles, samples=profiles.samples[:, :60])
+    assert "beyond the samples" in json.loads(ap.backproject(short, TARGET_GRID).attrs["flags"])["scene_beyond_samples"]
+    with pytest.raises(ValueError, match="as many pulses"):
+        replace(profiles, samples=profiles.samples[:50])
+
+
+def test_the_window_over_subcarriers_that_is_asked_for_is_taken(finished_tiny):
+    campaign = ap.open_campaign(finished_tiny.root)
+    flight, pairs = next(iter(campaign.pairs.items()))
+    echo, scene = campaign.stage("echo", flight, pairs[0]), campaign.scene
+    hann, none = (ap.backproject(echo, scene.grid, terrain=scene.terrain, window=name) for name in ("hann", "none"))
+    assert float(np.abs(none.values - hann.values).max()) > 1e-3 * float(np.abs(hann.values).max())

@@ -55,7 +55,7 @@ SETTINGS = (
 @pytest.mark.parametrize("window", ["none", "hann"])
 @pytest.mark.parametrize("seed", [1, 3, 9])
 def test_measured_errors_lie_from_3_5_db_below_to_1_5_db_above_the_predicted(seed, window):
-    """White echoes under both windows: Hann lets the same table err up to 17 dB less, and that is foreseen."""
+    """White echoes under both windows: Hann lets the same table err up to 17 dB less, and that is predicted."""
     generator = np.random.default_rng(seed)
     draws = [white(seed, window, generator) for _ in range(12)]  # a small scene is only a few cells of speckle
     job, places = draws[0].job, draws[0].grid.positions(0.0)

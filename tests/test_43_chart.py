@@ -21,8 +21,9 @@ from apertura.imaging.range_profiles import range_compress
 from apertura.scene.terrain import FlatGround
 from apertura.steps import image
 from apertura.steps.plan import expected_plan
-from apertura.study.chart.pareto import Point, with_front, write_points
+from apertura.study.chart.pareto import Point, with_front
 from apertura.study.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
+from apertura.study.tables import write_table
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
     points = [point, replace(point, seconds=2.0), replace(point, seconds=3.0, error_db=-60.1)]
     marked = with_front(points)
     assert [one.on_front for one in marked] == [True, False, True]
-    write_points(marked, tmp_path / "points.csv")
+    write_table(tmp_path / "points.csv", marked)
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
 
 

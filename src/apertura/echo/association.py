@@ -14,6 +14,11 @@ from apertura.errors import CampaignError
 LARGEST_JITTER = 1 / 6
 """RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
 
+EXPLAINED_M = 0.05
+"""Movement of a sidelink that errors of the logged positions alone may explain."""
+
+_MEDIAN_PULSES = 15  # of the running median that tells movement from jitter, an odd number
+
 NEAR_HALF = 0.4
 """Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
 
@@ -69,7 +74,7 @@ def associate(
     Parameters
     ----------
     tx_time_ns, rx_time_ns
-        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any origin common to both.
+        (pulse,) int64, UTC time tags of each node's own clock, nanoseconds, ascending; any common origin.
     repetition_interval_s
         Nominal time between pulses, seconds.
     tx_frame, rx_frame
@@ -79,10 +84,6 @@ def associate(
         a counter ever steps back.
     where
         What to call the recordings in errors.
-
-    Returns
-    -------
-    Association
 
     Raises
     ------
@@ -118,8 +119,7 @@ def associate(
         raise _nothing_in_common(tags, repetition_interval_s, where)
     line = fit_pairs(tags, pairs, interval_ns)
     association = Association(
-        tx_index=pairs[0],
-        rx_index=pairs[1],
+        *pairs,
         offset_s=line.offset_ns * 1e-9,
         drift_ppm=line.drift * 1e6,
         residual_s=float(np.sqrt(np.mean(residual_ns(tags, pairs, line) ** 2))) * 1e-9,
@@ -131,25 +131,18 @@ def associate(
     return replace(association, flags=_flags(association, repetition_interval_s, conflicts))
 
 
-def detect_wrong_association(
-    sidelink_path_m: Floats, predicted_path_m: Floats, *, tolerance_m: float = 0.05, window: int = 15
-) -> str | None:
+def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) -> str | None:
     """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
 
     A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
-    `tolerance_m` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
+    `EXPLAINED_M` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
     positions of other pulses.
 
     Parameters
     ----------
-    sidelink_path_m
-        (pulse,) float64, measured delay of the sidelink times c, metres; NaN where it did not lock.
-    predicted_path_m
-        (pulse,) float64, distance between the antennas of the sidelink for the same pulses, metres.
-    tolerance_m
-        Largest movement that positions alone may explain, metres.
-    window
-        Pulses of the running median that tells movement from jitter, an odd number.
+    sidelink_path_m, predicted_path_m
+        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
+        between its antennas.
 
     Notes
     -----
@@ -165,16 +158,16 @@ def detect_wrong_association(
     'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
     """
     pulse = np.flatnonzero(np.isfinite(sidelink_path_m) & np.isfinite(predicted_path_m))
-    if pulse.size < 2 * window:
+    if pulse.size < 2 * _MEDIAN_PULSES:
         return None
     residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
-    padded = np.pad(residual, window // 2, mode="edge")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1)
+    padded = np.pad(residual, _MEDIAN_PULSES // 2, mode="edge")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, _MEDIAN_PULSES), axis=1)
     smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
     jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
-    noise = 1.2533 * jitter / np.sqrt(window)  # standard deviation of a median of `window` Gaussian samples
+    noise = 1.2533 * jitter / np.sqrt(_MEDIAN_PULSES)  # standard deviation of a median of so many Gaussian samples
     worst = int(np.argmax(np.abs(smooth)))
-    if abs(smooth[worst]) <= max(tolerance_m, 5 * noise):
+    if abs(smooth[worst]) <= max(EXPLAINED_M, 5 * noise):
         return None
     return (
         f"sidelink leaves its geometry by {abs(smooth[worst]):.2f} m at pulse {pulse[worst]} (noise {noise:.3f} m): "
@@ -185,13 +178,9 @@ def detect_wrong_association(
 def _require_ascending(tags: Integers, node: str, where: str) -> None:
     back = np.flatnonzero(np.diff(tags) <= 0)
     if back.size or tags.size == 0:
+        found = f"time tag of pulse {back[0] + 1} of the {node} steps back" if tags.size else f"no pulses of the {node}"
         raise CampaignError(
-            f"no pulses of the {node}"
-            if not tags.size
-            else f"time tag of pulse {back[0] + 1} of the {node} steps back",
-            where=where,
-            expected="time tags that ascend",
-            remedy="Check core:datetime of the capture segments.",
+            found, where, expected="time tags that ascend", remedy="Check core:datetime of the capture segments."
         )
 
 

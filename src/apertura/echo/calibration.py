@@ -114,21 +114,14 @@ def estimate_path_offset(
 
 
 def reflector_history(transfer: Complexes, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
-    """Return the echo of a reflector from pulse to pulse: its phase, and what a coherence factor is made of.
+    """Return the echo (pulse,) complex128 of a reflector: its phase is constant if path and clocks are right.
 
     Parameters
     ----------
-    transfer
-        (pulse, subcarrier) complex64, absolute delay.
-    frequency_hz
-        (subcarrier,) float64, RF.
+    transfer, frequency_hz
+        As for `estimate_path_offset`.
     path_m
         (pulse,) float64, total path of the reflector, offsets included; constant in a static recording.
-
-    Returns
-    -------
-    ndarray
-        (pulse,) complex128, of constant phase if path and clocks are right.
 
     Examples
     --------

@@ -16,12 +16,7 @@ CODE_SIGMA = 4.0
 
 
 def saturated_share(iq: NDArray[np.int16]) -> float:
-    """Return the share of I and Q samples that repeat the largest or the smallest value that occurs.
-
-    Parameters
-    ----------
-    iq
-        (pulse, sample, 2) int16 ADC counts of one channel.
+    """Return the share of (pulse, sample, 2) int16 I and Q that repeat the largest or the smallest value that occurs.
 
     Notes
     -----
@@ -43,12 +38,7 @@ def saturated_share(iq: NDArray[np.int16]) -> float:
 def code_contrast_sigma(transfer: NDArray[np.complex64], *, prefix_cells: int) -> float:
     """Return by how many standard deviations the energy inside the prefix exceeds a wrong code's.
 
-    Parameters
-    ----------
-    transfer
-        (pulse, subcarrier) complex64, code removed.
-    prefix_cells
-        Cells of 1/B inside the cyclic prefix, where every echo must lie.
+    Echoes of (pulse, subcarrier) complex64 `transfer`, the code removed, must lie in the first `prefix_cells` of 1/B.
 
     Notes
     -----

@@ -111,16 +111,7 @@ def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
 
 
 def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: float) -> ClockDecision:
-    """Say whether a clock needs correction for images whose floor may lie at `accuracy_db`.
-
-    Parameters
-    ----------
-    offset
-        From `estimate_clock`.
-    numerology
-        Of the symbol.
-    accuracy_db
-        Level below the peak that errors may reach, dB.
+    """Say whether a clock needs correction for images whose errors may reach `accuracy_db` below the peak.
 
     Examples
     --------

@@ -1,7 +1,6 @@
 """Range compression: transfer functions to range profiles, referenced to band centre and cropped to a swath."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +21,7 @@ WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hannin
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:
-    """Return the weighting over the subcarriers, summing to 1 so that a profile peaks at the echo's amplitude.
-
-    Parameters
-    ----------
-    name
-        A key of `WINDOWS`.
-    count
-        Number of subcarriers.
+    """Return a row of `WINDOWS` for so many subcarriers, summing to 1: a profile peaks at the echo's amplitude.
 
     Examples
     --------
@@ -48,19 +40,22 @@ def centre_frequency(frequency_hz: NDArray[np.float64]) -> float:
 def range_step(frequency_hz: NDArray[np.float64], *, oversampling: float) -> tuple[float, int]:
     """Return the total path between range samples (m) and the length of the inverse DFT that gives it.
 
-    Parameters
-    ----------
-    frequency_hz
-        (subcarrier,) float64, equally spaced.
-    oversampling
-        At least this many samples per resolution cell c/B.
+    Of (subcarrier,) equally spaced frequencies, at least `oversampling` samples per resolution cell c/B.
+
+    Raises
+    ------
+    ValueError
+        If there is but one frequency, or they do not ascend in equal steps: a hundredth of one is let pass.
 
     Examples
     --------
     >>> range_step(1e9 + 1e6 * np.arange(100), oversampling=2)
     (1.49896229, 200)
     """
-    spacing = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
+    steps = np.diff(frequency_hz)
+    spacing = float(steps.mean()) if len(steps) else 0.0
+    if not (spacing > 0 and (np.abs(steps - spacing) <= 0.01 * spacing).all()):
+        raise ValueError(f"{len(frequency_hz)} frequencies: must be two or more that ascend in equal steps")
     length = fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
     return SPEED_OF_LIGHT_M_S / (spacing * length), length
 
@@ -92,7 +87,7 @@ def compress(
     count
         Samples kept per pulse.
     oversampling
-        As `range_step`, whose step this profile has.
+        Of `range_step`, whose step this profile has.
 
     Returns
     -------
@@ -126,41 +121,36 @@ def compress(
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
     turns = (start_m / SPEED_OF_LIGHT_M_S - reference_delay_s) * spacing_hz + (count // 2) / length
     carrier = np.exp(-2j * np.pi * (frequency_hz[middle] * reference_delay_s % 1.0))
-    filters = _decimation(len(frequency_hz), length, count)
-    factor, blocks = len(filters.taps), -(-len(frequency_hz) // len(filters.taps))
+    filters, response = _decimation(len(frequency_hz), length, count)
+    factor, blocks = len(filters), -(-len(frequency_hz) // len(filters))
     weighted = np.zeros((_PULSES_AT_ONCE, blocks * factor), np.complex64)
     profiles = np.empty((len(transfer), count), np.complex64)
     for first in range(0, len(transfer), _PULSES_AT_ONCE):
         part = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
         here = weighted[: part.stop - first]
         np.multiply(transfer[part], weight.astype(np.float32), out=here[:, : len(frequency_hz)])
-        taps = filters.taps * _phasors(turns[part], factor)[:, :, None]
+        taps = filters * _phasors(turns[part], factor)[:, :, None]
         sums = here.reshape(len(here), blocks, factor) @ taps
         start = _turned(carrier[part], -middle * turns[part])
         sums *= (_phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
         spectrum = np.zeros((len(here), length // factor), np.complex64)
-        for tap in range(filters.taps.shape[1]):
+        for tap in range(filters.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
         swath = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
-        profiles[part] = swath[:, after % (length // factor)] * filters.response
+        profiles[part] = swath[:, after % (length // factor)] * response
     return profiles
 
 
-@dataclass(frozen=True)
-class _Decimation:
-    """Taps (factor, tap) that sum `factor` subcarriers to one, and what undoes their response (count,) afterwards."""
+def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    """Return taps (factor, tap) that sum `factor` subcarriers to one, and what undoes their response (count,).
 
-    taps: NDArray[np.complex64]
-    response: NDArray[np.complex64]
-
-
-def _decimation(subcarriers: int, length: int, count: int) -> _Decimation:
-    """Return the filters of the largest decimation that leaves the swath room: none where it fills the range."""
+    The factor is the largest that leaves the swath room: 1 where it fills the range.
+    """
     after, middle = np.arange(count) - count // 2, subcarriers // 2
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]
     factors = [n for n in factors if length // n >= max(_ROOM * count, -(-subcarriers // n) + _TAPS - 1)]
     if not factors:
-        return _Decimation(np.ones((1, 1), np.complex64), _turned(np.ones(count), -middle * after / length))
+        return np.ones((1, 1), np.complex64), _turned(np.ones(count), -middle * after / length)
     factor, reach = factors[-1], _TAPS // 2
     beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
 
@@ -170,7 +160,7 @@ def _decimation(subcarriers: int, length: int, count: int) -> _Decimation:
     wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
     response = 1 / (wave @ (weights * _TAPS / 2 * kaiser_window(nodes, beta)))
     delay = (factor - 1) / 2 - middle - factor * reach
-    return _Decimation(taps.astype(np.complex64), _turned(response, delay * after / length))
+    return taps.astype(np.complex64), _turned(response, delay * after / length)
 
 
 def _turned(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:

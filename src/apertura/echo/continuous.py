@@ -1,7 +1,7 @@
 """Captures cut from a recording that never stopped, at the preamble before each symbol."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,22 +12,6 @@ from apertura.echo.trigger import Samples, find_preambles
 
 _SAMPLES_AT_ONCE = 2**18
 _BITS = 16
-
-
-@dataclass(frozen=True)
-class TriggeredRate:
-    """What a triggered recorder would have kept of a recording.
-
-    Attributes
-    ----------
-    duty_cycle
-        γ, share of the time that is captured.
-    mean_rate_bit_s
-        C = 2·f_s·ν·γ, of one channel: I and Q of ν bits.
-    """
-
-    duty_cycle: float
-    mean_rate_bit_s: float
 
 
 @dataclass(frozen=True)
@@ -59,7 +43,7 @@ def trigger_captures(
     samples
         (sample, 2) int16, I and Q of the trigger's channel; may be memory-mapped, is read in blocks.
     framing, symbol_samples, false_alarms_per_s
-        As `find_preambles`.
+        As for `find_preambles`.
     """
     detections = [
         detection
@@ -70,30 +54,15 @@ def trigger_captures(
     ]
     places = np.array([detection.sample for detection in detections], np.int64)
     numbers = [framing.read_counter(samples[place : place + framing.lead_samples]) for place in places]
-    rate = triggered_rate(
-        len(detections),
-        symbol_samples,
-        recorded_samples=len(samples),
-        sample_rate_hz=framing.sample_rate_hz,
-        bits=_BITS,
-    )
-    snr_db = round(float(np.median([detection.snr_db for detection in detections])), 2) if detections else None
-    report = {"captures": len(detections), "false_alarms_per_s": false_alarms_per_s, "snr_db": snr_db, **asdict(rate)}
+    duty_cycle = len(detections) * symbol_samples / len(samples)
+    report = {
+        "captures": len(detections),
+        "false_alarms_per_s": false_alarms_per_s,
+        "snr_db": round(float(np.median([one.snr_db for one in detections])), 2) if detections else None,
+        "duty_cycle": duty_cycle,
+        "mean_rate_bit_s": 2 * framing.sample_rate_hz * _BITS * duty_cycle,  # I and Q of one channel
+    }
     return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
-
-
-def triggered_rate(
-    captures: int, symbol_samples: int, *, recorded_samples: int, sample_rate_hz: float, bits: int
-) -> TriggeredRate:
-    """Return duty cycle and mean data rate of captures cut from a recording.
-
-    Examples
-    --------
-    >>> triggered_rate(100, 16000, recorded_samples=1_024_000_000, sample_rate_hz=1.024e9, bits=14)
-    TriggeredRate(duty_cycle=0.0015625, mean_rate_bit_s=44800000.0)
-    """
-    duty = captures * symbol_samples / recorded_samples
-    return TriggeredRate(duty, 2 * sample_rate_hz * bits * duty)
 
 
 def _blocks(samples: Samples) -> Iterator[Samples]:

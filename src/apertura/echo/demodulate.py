@@ -68,7 +68,7 @@ def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
 
 
 def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArray[np.complex64]:
-    """Return the received code symbols c_n·H_n of captures.
+    """Return the received code symbols c_n·H_n, (pulse, subcarrier) complex64 in ADC counts per subcarrier.
 
     Parameters
     ----------
@@ -76,11 +76,6 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
         (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
     numerology
         Of the symbol.
-
-    Returns
-    -------
-    ndarray
-        (pulse, subcarrier) complex64, in ADC counts per subcarrier.
 
     Raises
     ------
@@ -112,16 +107,7 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
 def remove_path(
     transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
 ) -> NDArray[np.complex64]:
-    """Return `transfer` with `delay_s` taken off the delay of every echo: times exp(+j2πf·delay).
-
-    Parameters
-    ----------
-    transfer
-        (pulse, subcarrier) complex64.
-    frequency_hz
-        (subcarrier,) float64, RF frequency.
-    delay_s
-        (pulse,) float64, seconds.
+    """Return (pulse, subcarrier) `transfer` with a delay per pulse taken off every echo: times exp(+j2πf·delay).
 
     Examples
     --------

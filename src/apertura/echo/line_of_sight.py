@@ -39,22 +39,13 @@ class LineOfSight:
     noise_power: Floats
     locked: NDArray[np.bool_]
 
-    def select(self, pulses: NDArray[np.bool_]) -> "LineOfSight":
-        """Return the path of some pulses, (pulse,) bool."""
+    def select(self, pulses: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "LineOfSight":
+        """Return the path of some pulses."""
         return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
 
 
 def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
-    """Fit one path to each pulse by maximum likelihood.
-
-    Parameters
-    ----------
-    sidelink
-        (pulse, subcarrier) complex64, code removed.
-
-    Returns
-    -------
-    LineOfSight
+    """Fit one path to each pulse of a sidelink, (pulse, subcarrier) complex64, by maximum likelihood.
 
     Notes
     -----
@@ -74,12 +65,10 @@ def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
     return LineOfSight(delay, phase, amplitude, noise, locked)
 
 
-def phasor(
-    path: LineOfSight, subcarriers: int, pulses: slice | NDArray[np.intp] = slice(None)
-) -> NDArray[np.complex128]:
+def phasor(path: LineOfSight, subcarriers: int) -> NDArray[np.complex128]:
     """Return (pulse, subcarrier) complex128 exp(j(phase - 2π·n·delay/N)) of the fitted paths."""
-    turns = np.outer(path.delay_cells[pulses] / subcarriers, centred_numbers(subcarriers))
-    return np.asarray(np.exp(1j * (path.phase_rad[pulses, None] - 2 * np.pi * turns)))
+    turns = np.outer(path.delay_cells / subcarriers, centred_numbers(subcarriers))
+    return np.asarray(np.exp(1j * (path.phase_rad[:, None] - 2 * np.pi * turns)))
 
 
 def centred_numbers(subcarriers: int) -> Floats:

@@ -23,11 +23,11 @@ FIT_SNR_DB = 13.4
 """Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
-_Inverse = Callable[[Complexes, LineOfSight, slice], NDArray[np.complex128]]
+_Inverse = Callable[[Complexes, LineOfSight], NDArray[np.complex128]]
 
 
 def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
-    """Return R·A/S.
+    """Return R·A/S, (pulse, subcarrier) complex64 in the units of `radar`.
 
     Where |S| falls more than 20 dB below A, in a spectral null or by noise, S is taken as 20 dB below A: a null
     attenuates its subcarrier, it never amplifies one more than tenfold.
@@ -38,11 +38,6 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
         (pulse, subcarrier) complex64 of the same captures.
     path
         The sidelink's direct path, where `measure` has fitted it already.
-
-    Returns
-    -------
-    ndarray
-        (pulse, subcarrier) complex64, in the units of `radar`.
 
     Notes
     -----
@@ -56,10 +51,8 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     array([6., 6., 6.], dtype=float32)
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.complex128]:
-        amplitude = _amplitude(symbols, path, pulses)
-        weakest = _weakest(amplitude)
-        return np.asarray(symbols.conj() * amplitude / np.maximum(np.abs(symbols), weakest) ** 2, np.complex128)
+    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+        return _bounded_inverse(symbols, _amplitude(symbols, path))
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -75,13 +68,13 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     SNR/(SNR + 1).
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.complex128]:
-        amplitude = _amplitude(symbols, path, pulses)
-        noise = np.where(path.locked, path.noise_power, 0.0)[pulses, None]  # without lock the noise is unknown
+    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+        amplitude = _amplitude(symbols, path)
+        noise = np.where(path.locked, path.noise_power, 0.0)[:, None]  # without lock the noise is unknown
         weakest = _weakest(amplitude)
         regular = symbols.conj() * amplitude / np.maximum(np.abs(symbols) ** 2 + noise, weakest**2)
-        kept = np.abs((regular * phasor(path, symbols.shape[1], pulses)).mean(1, keepdims=True))
-        return np.asarray(np.where(path.locked[pulses, None], regular / np.maximum(kept, 1e-30), regular))
+        kept = np.abs((regular * phasor(path, symbols.shape[1])).mean(1, keepdims=True))
+        return np.asarray(np.where(path.locked[:, None], regular / np.maximum(kept, 1e-30), regular))
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -96,15 +89,13 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
     Source: docs/theory/echo_methods.md, "Corrections". Of the noise, 33 cells of N stay.
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.complex128]:
+    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
         subcarriers = symbols.shape[1]
-        direct = phasor(path, subcarriers, pulses)
+        direct = phasor(path, subcarriers)
         profile = fft.ifft(symbols * direct.conj(), axis=1)
         profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # nothing to cut below 33 subcarriers
         clean = fft.fft(profile, axis=1) * direct
-        amplitude = path.amplitude[pulses, None]
-        weakest = _weakest(amplitude)
-        return np.asarray(clean.conj() * amplitude / np.maximum(np.abs(clean), weakest) ** 2, np.complex128)
+        return _bounded_inverse(clean, path.amplitude[:, None])
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -119,8 +110,8 @@ def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | Non
     Source: docs/theory/echo_methods.md, "Two parameters of a pulse".
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.complex128]:
-        return phasor(path, symbols.shape[1], pulses).conj()
+    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+        return phasor(path, symbols.shape[1]).conj()
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -135,14 +126,7 @@ METHODS: Mapping[str, Callable[..., Complexes]] = {
 
 
 def edges(method: str, state: SidelinkState) -> dict[str, str]:
-    """Return the edges that `method` crosses on such a sidelink: flag → one line; empty if it is adequate.
-
-    Parameters
-    ----------
-    method
-        A key of `METHODS`.
-    state
-        From `measure`.
+    """Return the edges that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
 
     Notes
     -----
@@ -174,11 +158,6 @@ def edges(method: str, state: SidelinkState) -> dict[str, str]:
 def choose(state: SidelinkState) -> tuple[str, str]:
     """Return the cheapest adequate method and why, in one line.
 
-    Parameters
-    ----------
-    state
-        From `measure`.
-
     Examples
     --------
     >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
@@ -203,10 +182,15 @@ def _gain_db(state: SidelinkState, cells: int) -> float:
     return state.snr_db + 10 * float(np.log10(state.subcarriers / min(cells, state.subcarriers)))
 
 
-def _amplitude(symbols: Complexes, path: LineOfSight, pulses: slice) -> NDArray[np.float64]:
+def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float64]:
     """Return (pulse, 1) amplitude of the direct path, or of all that arrives where it did not lock."""
     rms = np.sqrt(np.mean(np.abs(symbols) ** 2, axis=1))
-    return np.asarray(np.where(path.locked[pulses], path.amplitude[pulses], rms)[:, None], np.float64)
+    return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float64)
+
+
+def _bounded_inverse(symbols: NDArray[np.complexfloating], amplitude: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return A/S, where |S| counts as no weaker than `_weakest`."""
+    return np.asarray(symbols.conj() * amplitude / np.maximum(np.abs(symbols), _weakest(amplitude)) ** 2, np.complex128)
 
 
 def _weakest(amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -219,5 +203,5 @@ def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, in
     corrected = np.empty(radar.shape, np.complex64)
     for first in range(0, len(radar), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        corrected[pulses] = radar[pulses] * inverse(sidelink[pulses], path, pulses)
+        corrected[pulses] = radar[pulses] * inverse(sidelink[pulses], path.select(pulses))
     return corrected

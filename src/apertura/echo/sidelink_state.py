@@ -27,12 +27,10 @@ NULL_DB = -20.0
 
 @dataclass(frozen=True)
 class SidelinkState:
-    """What decides which correction a sidelink allows.
+    """What decides which correction a sidelink of N `subcarriers` allows.
 
     Attributes
     ----------
-    subcarriers
-        N.
     snr_db
         Per subcarrier, median of the locked pulses.
     echo_db
@@ -72,18 +70,7 @@ class SidelinkState:
 
 
 def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
-    """Measure the sidelink of a flight.
-
-    Parameters
-    ----------
-    sidelink
-        (pulse, subcarrier) complex64, code removed.
-    where
-        What to call the recording in errors.
-
-    Returns
-    -------
-    SidelinkState
+    """Measure the sidelink of a flight, (pulse, subcarrier) complex64, the code removed; errors call it `where`.
 
     Raises
     ------
@@ -146,14 +133,13 @@ def _average(sidelink: Complexes, path: LineOfSight) -> _Average:
     cells, levels = [], []
     for first in range(0, locked.size, 64):
         some = locked[first : first + 64]
-        aligned = sidelink[some] * phasor(path, subcarriers, some).conj() / path.amplitude[some, None]
+        direct = path.select(some)
+        aligned = sidelink[some] * phasor(direct, subcarriers).conj() / direct.amplitude[:, None]
         profile = fft.ifft(aligned, axis=1)
         profile_power = np.abs(profile) ** 2
-        power, mean, spectrum = (
-            power + profile_power.sum(0),
-            mean + profile.sum(0),
-            spectrum + (np.abs(aligned) ** 2).sum(0),
-        )
+        power += profile_power.sum(0)
+        mean += profile.sum(0)
+        spectrum += (np.abs(aligned) ** 2).sum(0)
         cells.append(profile_power[:, 2:-1].argmax(1) + 2)
         levels.append(profile_power[:, 2:-1].max(1))
     level = np.concatenate(levels)

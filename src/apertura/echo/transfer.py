@@ -44,14 +44,8 @@ class Transfer:
 def transfer_by_code(radar: Samples, codes: Complexes, numerology: Numerology) -> Transfer:
     """Return what a node received of its own pulses, whose clock is the transmitter's.
 
-    Parameters
-    ----------
-    radar
-        (capture, sample, 2) int16 I and Q, from the start of the cyclic prefix.
-    codes
-        (subcarrier,) complex64, as transmitted.
-    numerology
-        Of the symbol.
+    `radar` holds (capture, sample, 2) int16 I and Q from the start of the cyclic prefix, `codes` (subcarrier,) what was
+    sent, complex64.
 
     Examples
     --------
@@ -84,7 +78,7 @@ def transfer_by_sidelink(
     iq
         radar, sidelink → (capture, sample, 2) int16 I and Q, from near the start of the cyclic prefix.
     codes, numerology
-        As `transfer_by_code`.
+        (subcarrier,) complex64 as transmitted, and the grid of the symbol.
     symbol_samples
         (T_cp + T)·f_s: nothing beyond is used.
     sidelink_m

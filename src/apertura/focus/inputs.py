@@ -24,6 +24,11 @@ class PhaseHistory:
         (pulse,) float64, delay already removed from `transfer`.
     aperture
         Phase centres in the frame of the pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not belong together.
     """
 
     transfer: NDArray[np.complex64]
@@ -31,6 +36,19 @@ class PhaseHistory:
     weight: NDArray[np.float64]
     reference_delay_s: NDArray[np.float64]
     aperture: Aperture
+
+    def __post_init__(self) -> None:
+        pulses, subcarriers = self.transfer.shape if self.transfer.ndim == 2 else (-1, -1)
+        if (len(self.aperture), self.reference_delay_s.shape) != (pulses, (pulses,)):
+            raise ValueError(
+                f"{self.transfer.shape=}, {self.reference_delay_s.shape=}, {len(self.aperture)=}: must be "
+                "(pulse, subcarrier), (pulse,) and as many pulses"
+            )
+        if not self.frequency_hz.shape == self.weight.shape == (subcarriers,):
+            raise ValueError(
+                f"{self.transfer.shape=}, {self.frequency_hz.shape=}, {self.weight.shape=}: must be "
+                "(pulse, subcarrier) and (subcarrier,) twice"
+            )
 
     def __len__(self) -> int:
         """Return the number of pulses."""
@@ -68,6 +86,11 @@ class Profiles:
         Nyquist cells per sample inverted: (c/B)/step_m.
     aperture
         Phase centres in the frame of the pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not belong together, or the step is not positive.
     """
 
     samples: NDArray[np.complex64]
@@ -76,6 +99,16 @@ class Profiles:
     centre_frequency_hz: float
     oversampling: float
     aperture: Aperture
+
+    def __post_init__(self) -> None:
+        pulses = len(self.samples) if self.samples.ndim == 2 else -1
+        if (len(self.aperture), self.start_m.shape) != (pulses, (pulses,)):
+            raise ValueError(
+                f"{self.samples.shape=}, {self.start_m.shape=}, {len(self.aperture)=}: must be (pulse, range), "
+                "(pulse,) and as many pulses"
+            )
+        if not 0 < self.step_m < np.inf:
+            raise ValueError(f"{self.step_m=}: must be positive")
 
     def __len__(self) -> int:
         """Return the number of pulses."""

@@ -1,8 +1,8 @@
 """An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
@@ -59,27 +59,46 @@ def image_array(
         (row, column) complex64; 1 is the amplitude of an echo seen by every pulse.
     """
     from dask.array.core import Array
+    from dask.highlevelgraph import HighLevelGraph
 
-    prepare = partial(_prepare, setting, presum)
+    from apertura.focus.layer import tiles_layer
+
+    name = f"image-{uuid4().hex}"
+    graph = partial(_graph, name, inputs, setting, grid, terrain, side_px, beams, presum)
+    chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
+    places = product(range(len(chunks[0])), range(len(chunks[1])))
+    return Array(HighLevelGraph({name: tiles_layer(name, graph, places)}, {name: set()}), name, chunks, np.complex64)
+
+
+def _graph(  # noqa: PLR0917
+    name: str,
+    inputs: PhaseHistory | Profiles,
+    setting: Setting,
+    grid: SceneGrid,
+    terrain: Terrain,
+    side_px: int,
+    beams: Beams | None,
+    presum: tuple[Presum, NDArray[np.float64]] | None,
+    places: Collection[tuple[int, int]],
+) -> dict[Any, Any]:
+    """Return the tasks of the tiles in some rows and columns of tiles, and of what they share."""
     count, pulses = np.float32(len(inputs)), len(inputs) if presum is None else len(presum[0].at)
     ends = [number * pulses // setting.pulse_blocks for number in range(setting.pulse_blocks + 1)]
-    name = f"image-{uuid4().hex}"
     graph: dict[Any, Any] = {f"{name}-inputs": inputs}
     before: list[Any] = []  # what must be done before the next block's tables are prepared
     for number, block in enumerate(slice(*pair) for pair in pairwise(ends)):
         tables, last = f"{name}-tables-{number}", block.stop == pulses
-        graph[tables] = (partial(prepare, block), f"{name}-inputs", before)
+        graph[tables] = (partial(_prepare, setting, presum, block), f"{name}-inputs", before)
         before = []
-        for rows, columns in grid.tiles(side_px):
-            place = (rows.start // side_px, columns.start // side_px)
+        for place in places:
+            rows, columns = (slice(at * side_px, (at + 1) * side_px) for at in place)
             form = partial(_form, setting, grid[rows, columns], terrain, beams and beams[block], count)
             sum_before = (f"{name}-{number - 1}", *place) if number else None
             key = (name if last else f"{name}-{number}", *place)
             graph[key] = (form, tables, sum_before)
             graph[f"{name}-done-{number}", *place] = (_nothing, key)
             before.append((f"{name}-done-{number}", *place))
-    chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
-    return Array(graph, name, chunks, dtype=np.complex64)
+    return graph
 
 
 def _prepare(

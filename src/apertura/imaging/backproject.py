@@ -1,5 +1,6 @@
 """The front door from Python: one call from profiles or phase history to a planned, certified, lazy image."""
 
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -7,18 +8,22 @@ import numpy as np
 
 from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import illuminate
+from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job
+from apertura.imaging.checks import check_inputs
+from apertura.imaging.choices import ImagingChoices
 from apertura.imaging.formation import Formation
 from apertura.imaging.job import imaging_job, profiles_job
 from apertura.imaging.range_profiles import range_compress
 from apertura.imaging.stages import inputs_of
+from apertura.planning.memory import memory_limit
 from apertura.planning.planner import make_plan
-from apertura.quality.measures import numerical_error
-from apertura.scene.clearance import check_antennas
+from apertura.quality.measures import NumericalError, numerical_error
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
 from apertura.scene.terrain import FlatGround, Terrain
+from apertura.validation import validated
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -29,10 +34,9 @@ def backproject(
     grid: SceneGrid,
     accuracy_db: float = -60.0,
     *,
-    terrain: Terrain | None = None,
+    terrain: Terrain | float | None = None,
     engine: str = "auto",
     beams: Beams | None = None,
-    tile_px: int = 256,
     certified_pixels: int = 64,
     terrain_model: str = "auto",
     **choices: Any,
@@ -47,35 +51,37 @@ def backproject(
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
-        Numerical error asked: RMS on random pixels relative to the exact sum, dB.
+        Numerical error asked: RMS on random pixels relative to the exact sum, dB, -120 to -10.
     terrain
-        Heights of the ground; at zero by default.
+        Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
+        default.
     engine
         'auto' or a key of `apertura.focus.engines.ENGINES`.
     beams
         Of the antennas; isotropic by default.
-    tile_px
-        Side of a tile, which is a chunk of the array; a multiple of 16.
     certified_pixels
-        Random pixels computed both ways at once, for the certificate; 0 for none.
+        Random pixels computed both ways at once, for the certificate; 0 for none. A setting that misses the accuracy
+        asked on them gives way to the plan's next.
     terrain_model
         'auto', 'plane', 'tilted_plane' or 'dem': what stands for the ground.
     **choices
-        Other choices of the planner: engine_options, presum, pulse_blocks.
+        The others of `apertura.imaging.choices.ImagingChoices`: engine_options, presum, pulse_blocks, tile_px (side of
+        a tile, which is a chunk of the array, 256), window (over the subcarriers of a stage `echo`, 'hann').
 
     Returns
     -------
     xarray.DataArray
         (y, x) complex64, carrier kept, 1 is the amplitude of an echo seen by every pulse; a dask array on whatever
-        scheduler the caller has. Attributes: units, the plan (`setting`, `models`, `flags`, `predicted_error_db`) and
-        the certificate (`numerical_error_db`, `numerical_error_std_db`, against the double sum over pulses and
-        subcarriers, or from profiles alone against their band-limited interpolation in float64).
+        scheduler the caller has. Attributes: units; the plan: `setting`, `predicted_error_db`, and as JSON `models`
+        (choice → value and reason) and `flags` (limit crossed → what was found); the certificate: `numerical_error_db`,
+        `numerical_error_std_db`, against the double sum over pulses and subcarriers, or from profiles alone against
+        their band-limited interpolation in float64.
 
     Raises
     ------
     CampaignError
-        If there is no pulse, no echo of the scene arrives, an antenna is in the ground, or what is asked cannot run
-        here.
+        If a choice is not one, positions, samples or heights are not finite, an antenna is in the ground, no echo of
+        the scene arrives, or what is asked cannot run here.
     ValueError
         If the scene is deeper than the unambiguous range.
 
@@ -99,44 +105,69 @@ def backproject(
     """
     import xarray as xr
 
-    inputs = inputs_of(profiles)
-    ground = terrain if terrain is not None else FlatGround(0.0)
+    asked = validated(
+        ImagingChoices,
+        {**choices, "accuracy_db": accuracy_db, "engine": engine, "terrain": terrain_model},
+        where="backproject",
+        expected="choices of ImagingChoices",
+    )
+    inputs = inputs_of(profiles, asked.window)
+    ground = _ground(terrain, grid)
+    flags = check_inputs(inputs, grid, ground)
     level = ground if isinstance(ground, FlatGround) else FlatGround(float(np.nanmean(ground.heights(grid.coarse(33)))))
-    flags = check_antennas(grid, ground, inputs.aperture, where="backproject")
-    models = GroundModels.of(ground, level, grid)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
-    job = _job(compressed, history, grid, models, beams, tile_px)
-    overrides = {**choices, "engine": engine, "terrain": terrain_model}
-    plan = make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where="backproject")
-    formation = Formation(history, compressed, grid, plan, tile_px, beams)
-    attributes: dict[str, Any] = {
-        "units": "1",
-        "long_name": "focused scene, carrier kept",
-        "grid_mapping": "spatial_ref",
-        "setting": plan.setting.line,
-        "models": plan.reasons,
-        "flags": {**flags, **plan.flags},
-        "predicted_error_db": round(plan.predicted_error_db, 2),
-    }
+    job = replace(_job(compressed, history, grid, GroundModels.of(ground, level, grid), beams), tile_px=asked.tile_px)
+    plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
+    formation = Formation(history, compressed, grid, plan, asked.tile_px, beams)
+    attributes: dict[str, Any] = {}
     if certified_pixels:
-        pixels = np.random.default_rng(0).integers(0, grid.shape, (certified_pixels, 2))
-        error = numerical_error(formation.values(pixels), formation.exact(pixels))
-        attributes |= {
+        formation, error = _certified(formation, accuracy_db, certified_pixels)
+        attributes = {
             "numerical_error_db": round(error.rms_db, 2),
             "numerical_error_std_db": round(error.std_db, 2),
             "certified_pixels": certified_pixels,
         }
+        if error.rms_db > accuracy_db:
+            flags["accuracy_missed"] = f"{error.rms_db:.1f} dB measured, {accuracy_db:g} dB asked"
+    attributes |= {
+        "units": "1",
+        "long_name": "focused scene, carrier kept",
+        "grid_mapping": "spatial_ref",
+        "setting": formation.plan.setting.line,
+        "predicted_error_db": round(formation.plan.predicted_error_db, 2),
+        "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
+        "flags": json.dumps({**flags, **plan.flags}, ensure_ascii=False),
+    }
     return xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
 
 
+def _ground(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
+    if terrain is None and grid.frame == "ecef":
+        raise CampaignError(
+            "no terrain for a grid on Earth",
+            where="backproject: terrain",
+            expected=f"how high the ground of {grid.crs} is above its ellipsoid",
+            remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
+        )
+    return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
+
+
+def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, NumericalError]:
+    """Return the image by the first setting of the plan that meets the accuracy on random pixels, or by the last."""
+    pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
+    exact = formation.exact(pixels)
+    error = numerical_error(formation.values(pixels), exact)
+    for setting in formation.plan.fallbacks:
+        if error.rms_db <= accuracy_db:
+            break
+        formation = replace(formation, plan=formation.plan.fallen_back(setting))
+        error = numerical_error(formation.values(pixels), exact)
+    return formation, error
+
+
 def _job(
-    profiles: Profiles,
-    history: PhaseHistory | None,
-    grid: SceneGrid,
-    ground: GroundModels,
-    beams: Beams | None,
-    tile_px: int,
+    profiles: Profiles, history: PhaseHistory | None, grid: SceneGrid, ground: GroundModels, beams: Beams | None
 ) -> Job:
     if history is None:
         job = profiles_job(profiles, grid, ground, beams=beams)
@@ -145,4 +176,4 @@ def _job(
             history.aperture, history.frequency_hz, history.weight, grid, ground, history=history, beams=beams
         )
     lit = None if beams is None else illuminate(beams, job.aperture, job.points_m)
-    return replace(job, tile_px=tile_px, illumination=lit)
+    return replace(job, illumination=lit, memory_bytes=memory_limit())

@@ -4,12 +4,14 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.formation import Formation
 from apertura.quality.error_check import Certificate, certified_pixels
 from apertura.quality.measures import coherence_factor, survey
 from apertura.quality.point_targets import cut_through, find_peak
+from apertura.scene.grid import SceneGrid
 
 CERTIFIED_PIXELS = 256
 
@@ -62,7 +64,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     track = formation.profiles.aperture.tx_m
-    along = grid.direction(track[-1] - track[0], peak.row, peak.column)
+    along = _direction(grid, track[-1] - track[0], peak.row, peak.column)
     cuts = {
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
         for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
@@ -82,3 +84,11 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             },
         },
     }
+
+
+def _direction(grid: SceneGrid, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
+    """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel."""
+    here, east, north = grid.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
+    axes = np.stack([east - here, north - here])
+    steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
+    return float(steps[0]), float(steps[1])

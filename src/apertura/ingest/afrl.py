@@ -19,20 +19,11 @@ _EPOCH = np.datetime64("1970-01-01", "ns")
 
 
 def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
-    """Return the `echo` stage of phase-history files joined in the order of their names.
+    """Return the `echo` stage of a pass whose .mat files are joined in the order of their names.
 
-    Parameters
-    ----------
-    paths
-        .mat files of one pass; each holds fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m).
-    pair
-        Transmitter-receiver.
-
-    Returns
-    -------
-    xarray.Dataset
-        Monostatic: both phase centres are the antenna. Samples are referred to a delay of 2 r0/c. The data
-        carry no clock; `time` counts pulses from the epoch at 1 s. Frame 'local': metres from the scene centre.
+    Each holds fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). Monostatic: both phase centres are the antenna.
+    Samples are referred to a delay of 2 r0/c. The data carry no clock: `time` counts pulses from the epoch at 1 s.
+    Frame 'local': metres from the scene centre.
 
     Raises
     ------

@@ -18,10 +18,7 @@ _COLUMNS = ["cut", "angle_deg", "gain_db"]
 def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
     """Return the azimuth and elevation cuts of a CSV file.
 
-    Parameters
-    ----------
-    path
-        Columns cut (azimuth or elevation), angle_deg (growing within each cut, from boresight) and gain_db.
+    Its columns are cut (azimuth or elevation), angle_deg (growing within each cut, from boresight) and gain_db.
 
     Raises
     ------

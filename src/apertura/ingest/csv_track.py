@@ -16,13 +16,8 @@ _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
     """Return the `track` stage of a CSV log.
 
-    Parameters
-    ----------
-    path
-        Columns time_utc (ISO 8601), latitude_deg, longitude_deg, height_m (ellipsoidal, WGS 84) and, where
-        known, roll_deg, pitch_deg, yaw_deg.
-    node
-        Name of the node that logged.
+    Its columns are time_utc (ISO 8601), latitude_deg, longitude_deg, height_m (ellipsoidal, WGS 84) and, where
+    known, roll_deg, pitch_deg, yaw_deg.
 
     Raises
     ------

@@ -43,8 +43,6 @@ class Recording:
     ----------
     samples
         (sample, channel, 2) int16 I and Q, memory-mapped.
-    channels
-        Names of the channels.
     sample_rate_hz, frequency_hz
         Complex samples per second and RF frequency at baseband zero.
     captures
@@ -86,19 +84,7 @@ class Recording:
             )
 
     def cut(self, captures: Captures, *, node: str) -> xr.Dataset:
-        """Return the `raw` stage of some captures.
-
-        Parameters
-        ----------
-        captures
-            Where to cut.
-        node
-            Name of the node that recorded.
-
-        Returns
-        -------
-        xarray.Dataset
-            iq (channel, pulse, sample, component) int16 counts, time (pulse) UTC, frame (pulse).
+        """Return the `raw` stage of some captures of a node: iq, int16 counts, with UTC time and frame of each pulse.
 
         Raises
         ------
@@ -106,7 +92,15 @@ class Recording:
             If a capture holds only zeros.
         """
         iq = np.stack([self.samples[start : start + captures.length] for start in captures.start])
-        self._check_alive(iq)
+        for index, name in enumerate(self.channels):
+            dead = np.flatnonzero(~iq[:, :, index].any(axis=(1, 2)))
+            if dead.size:
+                raise CampaignError(
+                    f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
+                    self.files[-1],
+                    "samples",
+                    "The receiver or the copy failed; record or copy again, or remove those captures.",
+                )
         return xr.Dataset(
             {
                 "iq": (("channel", "pulse", "sample", "component"), np.moveaxis(iq, 2, 0)),
@@ -120,14 +114,3 @@ class Recording:
                 "frequency_hz": self.frequency_hz,
             },
         )
-
-    def _check_alive(self, iq: NDArray[np.int16]) -> None:
-        for index, name in enumerate(self.channels):
-            dead = np.flatnonzero(~iq[:, :, index].any(axis=(1, 2)))
-            if dead.size:
-                raise CampaignError(
-                    f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
-                    self.files[-1],
-                    "samples",
-                    "The receiver or the copy failed; record or copy again, or remove those captures.",
-                )

@@ -17,13 +17,8 @@ _LEAP_SINCE = np.datetime64("2017-01-01", "ns")
 def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
     """Return the `track` stage of an RTKLIB solution.
 
-    Parameters
-    ----------
-    path
-        A .pos file in latitude, longitude (decimal degrees) and ellipsoidal height; its header says whether
-        times are GPST (ahead of UTC by 18 s since 2017) or UTC, as calendar dates or week and seconds.
-    node
-        Name of the node that logged.
+    It holds latitude, longitude (decimal degrees) and ellipsoidal height; its header says whether times are GPST
+    (ahead of UTC by 18 s since 2017) or UTC, as calendar dates or week and seconds.
 
     Raises
     ------

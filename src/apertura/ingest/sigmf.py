@@ -49,12 +49,7 @@ class _Meta(BaseModel):
 
 
 def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
-    """Open a SigMF recording after checking its metadata and size.
-
-    Parameters
-    ----------
-    meta_path, data_path
-        ``.sigmf-meta`` and ``.sigmf-data``, datatype ci16_le.
+    """Open a SigMF recording of datatype ci16_le after checking its metadata and size.
 
     Raises
     ------

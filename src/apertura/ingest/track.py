@@ -18,7 +18,7 @@ def make_track(
     node: str,
     where: Path,
 ) -> xr.Dataset:
-    """Return the `track` stage of logged epochs.
+    """Return the `track` stage of epochs that `node` logged in the file `where`.
 
     Parameters
     ----------
@@ -28,10 +28,6 @@ def make_track(
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; None where not logged.
-    node
-        Name of the node that logged.
-    where
-        The log, for messages.
 
     Raises
     ------

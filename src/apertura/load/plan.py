@@ -20,9 +20,6 @@ from apertura.scene.ground_models import GroundModels
 from apertura.settings import CONFIG
 from apertura.store import manifest_of
 
-OVERRIDES = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Choices of the planner that section `processing` may make instead."""
-
 
 def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Plan:
     """Return how an open pair will be imaged.
@@ -54,8 +51,9 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
 def plan_job(campaign: Campaign, job: Job) -> Plan:
     """Return how a job will be done at the accuracy and with the overrides of a campaign."""
     processing = campaign.settings.processing
-    overrides = {name: getattr(processing, name) for name in OVERRIDES}
-    return make_plan(job, accuracy_db=processing.accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
+    return make_plan(
+        job, accuracy_db=processing.accuracy_db, overrides=processing.planned, where=f"{CONFIG}: processing"
+    )
 
 
 def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Job:

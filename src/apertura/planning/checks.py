@@ -23,7 +23,7 @@ def check_geometry(job: Job) -> dict[str, str]:
         If there is no pulse, a position is not finite, or no echo of the scene arrives inside the prefix.
     """
     aperture, ground_m = job.aperture, job.ground_m
-    _check_finite(aperture)
+    check_positions(aperture)
     up = vertical(ground_m)
     flags: dict[str, str] = {}
     over = np.zeros(len(aperture), bool)
@@ -48,7 +48,8 @@ def check_geometry(job: Job) -> dict[str, str]:
     return flags
 
 
-def _check_finite(aperture: Aperture) -> None:
+def check_positions(aperture: Aperture) -> None:
+    """Raise CampaignError unless there is a pulse and each has finite phase centres."""
     if len(aperture) == 0:
         raise CampaignError(
             "zero pulses", where="echo", expected="at least one", remedy="Check the triggers and the sidelink."

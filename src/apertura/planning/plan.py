@@ -1,7 +1,7 @@
 """What the planner answers: how an image will be formed, with a reason for each choice."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,26 @@ class Plan:
     def presumming(self) -> tuple[Presum, NDArray[np.float64]] | None:
         """The low-pass sum over pulses and the point they are aligned to; None: every pulse as it is."""
         return None if self.presum is None or self.middle_m is None else (self.presum, self.middle_m)
+
+    def fallen_back(self, setting: Setting) -> "Plan":
+        """Return the plan with one of its fallbacks, which takes every pulse as it is."""
+        reason = f"{self.setting.line} missed the accuracy asked on the pixels compared"
+        replaced = {"engine", "presum", "pulse_blocks", *self.setting.reasons}
+        decisions = (
+            Decision("engine", setting.engine, reason, setting.error_db),
+            *(Decision(name, setting.all_options[name], why) for name, why in setting.reasons.items()),
+            Decision("presum", 1, "a fallback takes every pulse"),
+            Decision("pulse_blocks", setting.pulse_blocks, "those of the fallback"),
+            *(decision for decision in self.decisions if decision.name not in replaced),
+        )
+        return replace(
+            self,
+            setting=setting,
+            decisions=decisions,
+            predicted_error_db=setting.error_db,
+            presum=None,
+            middle_m=None,
+        )
 
     def inputs(self, profiles: Profiles) -> Profiles:
         """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same."""

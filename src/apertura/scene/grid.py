@@ -35,6 +35,11 @@ class SceneGrid:
     name
         What GIS software shows for a local frame.
 
+    Raises
+    ------
+    ValueError
+        If the spacing or a side is not positive, or a corner is not finite.
+
     Examples
     --------
     >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60))
@@ -51,6 +56,13 @@ class SceneGrid:
     shape: tuple[int, int]
     first: tuple[int, int] = (0, 0)
     name: str = LOCAL
+
+    def __post_init__(self) -> None:
+        if not (0 < self.spacing_m < np.inf and np.isfinite([self.west_m, self.north_m]).all() and min(self.shape) > 0):
+            raise ValueError(
+                f"{self.west_m=}, {self.north_m=}, {self.spacing_m=}, {self.shape=}: must be finite, the spacing and "
+                "both sides positive"
+            )
 
     @classmethod
     def from_bounds(
@@ -240,16 +252,3 @@ class SceneGrid:
     def sample_points(self, count: int, height_m: float) -> Floats:
         """Return (count, count, 3) float64 positions (m) of `sample_pixels` at one height; rows go south."""
         return self.positions_at(*self.sample_pixels(count), height_m)
-
-    def direction(self, vector_m: Floats, row: float, column: float) -> tuple[float, float]:
-        """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel.
-
-        Examples
-        --------
-        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)).direction(np.array([3.0, 4.0, 1.0]), 2.0, 5.0)
-        (3.0, 4.0)
-        """
-        here, east, north = self.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
-        axes = np.stack([east - here, north - here])
-        steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
-        return float(steps[0]), float(steps[1])

@@ -1,71 +1,22 @@
 """Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field
 
-from apertura.focus.engines import ENGINES, load_engine
+from apertura.imaging.choices import ImagingChoices
 from apertura.settings.section import Metres3, Name, Section
 
 
-def _options_of_each_engine(schema: dict[str, Any]) -> None:
-    engines = {name: load_engine(name).Options.model_json_schema() for name in ENGINES}
-    schema.update(additionalProperties=False, properties=engines)
-
-
-class Processing(Section):
+class Processing(ImagingChoices):
     """How to compute; every key has a default."""
 
-    window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
-    accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
-    engine: str = Field(
-        "auto",
-        description=f"backprojection engine: auto, {', '.join(ENGINES)}",
-        json_schema_extra={"enum": ["auto", *ENGINES]},
-    )
-    engine_options: dict[str, dict[str, Any]] = Field(
-        default_factory=dict,
-        description="options of engines that the planner shall not choose: engine → option → value",
-        examples=[{}],
-        json_schema_extra=_options_of_each_engine,
-    )
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
-    tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
-    presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
-        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
-    )
-    pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
-        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
-    )
-    terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
-        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
-    )
-
-    @field_validator("engine")
-    @classmethod
-    def _engine_is_known(cls, name: str) -> str:
-        if name not in {"auto", *ENGINES}:
-            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
-        return name
-
-    @model_validator(mode="after")
-    def _options_are_those_of_engines(self) -> Self:
-        for name, options in self.engine_options.items():
-            if name not in ENGINES:
-                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
-            try:
-                load_engine(name).Options.model_validate(options)
-            except ValidationError as error:
-                first = error.errors()[0]
-                known = ", ".join(load_engine(name).Options.model_fields) or "none"
-                option = ".".join(map(str, first["loc"]))
-                raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
-        return self
 
 
 class Calibration(Section):

@@ -58,7 +58,7 @@ def simulate(
     impairments: Mapping[str, Impairments] | None = None,
     seed: int | Generator = 1,
 ) -> Path:
-    """Write a simulated campaign: SigMF recordings, flight logs, codes, config, and truth.json.
+    """Write a simulated campaign: SigMF recordings, flight logs, codes, config, and truth.json; return its folder.
 
     Parameters
     ----------
@@ -76,11 +76,6 @@ def simulate(
         Node → what is wrong with it instead.
     seed
         Of everything random, or the generator itself; the same seed gives identical bytes.
-
-    Returns
-    -------
-    Path
-        `directory`.
 
     Raises
     ------
@@ -120,7 +115,7 @@ def preset(name: str, *, pulses: int | None = None) -> CampaignSpecification:
     Raises
     ------
     CampaignError
-        If there is no preset of that name.
+        If there is none of that name.
 
     Examples
     --------

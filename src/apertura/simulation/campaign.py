@@ -16,14 +16,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.simulation.continuous import continuous_blocks, recording_start_s
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.files import (
-    Segment,
-    flight_truth,
-    targets_truth,
-    write_csv_log,
-    write_pos_log,
-    write_recording,
-)
+from apertura.simulation.files import flight_truth, targets_truth, write_csv_log, write_pos_log, write_recording
 from apertura.simulation.impairments import Adc
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.recording import digitize, full_scale
@@ -39,34 +32,20 @@ from apertura.simulation.synthesis import samples
 from apertura.simulation.trajectory import phase_centre
 
 _LOG_MARGIN_S = 2.0
+_WAVEFORM_KEYS = (
+    "carrier_hz", "carrier_is", "subcarriers", "subcarrier_spacing_hz", "symbol_s", "cyclic_prefix_s", "sample_rate_hz",
+    "prf_hz",
+)  # fmt: skip
 _PULSES_AT_ONCE = 16
 
 
 def write_campaign(directory: Path, specification: CampaignSpecification, generator: Generator) -> Path:
-    """Simulate a specification and write its campaign folder.
-
-    Parameters
-    ----------
-    directory
-        The folder to make; it must not exist, or be empty.
-    specification
-        Who flies what over which scene.
-    generator
-        Everything random; the same state gives identical bytes.
-
-    Returns
-    -------
-    Path
-        `directory`.
+    """Simulate a specification into a folder that is new or empty; it is written beside it and renamed when complete.
 
     Raises
     ------
     CampaignError
         If the folder holds something already.
-
-    Notes
-    -----
-    Source: docs/theory/simulate.md. Written in a folder beside it and renamed when complete.
     """
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise CampaignError(
@@ -86,26 +65,12 @@ def write_campaign(directory: Path, specification: CampaignSpecification, genera
 
 
 def _write_config(root: Path, campaign: DrawnCampaign) -> None:
-    specification, waveform, scene = (
-        campaign.specification,
-        campaign.specification.waveform,
-        campaign.specification.scene,
-    )
-    bounds = scene.bounds(specification.origin)
+    specification = campaign.specification
+    scene, bounds = specification.scene, specification.scene.bounds(specification.origin)
     document = {
         "campaign": specification.campaign,
-        "waveform": {
-            "kind": "ofdm",
-            "codes": "raw/codes.npy",
-            "carrier_hz": waveform.carrier_hz,
-            "carrier_is": waveform.carrier_is,
-            "subcarriers": waveform.subcarriers,
-            "subcarrier_spacing_hz": waveform.subcarrier_spacing_hz,
-            "symbol_s": waveform.symbol_s,
-            "cyclic_prefix_s": waveform.cyclic_prefix_s,
-            "sample_rate_hz": waveform.sample_rate_hz,
-            "prf_hz": waveform.prf_hz,
-        },
+        "waveform": {"kind": "ofdm", "codes": "raw/codes.npy"}
+        | {key: getattr(specification.waveform, key) for key in _WAVEFORM_KEYS},
         "nodes": {name: _node_section(node) for name, node in specification.nodes.items()},
         "scene": {
             "crs": scene.crs,
@@ -168,31 +133,22 @@ def _write_samples(
             recording.channels, time_s, adc, generator, framing=framing, first_frame=flight.first_frame
         )
         begun = np.array([recording_start_s(recording.channels["radar"]) + draw.tag_error_s[0]])
-        segments = [Segment(0, _utc(flight, begun)[0])]
+        captures: list[tuple[int, np.datetime64, int | None]] = [(0, _utc(flight, begun)[0], None)]
     else:
         kept = np.flatnonzero(draw.kept)
         tags = _utc(flight, time_s + draw.start_s + draw.tag_error_s)
         blocks = _captures(recording, adc, kept, generator)
-        segments = [
-            Segment(
-                order * waveform.capture_samples,
-                tags[pulse],
-                framing.counted(flight.first_frame + int(pulse)) if framing else None,
-            )
-            for order, pulse in enumerate(kept)
-        ]
-    described = (
-        {}
-        if framing is None
-        else {
-            "apertura:framing": asdict(framing)
-            | {"preamble": f"raw/{flight.name}/preamble.npy", "centre_hz": framing.centre_hz(waveform)}
-        }
-    )  # what a trigger must know
+        frames = [framing.counted(flight.first_frame + int(pulse)) if framing else None for pulse in kept]
+        starts = range(0, len(kept) * waveform.capture_samples, waveform.capture_samples)
+        captures = list(zip(starts, tags[kept], frames, strict=True))
+    described = {}
+    if framing:  # what a trigger must know
+        known = {"preamble": f"raw/{flight.name}/preamble.npy", "centre_hz": framing.centre_hz(waveform)}
+        described = {"apertura:framing": asdict(framing) | known}
     write_recording(
         stem,
         blocks,
-        segments,
+        captures,
         channels=list(recording.channels),
         sample_rate_hz=waveform.sample_rate_hz,
         frequency_hz=waveform.carrier_hz,

@@ -14,8 +14,8 @@ from pydantic.dataclasses import dataclass
 
 from apertura.errors import CampaignError
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, Adc
-from apertura.simulation.radar import Floats, TransmitWaveform
+from apertura.simulation.impairments import STRICT_KEYS, Adc, Floats
+from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate
 
@@ -38,9 +38,7 @@ class Framing:
     register_bits: int = Field(
         default=10, ge=2, le=20, description="length k of the shift register: 2^k - 1 chips of preamble"
     )
-    chip_samples: int = Field(
-        default=4, ge=1, description="samples per chip; the sampling rate over it must fit the band"
-    )
+    chip_samples: int = Field(default=4, ge=1, description="samples per chip; the rate of chips must fit the band")
     counter_bits: int = Field(default=16, ge=1, description="width of the frame counter; it wraps at 2^counter_bits")
     bit_chips: int = Field(default=15, ge=1, description="chips per payload bit, all of one sign: +1 for a one")
     guard_samples: int = Field(default=256, ge=0, description="silence before the prefix, longer than the longest echo")
@@ -73,17 +71,7 @@ class Framing:
         return float(waveform.baseband_hz[len(waveform.codes) // 2])
 
     def signal(self, waveform: TransmitWaveform, frame: int, time_s: Floats) -> NDArray[np.complex128]:
-        """Return the preamble and payload as sent, at baseband.
-
-        Parameters
-        ----------
-        waveform
-            Gives sampling rate, band centre and power.
-        frame
-            Number before it wraps.
-        time_s
-            (...,) float64, seconds after the start of the cyclic prefix (negative).
-        """
+        """Return preamble and payload of a frame at baseband, (...,) seconds after the cyclic prefix starts."""
         chips = np.concatenate([self.preamble(), self.payload(frame)])
         rate = waveform.sample_rate_hz
         # a millionth of a sample is rounding, not an earlier chip
@@ -126,14 +114,8 @@ def continuous_blocks(
         Of one node; their `start_s` matters at the first pulse only.
     time_s
         (pulse,) float64, times of the pulses.
-    adc
-        Converter; its full scale is set as for captures.
-    generator
-        Draws the noise.
-    framing
-        What goes before each symbol; None: nothing.
-    first_frame
-        Number of the first pulse.
+    framing, first_frame
+        What goes before each symbol, counted from where; None: nothing.
     block_samples
         How many samples of noise alone to make at a time.
 

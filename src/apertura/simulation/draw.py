@@ -10,9 +10,7 @@ import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
-from apertura.simulation.impairments import Blockage, Impairments, Localization, PhaseWalk, Timing, UniformPhase
-
-Floats = NDArray[np.float64]
+from apertura.simulation.impairments import Blockage, Floats, Impairments, Localization, PhaseWalk, Timing, UniformPhase
 
 
 @dataclass(frozen=True)
@@ -42,18 +40,7 @@ class ImpairmentDraw:
 def draw_impairments(
     impairments: Impairments, time_s: Floats, sample_rate_hz: float, generator: Generator
 ) -> ImpairmentDraw:
-    """Draw what is random about a node in one flight.
-
-    Parameters
-    ----------
-    impairments
-        The switches.
-    time_s
-        (pulse,) float64, times of the pulses.
-    sample_rate_hz
-        For trigger jitter.
-    generator
-        Advanced by the same amount whatever is switched on.
+    """Draw what is random about a node at (pulse,) times; the generator advances by as much whatever is on.
 
     Examples
     --------

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ from numpy.typing import NDArray
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import pulse_samples
+from apertura.simulation.impairments import Floats
 from apertura.simulation.observation import Observation
-from apertura.simulation.radar import Floats
 from apertura.simulation.recording import full_scale
 from apertura.simulation.scene import Origin, PointTarget, Target, scatterers
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
@@ -31,29 +30,10 @@ age(s)  ratio
 _POS_QUALITY = "   1  18   0.0050   0.0050   0.0100   0.0000   0.0000   0.0000   0.00  100.0"
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Where a capture begins.
-
-    Attributes
-    ----------
-    sample_start
-        Index into the samples of one channel.
-    time_utc
-        The node's own tag, datetime64[ns].
-    frame
-        Frame number read from the payload, if there is one.
-    """
-
-    sample_start: int
-    time_utc: np.datetime64
-    frame: int | None = None
-
-
 def write_recording(
     stem: Path,
     blocks: Iterable[NDArray[np.int16]],
-    segments: Sequence[Segment],
+    captures: Sequence[tuple[int, np.datetime64, int | None]],
     *,
     channels: Sequence[str],
     sample_rate_hz: float,
@@ -68,12 +48,10 @@ def write_recording(
         raw/<flight>/<node>; the file name is the node's name.
     blocks
         (sample, channel, 2) int16 counts of I and Q, in order; never held all at once.
-    segments
-        One per trigger.
-    channels
-        Names, in the order of the samples.
-    sample_rate_hz, frequency_hz
-        Nominal sampling rate, and the RF frequency at baseband zero.
+    captures
+        Of each trigger the first sample, the node's own UTC tag (datetime64[ns]) and the frame number sent, if any.
+    frequency_hz
+        RF frequency at baseband zero.
     extra
         More keys of the `apertura` namespace for the global object.
 
@@ -100,31 +78,28 @@ def write_recording(
         "apertura:node": stem.name,
         **extra,
     }
-    captures = [_capture(segment, frequency_hz) for segment in segments]
-    meta = {"global": header, "captures": captures, "annotations": []}
+    segments = [
+        {
+            "core:sample_start": start,
+            "core:frequency": frequency_hz,
+            "core:datetime": f"{np.datetime_as_string(time_utc, 'us')}Z",
+            **({} if frame is None else {"apertura:frame": frame}),
+        }
+        for start, time_utc, frame in captures
+    ]
+    meta = {"global": header, "captures": segments, "annotations": []}
     stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
 
 
-def _capture(segment: Segment, frequency_hz: float) -> dict[str, Any]:
-    capture: dict[str, Any] = {
-        "core:sample_start": segment.sample_start,
-        "core:frequency": frequency_hz,
-        "core:datetime": f"{np.datetime_as_string(segment.time_utc, 'us')}Z",
-    }
-    return capture if segment.frame is None else capture | {"apertura:frame": segment.frame}
-
-
 def write_csv_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, attitude_rad: Floats) -> None:
-    """Write a flight controller's log: UTC, latitude, longitude, ellipsoidal height, roll, pitch, yaw.
+    """Write a flight controller's log as .csv.
 
     Parameters
     ----------
-    path
-        The .csv to write.
     time_utc
         (epoch,) datetime64[ns], UTC.
     geodetic
-        (epoch, 3) float64: degrees, degrees, metres above the ellipsoid.
+        (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
     attitude_rad
         (epoch, 3) float64: roll, pitch, yaw (clockwise from north).
     """
@@ -138,18 +113,7 @@ def write_csv_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats
 
 
 def write_pos_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, *, system: str = "GPST") -> None:
-    """Write an RTKLIB solution in `system` GPST (18 s ahead of UTC since 2017) or UTC.
-
-    Parameters
-    ----------
-    path
-        The .pos to write.
-    time_utc
-        (epoch,) datetime64[ns], UTC.
-    geodetic
-        (epoch, 3) float64: degrees, degrees, metres above the ellipsoid.
-    system
-        Time system of the columns, named in the header.
+    """Write an RTKLIB solution, .pos, of the first columns of `write_csv_log`, in `system` GPST or UTC.
 
     Notes
     -----
@@ -168,16 +132,10 @@ def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict
     points = tuple(target for target in targets if isinstance(target, PointTarget))
     others = [repr(target) for target in targets if not isinstance(target, PointTarget)]
     placed = scatterers(origin, points, default_rng(0))
-    listed = [
-        {
-            "x": float(x),
-            "y": float(y),
-            "height_m": float(height),
-            "amplitude": float(abs(amplitude)),
-            "phase_rad": float(np.angle(amplitude)),
-        }
-        for (x, y, height), amplitude in zip(projected_from_ecef(crs, placed.position_m), placed.amplitude, strict=True)
-    ]
+    columns = np.column_stack(
+        [projected_from_ecef(crs, placed.position_m), np.abs(placed.amplitude), np.angle(placed.amplitude)]
+    )
+    listed = [dict(zip(("x", "y", "height_m", "amplitude", "phase_rad"), row, strict=True)) for row in columns.tolist()]
     return {"crs": crs, "targets": listed} | ({"extended": others} if others else {})
 
 
@@ -202,11 +160,8 @@ def flight_truth(
             "blocked": np.flatnonzero(draw.blocked).tolist(),
             "position_error_m": draw.position_error_m.tolist() if draw.position_error_m.any() else 0.0,
             "channels": {
-                channel_name: {
-                    "noise_variance": channel.noise_variance,
-                    "full_scale": full_scale(channel, node.impairments.adc),
-                }
-                for channel_name, channel in recording.channels.items()
+                own: {"noise_variance": one.noise_variance, "full_scale": full_scale(one, node.impairments.adc)}
+                for own, one in recording.channels.items()
             },
             "impairments": repr(node.impairments),
         }

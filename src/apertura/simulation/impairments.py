@@ -33,7 +33,7 @@ class Clock:
     )
 
     @classmethod
-    def of_ppm(cls, ppm: float, *, carrier_hz: float, sample_rate_hz: float, continuous_phase: bool = False) -> "Clock":
+    def of_ppm(cls, ppm: float, *, carrier_hz: float, sample_rate_hz: float) -> "Clock":
         """Return one clock that feeds both, fast by `ppm`.
 
         Examples
@@ -41,7 +41,7 @@ class Clock:
         >>> Clock.of_ppm(8, carrier_hz=1.25e9, sample_rate_hz=1e9)
         Clock(cfo_hz=10000.0, sfo_hz=8000.0, continuous_phase=False)
         """
-        return cls(ppm * carrier_hz / 1e6, ppm * sample_rate_hz / 1e6, continuous_phase)
+        return cls(ppm * carrier_hz / 1e6, ppm * sample_rate_hz / 1e6)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -162,9 +162,7 @@ class Impairments:
         default=None, description="carrier phase per pulse: uniform or walk; null: coherent"
     )
     timing: Timing = Field(default=Timing(), description="start of each capture")
-    missed_fraction: float = Field(
-        default=0.0, ge=0, lt=1, description="share of the pulses at which the trigger fails"
-    )
+    missed_fraction: float = Field(default=0.0, ge=0, lt=1, description="share of the pulses without trigger")
     time_tag: TimeTag = Field(default=TimeTag(), description="error of the UTC tags")
     radar_snr_db: float | None = Field(default=None, description="SNR of the radar channel, dB; null: no noise")
     sidelink_snr_db: float | None = Field(default=None, description="SNR of the sidelink, dB; null: no noise")

@@ -7,27 +7,25 @@ import numpy as np
 from numpy.random import Generator
 
 from apertura.simulation.draw import ImpairmentDraw, draw_impairments, independent_streams
-from apertura.simulation.impairments import AntennaPoint, Impairments, RadarPoint
-from apertura.simulation.radar import Floats, TransmitWaveform
+from apertura.simulation.impairments import AntennaPoint, Floats, Impairments, RadarPoint
+from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import Geometry, receive
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
 from apertura.simulation.synthesis import Channel
-from apertura.simulation.trajectory import body_turn, phase_centre, phase_centre_velocity
+from apertura.simulation.trajectory import body_turn, logged_velocity, phase_centre
+
+_Node = tuple[Impairments, ImpairmentDraw]
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A node's channels in one flight, and what the processor is not told.
+    """A node's channels in one flight, what was drawn of its impairments, and where the antennas truly were.
 
     Attributes
     ----------
     channels
         `radar` and, of a node without the transmitter's clock, `sidelink`: for `samples` or `transfer_functions`.
-    draw
-        What was drawn of the receiver's impairments.
-    truth
-        Where the antennas truly were.
     noise
         A generator per channel, for their noise; only where arrays were given.
     """
@@ -41,38 +39,26 @@ class Observation:
 def fly(
     campaign: DrawnCampaign, flight: SimulatedFlight, scatterers: Scatterers, generator: Generator
 ) -> dict[str, Observation]:
-    """Return what each node of a flight records.
-
-    Parameters
-    ----------
-    campaign, flight
-        Who flies what.
-    scatterers
-        What stands there, ECEF.
-    generator
-        Draws what is random about the nodes; each has its own stream.
-    """
+    """Return what each node of a flight records of scatterers in ECEF; what is random of each has its own stream."""
     nodes, time_s = campaign.specification.nodes, campaign.pulse_times(flight)
-    streams = dict(zip(flight.tracks, independent_streams(generator, len(flight.tracks)), strict=True))
-    draws = {
-        name: draw_impairments(
-            _possible(nodes[name].impairments, flight), time_s, campaign.waveform.sample_rate_hz, streams[name]
-        )
-        for name in flight.tracks
-    }
+    sender, draws = flight.transmitter, {}
+    for name, stream in zip(flight.tracks, independent_streams(generator, len(flight.tracks)), strict=True):
+        possible = _possible(nodes[name].impairments, flight)
+        draws[name] = draw_impairments(possible, time_s, campaign.waveform.sample_rate_hz, stream)
     observations = {}
     for name in flight.tracks:
-        geometry = _geometry(campaign, flight, name, draws)
+        own, transmitter = nodes[name].impairments, nodes[sender].impairments
+        geometry = _true(_logged(campaign, flight, name), (transmitter, draws[sender]), (own, draws[name]))
         geometry = replace(geometry, gain=_gain(campaign, flight, name, geometry, scatterers))
         channels = receive(
             campaign.waveform,
             scatterers,
             geometry,
-            impairments=nodes[name].impairments,
+            impairments=own,
             draw=draws[name],
-            transmitter=nodes[flight.transmitter].impairments,
+            transmitter=transmitter,
             path_offset_m=nodes[name].path_offset_m,
-            sidelink=name != flight.transmitter,
+            sidelink=name != sender,
         )
         observations[name] = Observation(channels, draws[name], geometry)
     return observations
@@ -85,18 +71,15 @@ def _possible(impairments: Impairments, flight: SimulatedFlight) -> Impairments:
     return replace(impairments, missed_fraction=0.0, clock=replace(impairments.clock, continuous_phase=False))
 
 
-def _geometry(
-    campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str, draws: Mapping[str, ImpairmentDraw]
-) -> Geometry:
+def _logged(campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str) -> Geometry:
     origin, nodes, time_s = campaign.specification.origin, campaign.specification.nodes, campaign.pulse_times(flight)
 
     def place(name: str, point: AntennaPoint) -> Floats:
         arm = nodes[name].lever_arms_m.get(point, (0.0, 0.0, 0.0))
-        logged = phase_centre(origin, campaign.trajectories[flight.name, name], time_s, arm)
-        return _true(logged, point, nodes[name].impairments, draws[name])
+        return phase_centre(origin, campaign.trajectories[flight.name, name], time_s, arm)
 
     def velocity(name: str) -> Floats:
-        return phase_centre_velocity(origin, campaign.trajectories[flight.name, name], time_s)
+        return logged_velocity(origin, campaign.trajectories[flight.name, name], time_s)
 
     sender = flight.transmitter
     return Geometry(
@@ -143,17 +126,10 @@ def observe(
     ----------
     waveform
         What is transmitted; its repetition frequency gives the times.
-    scatterers
-        The scene, in the frame of `logged`.
-    logged
-        Where the logs say the antennas are; localization errors move the true ones.
-    generator
-        Everything random.
-    receiver
-        What is wrong with the receiving node.
-    transmitter
-        What is wrong with the transmitting node (localization, ripple). None: transmitter and receiver are one
-        node, with one position error.
+    scatterers, logged
+        The scene, and where the logs say the antennas are, in one frame; localization errors move the true ones.
+    receiver, transmitter
+        What is wrong with each node. No transmitter: it is the receiver, with one position error.
     sidelink
         Whether the second channel is recorded.
 
@@ -172,25 +148,24 @@ def observe(
     sender, sender_draw = receiver, drawn
     if transmitter is not None:
         sender, sender_draw = transmitter, draw_impairments(transmitter, time_s, waveform.sample_rate_hz, streams[1])
-    truth = replace(
-        logged,
-        radar_tx=_true(logged.radar_tx, "radar_tx", sender, sender_draw),
-        radar_rx=_true(logged.radar_rx, "radar_rx", receiver, drawn),
-        sidelink_tx=_true(logged.sidelink_tx, "sidelink", sender, sender_draw),
-        sidelink_rx=_true(logged.sidelink_rx, "sidelink", receiver, drawn),
-    )
+    truth = _true(logged, (sender, sender_draw), (receiver, drawn))
     channels = receive(
-        waveform,
-        scatterers,
-        truth,
-        impairments=receiver,
-        draw=drawn,
-        transmitter=sender,
-        sidelink=sidelink,
+        waveform, scatterers, truth, impairments=receiver, draw=drawn, transmitter=sender, sidelink=sidelink
     )
     return Observation(channels, drawn, truth, {"radar": streams[2], "sidelink": streams[3]})
 
 
-def _true(logged_m: Floats, point: str, impairments: Impairments, draw: ImpairmentDraw) -> Floats:
-    wrong = impairments.localization
-    return logged_m - draw.position_error_m if wrong and point in wrong.points else logged_m
+def _true(logged: Geometry, sender: _Node, receiver: _Node) -> Geometry:
+    """Return where the antennas truly are: where the logs say, less the localization error of each node."""
+
+    def moved(logged_m: Floats, point: AntennaPoint, node: _Node) -> Floats:
+        wrong, error_m = node[0].localization, node[1].position_error_m
+        return logged_m - error_m if wrong and point in wrong.points else logged_m
+
+    return replace(
+        logged,
+        radar_tx=moved(logged.radar_tx, "radar_tx", sender),
+        radar_rx=moved(logged.radar_rx, "radar_rx", receiver),
+        sidelink_tx=moved(logged.sidelink_tx, "sidelink", sender),
+        sidelink_rx=moved(logged.sidelink_rx, "sidelink", receiver),
+    )

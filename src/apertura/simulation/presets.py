@@ -8,7 +8,7 @@ import numpy as np
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments, Leakage, TimeTag, Timing, UniformPhase
 from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.recording import Geometry
+from apertura.simulation.recording import Geometry, straight_pair
 from apertura.simulation.scene import Origin, PointTarget, Scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
@@ -42,12 +42,7 @@ def demo(*, pulses: int = 300) -> CampaignSpecification:
     """Return the campaign of `make demo`: two UAVs, one transmits, both receive, five targets on 12 m × 12 m.
 
     The secondary has its own clock: tags off by milliseconds, random phase and start of every capture. Both
-    miss some triggers, both digitise 14 bits with noise.
-
-    Parameters
-    ----------
-    pulses
-        Pulses at 20 Hz and 0.5 m/s; 300 fly 7.5 m and make about 14 MB.
+    miss some triggers, both digitise 14 bits with noise. Pulses are at 20 Hz and 0.5 m/s; 300 make about 14 MB.
     """
     tracks = {"uav1": _pass_by(-1.9, pulses), "uav2": _pass_by(2.8, pulses)}
     nodes = {"uav1": _PRIMARY, "uav2": _secondary(0.911, 0.402, tag_s=3.7e-3)}
@@ -68,10 +63,7 @@ def swarm(*, pulses: int = 240) -> CampaignSpecification:
 def continuous(*, pulses: int = 60) -> CampaignSpecification:
     """Return a flight whose recorders never stopped, to be triggered by the preamble before each symbol.
 
-    Parameters
-    ----------
-    pulses
-        Pulses at 1 kHz and 20 m/s; 60 make about 46 MB.
+    Pulses are at 1 kHz and 20 m/s; 60 make about 46 MB.
     """
     waveform = WaveformSpecification(200, 1.2e9, 250e3, 5e-6, 2e-6, 64e6, 1000.0)
     velocity = (20.0, 0.0, 0.0)
@@ -96,10 +88,7 @@ def continuous(*, pulses: int = 60) -> CampaignSpecification:
 def paper(*, pulses: int = 600) -> CampaignSpecification:
     """Return the paper's simulated scene as a campaign: 4096 subcarriers, 30 m of straight track at 10 m height.
 
-    Parameters
-    ----------
-    pulses
-        Over the 30 s of the flight. The paper has 3000; 600, every 5 cm, are still unambiguous and make 38 MB.
+    Of the paper's 3000 pulses in 30 s, 600, every 5 cm, are still unambiguous and make 38 MB.
     """
     waveform = replace(_PAPER_WAVEFORM, prf_hz=pulses / 30)
     track = Straight((-0.5 * (pulses - 1) / waveform.prf_hz, -15.0, 10.0), (1.0, 0.0, 0.0))
@@ -162,22 +151,11 @@ def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     return replace(_PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
 
 
-def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
+def paper_scene(*, pulses: int = 3000, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:
     """Return the paper's simulated scene as arrays: five targets, straight track at 10 m, antennas at one place.
 
-    Parameters
-    ----------
-    pulses
-        Along `length_m` of track; 3000 at 1 m/s and 100 Hz in the paper.
-    length_m
-        Aperture, centred on cross-range zero.
-    rx_ahead_m
-        The receiver flies this far ahead of the transmitter (4.7 m in the localization study).
-
-    Returns
-    -------
-    Scatterers, Geometry
-        In local Cartesian metres: cross-range (along track), ground range, up.
+    Both are in local Cartesian metres: cross-range (along the track, centred on zero), ground range, up. The receiver
+    flies `rx_ahead_m` ahead of the transmitter (4.7 m in the localization study).
 
     Notes
     -----
@@ -191,7 +169,4 @@ def paper_scene(*, pulses: int = 3000, length_m: float = 30.0, rx_ahead_m: float
     """
     cross_ground = np.array(_PAPER_TARGETS)
     scatterers = Scatterers(np.column_stack([cross_ground, np.zeros(5)]), np.ones(5, np.complex128))
-    along = np.linspace(-length_m / 2, length_m / 2, pulses)
-    sender = np.column_stack([along, np.zeros(pulses), np.full(pulses, 10.0)])
-    receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
-    return scatterers, Geometry(sender, receiver, sender, receiver)
+    return scatterers, straight_pair(np.linspace(-15.0, 15.0, pulses), 10.0, rx_ahead_m=rx_ahead_m)

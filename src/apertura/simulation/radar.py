@@ -8,9 +8,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.simulation.impairments import Floats
 from apertura.simulation.scene import Scatterers
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,8 @@ class TransmitWaveform:
         RF frequency of subcarrier n = 0, which is baseband zero.
     carrier_is
         n = 0…N−1 (`band_start`) or −N/2…N/2−1 (`band_centre`).
-    subcarrier_spacing_hz, symbol_s, cyclic_prefix_s, sample_rate_hz, prf_hz
-        Δf, T, T_cp, f_s and the pulse repetition frequency.
+    subcarrier_spacing_hz, symbol_s, cyclic_prefix_s, sample_rate_hz
+        Δf, T, T_cp and f_s.
 
     Examples
     --------
@@ -61,7 +60,7 @@ class TransmitWaveform:
 
     @property
     def duration_s(self) -> float:
-        """Prefix and symbol together."""
+        """T_cp + T."""
         return self.cyclic_prefix_s + self.symbol_s
 
     @property
@@ -103,16 +102,14 @@ def newman_codes(count: int) -> NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class Paths:
-    """Ways from the transmitter to one receiving channel.
+    """Ways from the transmitter to one receiving channel, each array (pulse, path).
 
     Attributes
     ----------
-    delay_s
-        (pulse, path) float64 at the pulse's start.
+    delay_s, delay_rate
+        float64, seconds at the pulse's start, and their growth in seconds per second; zero: stop and go.
     amplitude
-        (pulse, path) complex128.
-    delay_rate
-        (pulse, path) float64, seconds per second; zero: stop and go.
+        complex128.
     """
 
     delay_s: Floats
@@ -121,11 +118,8 @@ class Paths:
 
     def and_also(self, other: "Paths") -> "Paths":
         """Return both sets together."""
-        return Paths(
-            np.concatenate([self.delay_s, other.delay_s], axis=1),
-            np.concatenate([self.amplitude, other.amplitude], axis=1),
-            np.concatenate([self.delay_rate, other.delay_rate], axis=1),
-        )
+        both = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Paths(*(np.concatenate(pair, axis=1) for pair in both))
 
     def at(self, pulses: slice | NDArray[np.intp]) -> "Paths":
         """Return those of some pulses."""
@@ -146,9 +140,7 @@ def echo_paths(
     Parameters
     ----------
     tx_position_m, rx_position_m
-        (pulse, 3) float64, phase centres in the frame of the scatterers, metres.
-    scatterers
-        Points in the same Cartesian frame.
+        (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
     path_offset_m
         Electrical path of the receiving channel beyond geometry, metres.
     tx_velocity_m_s, rx_velocity_m_s
@@ -179,19 +171,14 @@ def direct_path(
     rx_position_m: Floats,
     *,
     path_offset_m: float = 0.0,
-    gain: complex = 1.0,
     relative_velocity_m_s: Floats | float = 0.0,
 ) -> Paths:
-    """Return the one path from antenna to antenna: delay (R + offset)/c, amplitude gain/R, level inside 1 m.
+    """Return the one path from antenna to antenna: delay (R + offset)/c, amplitude 1/R, level inside 1 m.
 
     Parameters
     ----------
-    tx_position_m, rx_position_m
-        (pulse, 3) float64, metres, one Cartesian frame.
-    path_offset_m
-        Electrical path of the receiving channel beyond geometry, metres.
-    gain
-        Amplitude at 1 m.
+    tx_position_m, rx_position_m, path_offset_m
+        As for `echo_paths`.
     relative_velocity_m_s
         (pulse, 3) float64, transmitter's less receiver's velocity.
 
@@ -202,7 +189,7 @@ def direct_path(
     """
     distance, rate = _range_and_rate(tx_position_m - rx_position_m, relative_velocity_m_s, np.zeros((1, 3)))
     delay = (distance + path_offset_m) / SPEED_OF_LIGHT_M_S
-    return Paths(delay, gain / np.maximum(distance, 1.0).astype(np.complex128), rate / SPEED_OF_LIGHT_M_S)
+    return Paths(delay, 1 / np.maximum(distance, 1.0).astype(np.complex128), rate / SPEED_OF_LIGHT_M_S)
 
 
 def _range_and_rate(antenna_m: Floats, velocity_m_s: Floats | float, points_m: Floats) -> tuple[Floats, Floats]:

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.draw import ImpairmentDraw
-from apertura.simulation.impairments import Adc, ChannelName, Impairments
-from apertura.simulation.radar import Floats, Paths, TransmitWaveform, direct_path, echo_paths
+from apertura.simulation.impairments import Adc, ChannelName, Floats, Impairments, Ripple
+from apertura.simulation.radar import Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum
 
@@ -22,10 +23,8 @@ class Geometry:
 
     Attributes
     ----------
-    radar_tx, radar_rx
-        (pulse, 3) float64, metres, Cartesian, in the frame of the scatterers.
-    sidelink_tx, sidelink_rx
-        (pulse, 3) float64, ends of the direct path.
+    radar_tx, radar_rx, sidelink_tx, sidelink_rx
+        (pulse, 3) float64, metres, Cartesian, in the frame of the scatterers; `sidelink`: ends of the direct path.
     tx_velocity, rx_velocity
         (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
     gain
@@ -41,6 +40,13 @@ class Geometry:
     gain: Floats | float = 1.0
 
 
+def straight_pair(along_m: Floats, height_m: float, *, rx_ahead_m: float = 0.0) -> Geometry:
+    """Return two nodes with their antennas at one place each, above the first axis at (pulse,) places along it."""
+    sender = np.column_stack([along_m, np.zeros(len(along_m)), np.full(len(along_m), height_m)])
+    receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
+    return Geometry(sender, receiver, sender, receiver)
+
+
 def receive(
     waveform: TransmitWaveform,
     scatterers: Scatterers,
@@ -48,36 +54,29 @@ def receive(
     *,
     impairments: Impairments,
     draw: ImpairmentDraw,
-    transmitter: Impairments | None = None,
-    path_offset_m: Mapping[ChannelName, float] | None = None,
+    transmitter: Impairments,
+    path_offset_m: Mapping[ChannelName, float] = MappingProxyType({}),
     sidelink: bool = True,
 ) -> dict[str, Channel]:
     """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.
 
     Parameters
     ----------
-    waveform
-        What is transmitted.
-    scatterers
-        The scene.
-    geometry
-        Where the antennas truly are.
-    impairments, draw
-        What is wrong with the receiving node, and what was drawn of it.
-    transmitter
-        Impairments of the transmitting node, for its ripple; the receiving node itself if None.
+    scatterers, geometry
+        The scene, and where the antennas truly are.
+    impairments, draw, transmitter
+        What is wrong with the receiving node, what was drawn of it, and what is wrong with the transmitting one.
     path_offset_m
         Electrical path beyond geometry per channel, metres; zero where missing.
     sidelink
         Whether the second channel is recorded.
     """
-    offset = dict(path_offset_m or {})
     velocity = (geometry.tx_velocity, geometry.rx_velocity) if impairments.doppler else (0.0, 0.0)
     echoes = echo_paths(
         geometry.radar_tx,
         geometry.radar_rx,
         scatterers,
-        path_offset_m=offset.get("radar", 0.0),
+        path_offset_m=path_offset_m.get("radar", 0.0),
         tx_velocity_m_s=velocity[0],
         rx_velocity_m_s=velocity[1],
     )
@@ -85,13 +84,11 @@ def receive(
     direct = direct_path(
         geometry.sidelink_tx,
         geometry.sidelink_rx,
-        path_offset_m=offset.get("sidelink", 0.0),
+        path_offset_m=path_offset_m.get("sidelink", 0.0),
         relative_velocity_m_s=np.subtract(*velocity),
     )
-    sent = (transmitter or impairments).transmit_ripple
-    transmitted = sent.response(waveform.frequency_hz) if sent else np.ones(len(waveform.codes), np.complex128)
     power = spectral_power(waveform, echoes)
-    leaked = _with_leakage(echoes, geometry, impairments, offset.get("radar", 0.0), power)
+    leaked = _with_leakage(echoes, geometry, impairments, path_offset_m.get("radar", 0.0), power)
     heard = {"radar": (leaked, power, impairments.radar_ripple, impairments.radar_snr_db)}
     if sidelink:
         power = spectral_power(waveform, direct)
@@ -101,7 +98,7 @@ def receive(
         name: Channel(
             waveform,
             paths,
-            transmitted * (ripple.response(waveform.frequency_hz) if ripple else 1.0),
+            _response(waveform, transmitter.transmit_ripple) * _response(waveform, ripple),
             draw.phase_rad,
             draw.start_s,
             cfo_hz=impairments.clock.cfo_hz,
@@ -112,13 +109,16 @@ def receive(
     }
 
 
-def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | None = None) -> float:
+def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
+    return ripple.response(waveform.frequency_hz) if ripple else np.ones(len(waveform.codes), np.complex128)
+
+
+def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
     """Return the mean of |Σ a·exp(-j2πfτ)|² over pulses and subcarriers."""
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
     parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
-    gain = 1.0 if response is None else response
     total = sum(
-        float((np.abs(path_spectrum(waveform, part.delay_s, part.amplitude) * gain) ** 2).sum()) for part in parts
+        float((np.abs(path_spectrum(waveform, part.delay_s, part.amplitude) * response) ** 2).sum()) for part in parts
     )
     return total / (len(paths.delay_s) * len(waveform.codes))
 
@@ -158,12 +158,8 @@ def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, o
 def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw) -> Paths:
     paths = direct
     for reflection in impairments.sidelink_multipath:
-        later = Paths(
-            direct.delay_s + reflection.excess_m / SPEED_OF_LIGHT_M_S,
-            direct.amplitude * reflection.amplitude,
-            direct.delay_rate,
-        )
-        paths = paths.and_also(later)
+        later_s = direct.delay_s + reflection.excess_m / SPEED_OF_LIGHT_M_S
+        paths = paths.and_also(Paths(later_s, direct.amplitude * reflection.amplitude, direct.delay_rate))
     shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
     gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * draw.blocked) / 20)
-    return Paths(paths.delay_s, paths.amplitude * gain[:, None], paths.delay_rate)
+    return replace(paths, amplitude=paths.amplitude * gain[:, None])

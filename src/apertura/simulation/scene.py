@@ -10,10 +10,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS
+from apertura.simulation.impairments import STRICT_KEYS, Floats
 
 Vector = tuple[float, float, float]
-Floats = NDArray[np.float64]
 
 _NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -128,9 +127,7 @@ class Clutter:
 
     bounds_m: tuple[float, float, float, float] = Field(description="east min, north min, east max, north max, m")
     reflectivity: float = Field(ge=0, description="mean power per square metre; 1: one unit point target per m²")
-    density_per_m2: float = Field(
-        default=10.0, gt=0, description="points per m²; several per resolution cell look like ground"
-    )
+    density_per_m2: float = Field(default=10.0, gt=0, description="points per m²; several per cell look like ground")
     up_m: float = Field(default=0.0, description="height above the origin, m")
     kind: Literal["clutter"] = Field(default="clutter", kw_only=True, repr=False)
 

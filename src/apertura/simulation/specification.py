@@ -16,8 +16,8 @@ from pydantic.fields import FieldInfo
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
-from apertura.simulation.radar import Floats, TransmitWaveform, newman_codes, qpsk_codes
+from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Floats, Impairments, RadarPoint
+from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
 from apertura.validation import read_yaml, validated
@@ -39,9 +39,7 @@ class WaveformSpecification:
     carrier_is: Literal["band_start", "band_centre"] = Field(
         default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
     )
-    code: Literal["qpsk", "newman"] = Field(
-        default="qpsk", description="code symbols: random QPSK, or Newman's flat symbol"
-    )
+    code: Literal["qpsk", "newman"] = Field(default="qpsk", description="random QPSK, or Newman's flat symbol")
 
     @model_validator(mode="after")
     def _dft_fits(self) -> Self:
@@ -215,17 +213,7 @@ def _plain(value: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class DrawnCampaign:
-    """A specification with its code symbols and trajectories drawn.
-
-    Attributes
-    ----------
-    specification
-        What it was drawn from.
-    waveform
-        What is transmitted.
-    trajectories
-        (flight, node) → how the node flies.
-    """
+    """A specification with its code symbols and trajectories, (flight, node) → how the node flies, drawn."""
 
     specification: CampaignSpecification
     waveform: TransmitWaveform

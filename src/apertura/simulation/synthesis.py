@@ -14,7 +14,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.simulation.radar import Floats, Paths, TransmitWaveform
+from apertura.simulation.impairments import Floats
+from apertura.simulation.radar import Paths, TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
@@ -28,10 +29,6 @@ class Channel:
 
     Attributes
     ----------
-    waveform
-        What is transmitted.
-    paths
-        (pulse, path) delays and amplitudes.
     response
         (subcarrier,) complex128, ripple of transmitter and receiver.
     phase_rad
@@ -76,18 +73,16 @@ def path_spectrum(waveform: TransmitWaveform, delay_s: Floats, amplitude: Comple
     return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
 
 
-def transfer_functions(
-    channel: Channel, generator: Generator | None, pulses: slice | NDArray[np.intp] = slice(None)
-) -> Complex:
+def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
     """Return (pulse, subcarrier) transfer functions as an ideal demodulator would measure them, without samples.
 
     Equal to the DFT of `samples` divided by the code while clocks run true, nothing moves within the pulse and
     all echoes stay inside the prefix; many times faster. Without generator, without noise.
     """
-    waveform, paths = channel.waveform, channel.paths.at(pulses)
-    early = paths.delay_s - channel.start_s[pulses, None]
+    waveform, paths = channel.waveform, channel.paths
+    early = paths.delay_s - channel.start_s[:, None]
     transfer = path_spectrum(waveform, early, paths.amplitude) * channel.response
-    transfer *= np.exp(1j * channel.phase_rad[pulses, None])
+    transfer *= np.exp(1j * channel.phase_rad[:, None])
     if generator is not None and channel.noise_variance:
         transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
     return np.asarray(transfer)
@@ -104,14 +99,10 @@ def samples(
 
     Parameters
     ----------
-    channel
-        What is received.
     generator
         Draws the noise, pulse after pulse; None: without noise.
-    pulses
-        Which captures.
-    count
-        Samples per capture; prefix and symbol if None.
+    pulses, count
+        Which captures, and samples of each; prefix and symbol if None.
 
     Notes
     -----

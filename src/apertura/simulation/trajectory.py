@@ -6,15 +6,12 @@ from typing import Annotated, Literal, Protocol, Self
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from apertura.geometry.geodesy import body_axes, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS
+from apertura.simulation.impairments import STRICT_KEYS, Floats
 from apertura.simulation.scene import Origin, Vector
-
-Floats = NDArray[np.float64]
 
 
 class Trajectory(Protocol):
@@ -62,12 +59,8 @@ class Wobble:
     """Smooth random motion about what was meant to be flown, as wind and a position controller leave it."""
 
     sigma_m: Vector = Field(default=(0.03, 0.05, 0.04), description="standard deviation east, north, up, m")
-    attitude_sigma_deg: Vector = Field(
-        default=(2.0, 2.0, 3.0), description="standard deviation of roll, pitch, yaw, degrees"
-    )
-    smoothing_s: float = Field(
-        default=1.0, gt=0, description="standard deviation of the Gaussian that smooths white noise, s"
-    )
+    attitude_sigma_deg: Vector = Field(default=(2.0, 2.0, 3.0), description="the same of roll, pitch, yaw, deg")
+    smoothing_s: float = Field(default=1.0, gt=0, description="standard deviation of the smoothing Gaussian, s")
 
     def around(self, path: Trajectory, duration_s: float, generator: Generator) -> Sampled:
         """Return `path` with the motion drawn, from 10 s before the first pulse to 10 s after `duration_s`.
@@ -190,12 +183,10 @@ def body_turn(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
     return np.asarray(ned_axes(origin.ecef(path.position(time_s))) @ body_axes(path.attitude(time_s)))
 
 
-def phase_centre_velocity(
-    origin: Origin, path: Trajectory, time_s: Floats, lever_arm_m: Vector = (0.0, 0.0, 0.0)
-) -> Floats:
-    """Return (time, 3) float64 ECEF velocity (m/s) of the same antenna."""
+def logged_velocity(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
+    """Return (time, 3) float64 ECEF velocity (m/s) of the logged point."""
     half_s = 1e-3
-    after, before = (phase_centre(origin, path, time_s + sign * half_s, lever_arm_m) for sign in (1, -1))
+    after, before = (phase_centre(origin, path, time_s + sign * half_s) for sign in (1, -1))
     return np.asarray((after - before) / (2 * half_s))
 
 
@@ -209,7 +200,7 @@ class GaussianBeam:
     beamwidth_deg: tuple[float, float] = Field(description="full width at half power in azimuth, elevation, degrees")
 
     def gain(self, turn: Floats, antenna_m: Floats, points_m: Floats) -> Floats:
-        """Return the field towards points, relative to boresight.
+        """Return the field (pulse, point) float64 towards points, relative to boresight.
 
         Parameters
         ----------
@@ -217,11 +208,6 @@ class GaussianBeam:
             (pulse, 3, 3) float64, forward-right-down of the body into the frame of the points.
         antenna_m, points_m
             (pulse, 3) and (point, 3) float64, metres, in that frame.
-
-        Returns
-        -------
-        ndarray
-            (pulse, point) float64.
 
         Notes
         -----

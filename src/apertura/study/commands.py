@@ -1,23 +1,29 @@
 """`apertura study …`: each job of the studies as one command; a file that exists is complete."""
 
-from collections.abc import Callable
+import pkgutil
+from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from apertura.study.paper.claims import Claim
+from apertura.errors import CampaignError
 
 app = typer.Typer(no_args_is_help=True, help="The paper's claims, and the stability of every correction.")
 
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
-PAPER_PARTS = (
-    "parameters", "resolution", "uav_resolution", "coherence", "loss_carrier_phase", "loss_timing", "loss_cfo",
-    "loss_sfo", "loss_localization", "corrected", "clock",
-)  # fmt: skip
-"""Files of rows that make up claims.csv, in its order; `loss_…` for each of `apertura.study.paper.losses.ERRORS`."""
+_LOSS = "losses:loss_claims"
+PAPER_PARTS = {
+    "parameters": "parameters:parameter_claims",
+    "resolution": "resolution:simulated_table",
+    "uav_resolution": "resolution:uav_table",
+    "coherence": "coherence:coherence_claims",
+    **{f"loss_{error}": _LOSS for error in ("carrier_phase", "timing", "cfo", "sfo", "localization")},
+    "corrected": "corrected:corrected_claims",
+    "clock": "corrected:clock_claims",
+}
+"""Files of rows that make up claims.csv, in its order → what computes them; `loss_…` gives its error as argument."""
 
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
 
@@ -27,24 +33,17 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     """Compute some rows of the claims table, parts/PART.csv."""
     from apertura.study.tables import write_table
 
+    _require("part", part, PAPER_PARTS)
     path = folder / "parts" / f"{part}.csv"
-    write_table(path, _claims(part)())
+    claims = pkgutil.resolve_name(f"apertura.study.paper.{PAPER_PARTS[part]}")
+    write_table(path, claims(part.removeprefix("loss_")) if PAPER_PARTS[part] == _LOSS else claims())
     typer.echo(path)
 
 
-def _claims(part: str) -> "Callable[[], list[Claim]]":
-    from apertura.study.paper import coherence, corrected, losses, parameters, resolution
-
-    if part.startswith("loss_"):
-        return lambda: losses.loss_claims(part.removeprefix("loss_"))
-    return {
-        "parameters": parameters.parameter_claims,
-        "resolution": resolution.simulated_table,
-        "uav_resolution": resolution.uav_table,
-        "coherence": coherence.coherence_claims,
-        "corrected": corrected.corrected_claims,
-        "clock": corrected.clock_claims,
-    }[part]
+def _require(kind: str, name: str, choices: Collection[str]) -> None:
+    if name not in choices:
+        expected = f"one of {', '.join(choices)}"
+        raise CampaignError(f"{kind} {name!r}", where="apertura study", expected=expected, remedy="Choose one of them.")
 
 
 @app.command()
@@ -61,8 +60,9 @@ def paper_claims(folder: Folder = PAPER) -> None:
 @app.command()
 def paper_figure(error: str, folder: Folder = PAPER) -> None:
     """Draw range-compressed data beside the image of one error, ERROR.png."""
-    from apertura.study.paper.figures import draw_error
+    from apertura.study.paper.figures import SHOWN, draw_error
 
+    _require("error", error, SHOWN)
     typer.echo(draw_error(error, folder / f"{error}.png"))
 
 
@@ -71,8 +71,11 @@ def stability_sweep(impairment: str, method: str, folder: Folder = STABILITY) ->
     """Sweep one impairment under one correction, parts/IMPAIRMENT.METHOD.csv."""
     from apertura.study.stability.outcomes import run_sweep
     from apertura.study.stability.summary import part_path
+    from apertura.study.stability.sweeps import CHOICES, SWEEPS
     from apertura.study.tables import write_table
 
+    _require("impairment", impairment, SWEEPS)
+    _require("method", method, CHOICES)
     path = part_path(folder, impairment, method)
     write_table(path, run_sweep(impairment, method))
     typer.echo(path)
@@ -83,7 +86,9 @@ def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
     """Put the corrections of one impairment together: IMPAIRMENT.csv and .png."""
     from apertura.study.stability.charts import draw_impairment
     from apertura.study.stability.summary import join_parts
+    from apertura.study.stability.sweeps import SWEEPS
 
+    _require("impairment", impairment, SWEEPS)
     outcomes = join_parts(folder, impairment)
     draw_impairment(impairment, outcomes, folder / f"{impairment}.png")
     typer.echo(folder / f"{impairment}.csv")

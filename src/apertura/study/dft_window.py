@@ -20,19 +20,11 @@ def window_samples(channel: Channel, generator: Generator | None) -> NDArray[np.
     """Return the (pulse, sample) complex128 samples of every capture that the DFT takes.
 
     Equal to `apertura.simulation.synthesis.samples` from the end of the prefix on, as long as every path has
-    arrived by then; twenty times faster, because no edge of any path has to be placed.
-
-    Parameters
-    ----------
-    channel
-        What is received.
-    generator
-        Draws the noise; None: without noise.
+    arrived by then; twenty times faster, because no edge of any path has to be placed. Without generator, no noise.
 
     Notes
     -----
-    Source: docs/theory/simulate.md, eqs. 3 and 4. Held against `samples` by
-    `test_the_window_of_many_pulses_is_that_of_the_simulated_captures`.
+    Source: docs/theory/simulate.md, eqs. 3 and 4.
     """
     waveform, rate = channel.waveform, sampling_rate(channel)
     index = waveform.prefix_samples + np.arange(waveform.dft_samples)

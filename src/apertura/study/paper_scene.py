@@ -26,31 +26,14 @@ RX_AHEAD_M = 4.7
 
 @dataclass(frozen=True)
 class PaperScene:
-    """What is transmitted, over which targets, from where.
+    """What is transmitted, over which targets, from where as the logs say.
 
-    Attributes
-    ----------
-    waveform
-        The paper's, with as many subcarriers over the same band as the question needs.
-    scatterers
-        Targets on the ground, in local Cartesian metres: along the track, across it, up.
-    geometry
-        Phase centres as the logs say.
+    In local Cartesian metres: along the track, across it, up.
     """
 
     waveform: TransmitWaveform
     scatterers: Scatterers
     geometry: Geometry
-
-    @property
-    def frequency_hz(self) -> NDArray[np.float64]:
-        """(subcarrier,) float64, RF."""
-        return self.waveform.frequency_hz
-
-    @property
-    def sidelink_m(self) -> NDArray[np.float64]:
-        """(pulse,) float64, length of the direct path as the logs say."""
-        return np.asarray(np.linalg.norm(self.geometry.sidelink_tx - self.geometry.sidelink_rx, axis=1))
 
 
 def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qpsk: bool = False) -> PaperScene:
@@ -75,14 +58,14 @@ def reduced_scene(*, pulses: int, subcarriers: int, rx_ahead_m: float = 0.0, qps
     Examples
     --------
     >>> scene = reduced_scene(pulses=300, subcarriers=128)
-    >>> float(scene.waveform.prf_hz), float(scene.frequency_hz[-1] - scene.frequency_hz[0])
-    (10.0, 406400000.0)
+    >>> float(scene.waveform.prf_hz), len(scene.waveform.codes) * scene.waveform.subcarrier_spacing_hz
+    (10.0, 409600000.0)
     """
     waveform = paper_waveform(prf_hz=pulses / LENGTH_M)
     every = len(waveform.codes) // subcarriers
     codes = qpsk_codes(subcarriers, np.random.default_rng(3)) if qpsk else newman_codes(subcarriers)
     waveform = replace(waveform, codes=codes, subcarrier_spacing_hz=every * waveform.subcarrier_spacing_hz)
-    return PaperScene(waveform, *paper_scene(pulses=pulses, length_m=LENGTH_M, rx_ahead_m=rx_ahead_m))
+    return PaperScene(waveform, *paper_scene(pulses=pulses, rx_ahead_m=rx_ahead_m))
 
 
 NO_IMPAIRMENTS = Impairments()
@@ -94,10 +77,6 @@ class Disturbance:
 
     Attributes
     ----------
-    receiver
-        Impairments of the receiving node.
-    transmitter
-        Of the transmitting node; None: one node does both.
     sampled
         Go through samples (clock errors, Doppler, the converter) instead of transfer functions.
     quantised
@@ -105,13 +84,12 @@ class Disturbance:
     """
 
     receiver: Impairments = NO_IMPAIRMENTS
-    transmitter: Impairments | None = None
+    transmitter: Impairments = NO_IMPAIRMENTS
     sampled: bool = False
     quantised: bool = False
 
 
 UNDISTURBED = Disturbance()
-UNDISTURBED_PAIR = Disturbance(transmitter=NO_IMPAIRMENTS)
 
 
 def receive_pair(
@@ -122,7 +100,7 @@ def receive_pair(
     Examples
     --------
     >>> scene = reduced_scene(pulses=4, subcarriers=128, rx_ahead_m=4.7)
-    >>> radar, sidelink, _ = receive_pair(scene, UNDISTURBED_PAIR, np.random.default_rng(0))
+    >>> radar, sidelink, _ = receive_pair(scene, UNDISTURBED, np.random.default_rng(0))
     >>> radar.shape, sidelink.shape
     ((4, 128), (4, 128))
     """

@@ -29,51 +29,38 @@ _REFINEMENTS = 4
 
 
 def phase_history(
-    scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None, window: str = "none"
+    scene: PaperScene,
+    transfer: Complexes,
+    *,
+    divided: bool = False,
+    pulses: NDArray[np.bool_] | None = None,
+    window: str = "none",
 ) -> PhaseHistory:
-    """Return transfer functions of total paths with the phase centres of the scene's logs.
+    """Return transfer functions of total paths tx → target → rx with the phase centres of the scene's logs.
 
     Parameters
     ----------
-    scene
-        Where the logs say the antennas are.
     transfer
-        (pulse, subcarrier) complex64 of the kept pulses, of the total path tx → target → rx.
+        (pulse, subcarrier) complex64 of the kept pulses.
+    divided
+        Whether the path of the sidelink, whose logged length is put back, was taken off that of the echoes.
     pulses
         (pulse,) bool, which of the scene's are kept; None: all.
     window
         Key of `apertura.echo.compression.WINDOWS`.
     """
     kept = slice(None) if pulses is None else pulses
-    frequency_hz, geometry = scene.frequency_hz, scene.geometry
+    frequency_hz, geometry = scene.waveform.frequency_hz, scene.geometry
+    if divided:
+        sidelink_m = np.linalg.norm(geometry.sidelink_tx - geometry.sidelink_rx, axis=1)[kept]
+        transfer = remove_path(transfer, frequency_hz, delay_s=-sidelink_m / SPEED_OF_LIGHT_M_S)
     weight = window_weights(window, len(frequency_hz))
     aperture = Aperture(geometry.radar_tx[kept], geometry.radar_rx[kept])
     return PhaseHistory(transfer, frequency_hz, weight, np.zeros(len(transfer)), aperture)
 
 
-def divided_history(scene: PaperScene, transfer: Complexes, *, pulses: NDArray[np.bool_] | None = None) -> PhaseHistory:
-    """Return what a sidelink correction left, brought back to total paths by the logged length of the sidelink.
-
-    Parameters
-    ----------
-    scene, transfer, pulses
-        As `phase_history`, but of the total path less that of the sidelink.
-    """
-    kept = slice(None) if pulses is None else pulses
-    delay_s = -scene.sidelink_m[kept] / SPEED_OF_LIGHT_M_S
-    return phase_history(scene, remove_path(transfer, scene.frequency_hz, delay_s=delay_s), pulses=pulses)
-
-
 def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:
-    """Return range tables that cover some metres around every target, for `numba.form`.
-
-    Parameters
-    ----------
-    history
-        From `phase_history` or `divided_history`.
-    targets_m
-        (target, 3) float64, in the frame of the phase centres.
-    """
+    """Return range tables that cover some metres around every target, (target, 3) float64, for `numba.form`."""
     path_m = history.aperture.path(targets_m)
     step_m, length = range_step(history.frequency_hz, oversampling=2.0)
     start_m = path_m.min(axis=1) - SWATH_MARGIN_M
@@ -102,10 +89,10 @@ def pixels_around(centre_m: Floats, along_m: Floats, across_m: Floats) -> Floats
     return np.asarray(centre_m + np.stack([along, across, np.zeros_like(along)], axis=-1))
 
 
-def random_pixels(generator: Generator, count: int = 256) -> Floats:
-    """Return (1, count, 3) float64 pixels between the five targets, uniformly distributed."""
-    along_m, across_m = generator.uniform(-6, 6, count), generator.uniform(5, 25, count)
-    return np.column_stack([along_m, across_m, np.zeros(count)])[None]
+def random_pixels(generator: Generator) -> Floats:
+    """Return (1, 256, 3) float64 pixels between the five targets, uniformly distributed."""
+    along_m, across_m = generator.uniform(-6, 6, 256), generator.uniform(5, 25, 256)
+    return np.column_stack([along_m, across_m, np.zeros(256)])[None]
 
 
 def mean_image(tables: numba.Tables, pixels_m: Floats) -> Complexes:
@@ -118,17 +105,8 @@ def find_peaks(
 ) -> tuple[Floats, Floats]:
     """Return positions (target, 3) and magnitudes (target,) of the maxima near each target.
 
-    The matched filter is evaluated on a coarse grid, then three times on a finer one about the best pixel: no
-    image is formed and nothing is interpolated between pixels.
-
-    Parameters
-    ----------
-    tables
-        From `range_tables`.
-    targets_m
-        (target, 3) float64, where to begin.
-    reach_m
-        How far along and across the track.
+    The matched filter is evaluated on a coarse grid, `reach_m` along and across the track, then three times on a
+    finer one about the best pixel: no image is formed and nothing is interpolated between pixels.
     """
     peaks = [_find_peak(tables, target, reach_m) for target in targets_m]
     return np.stack([position for position, _ in peaks]), np.array([level for _, level in peaks])
@@ -148,14 +126,8 @@ def _find_peak(tables: numba.Tables, target_m: Floats, reach_m: tuple[float, flo
 def half_power_widths(image: Callable[[Floats], Complexes], peak_m: Floats) -> tuple[float, float]:
     """Return the −3 dB widths across (ground range) and along the track (cross-range) through a peak, metres.
 
-    NaN where the main lobe is wider than 1 m (across) or 0.4 m (along) to either side.
-
-    Parameters
-    ----------
-    image
-        Values (y, x) complex64 at (y, x, 3) pixels.
-    peak_m
-        (3,) float64.
+    `image` gives the values (y, x) complex64 at (y, x, 3) pixels. NaN where the main lobe is wider than 1 m (across)
+    or 0.4 m (along) to either side.
     """
     centre, across_m, along_m = np.zeros(1), np.linspace(-1, 1, 401), np.linspace(-0.4, 0.4, 401)
     across = np.abs(image(pixels_around(peak_m, centre, across_m))).ravel() ** 2
@@ -175,9 +147,9 @@ def error_floor_db(values: Complexes, ideal: Complexes, peaks: Floats) -> float:
     Parameters
     ----------
     values, ideal
-        Complex64 of one shape: the image and the undisturbed one, at `random_pixels`.
+        Complex64 of one shape: the image and the undisturbed one.
     peaks
-        (target,) float64, magnitudes of the image's peaks.
+        (target,) float64, magnitudes.
     """
     gain = np.vdot(ideal, values) / np.vdot(ideal, ideal).real
     return float(amplitude_db(np.sqrt(np.mean(np.abs(values - gain * ideal) ** 2)) / peaks.mean()))

@@ -21,7 +21,7 @@ def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -
     Parameters
     ----------
     path
-        File to write; folders above it are made.
+        Folders above it are made.
     rows
         At least one dataclass instance or mapping, all with the columns of the first.
     digits
@@ -42,14 +42,7 @@ def _record(row: Any, digits: int | None) -> Mapping[str, object]:
 
 
 def read_table(path: Path, kind: type[Row]) -> list[Row]:
-    """Return the rows of a file of `write_table`.
-
-    Parameters
-    ----------
-    path
-        The file.
-    kind
-        Dataclass of its rows, with fields of str, int and float.
+    """Return the rows of a file of `write_table`, each a dataclass `kind` with fields of str, int and float.
 
     Examples
     --------

@@ -103,19 +103,7 @@ draw(); table();
 
 
 def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, accuracy_db: float) -> None:
-    """Write the chart of points, fastest first, as one HTML file.
-
-    Parameters
-    ----------
-    points
-        Fields of `apertura.study.chart.pareto.Point`.
-    path
-        HTML to write.
-    title
-        Of the page.
-    accuracy_db
-        What the campaign asks for.
-    """
+    """Write the chart of points, fastest first, each the fields of `apertura.study.chart.pareto.Point`, as HTML."""
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
     page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}")
     write_text(path, page.replace("@ENGINES@", json.dumps(list(ENGINES))).replace("@POINTS@", data))

@@ -1,17 +1,15 @@
 """The points of the speed-accuracy chart, a setting each: the Pareto front among them, as CSV and as PNG."""
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from apertura.atomic import replacement
 from apertura.focus.engines import ENGINES
-from apertura.study.stability.charts import save
+from apertura.study.png import save_png
 
 _COLOURS = ("#0072b2", "#e69f00", "#000000", "#cc79a7", "#56b4e9", "#009e73")
 _MARKERS = "osD^vP"
@@ -42,52 +40,15 @@ def with_front(points: Sequence[Point]) -> list[Point]:
     return marked
 
 
-def write_points(points: Sequence[Point], path: Path) -> None:
-    """Write the points as CSV, one line each."""
-    with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.DictWriter(stream, [field.name for field in fields(Point)], lineterminator="\n")
-        table.writeheader()
-        for point in points:
-            row = asdict(point)
-            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-
-
 def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
-    """Draw error against seconds.
-
-    Parameters
-    ----------
-    points
-        Fastest first.
-    path
-        PNG to write.
-    title
-        Of the chart.
-    accuracy_db
-        What the campaign asks for.
-    """
+    """Draw error against seconds of points, fastest first, and the accuracy that the campaign asks for, as PNG."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
     for engine, colour, marker in zip(ENGINES, cycle(_COLOURS), cycle(_MARKERS), strict=False):
         some = [point for point in points if point.engine == engine and not point.planned]
-        axes.plot(
-            [point.seconds for point in some],
-            [point.error_db for point in some],
-            linestyle="none",
-            color=colour,
-            marker=marker,
-            alpha=0.6,
-            label=engine,
-        )
+        axes.plot(*_places(some), linestyle="none", color=colour, marker=marker, alpha=0.6, label=engine)
     front = [point for point in points if point.on_front]
-    axes.plot(
-        [point.seconds for point in front],
-        [point.error_db for point in front],
-        color="0.4",
-        drawstyle="steps-post",
-        zorder=0,
-        label="Pareto front",
-    )
+    axes.plot(*_places(front), color="0.4", drawstyle="steps-post", zorder=0, label="Pareto front")
     for point in points:
         if point.planned:
             thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
@@ -100,4 +61,8 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)
     axes.legend(fontsize=9)
-    save(figure, path)
+    save_png(figure, path)
+
+
+def _places(points: Sequence[Point]) -> tuple[list[float], list[float]]:
+    return [point.seconds for point in points], [point.error_db for point in points]

@@ -23,7 +23,8 @@ from apertura.planning.search import Search
 from apertura.quality.measures import numerical_error
 from apertura.store import open_stage
 from apertura.study.chart.interactive import write_page
-from apertura.study.chart.pareto import Point, draw_points, with_front, write_points
+from apertura.study.chart.pareto import Point, draw_points, with_front
+from apertura.study.tables import write_table
 
 FOLDER = Path("results/study")
 PULSES, SIDE_PX, PIXELS = 1024, 256, 200
@@ -41,20 +42,16 @@ class Part:
 
     Attributes
     ----------
-    history, profiles
-        Of the block.
+    history, profiles, beams
+        Of the block; None where the antennas have no beams.
     pixels
         (y, x, 3) float64, the window.
     picked
         (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known.
     exact
         (pixel,) complex128.
-    total_pixels
-        Of the whole image.
     reference_seconds
         What the exact values took.
-    beams
-        Of the antennas over the block, where they have any.
     """
 
     history: PhaseHistory
@@ -73,7 +70,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     Parameters
     ----------
     campaign, flight, pair
-        Whose echo and profile stages are used; they must be finished.
+        Whose finished echo and profile stages are used.
     seconds
         When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
 
@@ -105,20 +102,14 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
-    paths[0].parent.mkdir(parents=True, exist_ok=True)
-    write_points(points, paths[0])
+    write_table(paths[0], points, digits=6)
     draw_points(points, paths[1], title=title, accuracy_db=processing.accuracy_db)
     write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.accuracy_db)
     return paths
 
 
 def _part(
-    history: PhaseHistory,
-    profiles: Profiles,
-    scene: OpenScene,
-    *,
-    total_pixels: int,
-    beams: Beams | None,
+    history: PhaseHistory, profiles: Profiles, scene: OpenScene, *, total_pixels: int, beams: Beams | None
 ) -> Part:
     window = []
     for size in scene.grid.shape:
@@ -162,7 +153,6 @@ def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: flo
 
 def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     engine = load_engine(setting.engine)
-    presum = 1 if plan is None or plan.presum is None else plan.presum.factor
 
     def prepare() -> Any:
         if engine.READS == "phase_history":
@@ -174,41 +164,28 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
     form_s, image = _least(lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3)
     values = image[part.picked[:, 0], part.picked[:, 1]]
-    taken = tables_s + form_s * part.total_pixels / pixels[..., 0].size
-    error_db = numerical_error(values.astype(np.complex64), part.exact).rms_db
-    predicted_db = setting.error_db if plan is None else plan.predicted_error_db
-    return _point(part, setting, presum, taken, error_db, predicted_db, planned=plan is not None)
+    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, values, plan)
 
 
 def _reference_point(part: Part, plan: Plan) -> Point:
     setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
     taken = part.reference_seconds * part.total_pixels / PIXELS
-    values = part.exact.astype(np.complex64)
-    error_db = numerical_error(values, part.exact).rms_db
-    return _point(part, setting, 1, taken, error_db, setting.error_db, planned=_is_reference(plan.setting))
+    return replace(_point(part, setting, taken, part.exact, None), planned=_is_reference(plan.setting))
 
 
-def _point(
-    part: Part,
-    setting: Setting,
-    presum: int,
-    taken: float,
-    error_db: float,
-    predicted_db: float,
-    *,
-    planned: bool,
-) -> Point:
+def _point(part: Part, setting: Setting, taken: float, values: NDArray[np.complexfloating], plan: Plan | None) -> Point:
+    """Return what a setting took and errs on the picked pixels; `plan` where it is the planner's choice."""
     return Point(
         engine=setting.engine,
         setting=setting.line,
-        presum=presum,
+        presum=1 if plan is None or plan.presum is None else plan.presum.factor,
         seconds=taken,
         pixel_pulses_per_s=part.total_pixels * len(part.profiles) / taken,
-        error_db=error_db,
+        error_db=numerical_error(values.astype(np.complex64), part.exact).rms_db,
         predicted_seconds=setting.seconds,
-        predicted_error_db=predicted_db,
+        predicted_error_db=setting.error_db if plan is None else plan.predicted_error_db,
         on_front=False,
-        planned=planned,
+        planned=plan is not None,
     )
 
 

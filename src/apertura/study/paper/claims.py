@@ -9,17 +9,11 @@ class Claim:
 
     Attributes
     ----------
-    claim
-        What is claimed, in words.
     paper
         Value that the source paper prints; empty where it prints none.
     independent_model
         Value of a model that shares no code with this project, or of a closed form; empty where the paper's stands.
         Both are empty for requirements that this project sets itself.
-    computed
-        Value of this project.
-    unit
-        Of all three.
     verdict
         How `computed` compares with what is given, and a note where the paper contradicts itself. It begins with
         "consistency check" where something was fitted to the expected value, so that agreeing proves little.
@@ -51,15 +45,13 @@ def compare(
     Parameters
     ----------
     claim, computed, unit, paper, independent_model
-        As in `Claim`; one of the last two.
+        Columns of `Claim`; one of the last two.
     within
         Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`.
     style
         Format of `computed`.
-    agreement
-        Verdict where the difference is small enough.
-    note
-        Appended to the verdict.
+    agreement, note
+        Verdict where the difference is small enough, and what is appended to any.
 
     Raises
     ------
@@ -93,12 +85,10 @@ def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, st
 
     Parameters
     ----------
-    claim, computed, unit
-        As in `Claim`.
+    claim, computed, unit, style, note
+        As for `compare`.
     limit, met
         What the project requires, in words, and whether `computed` meets it.
-    style, note
-        As in `compare`.
 
     Examples
     --------

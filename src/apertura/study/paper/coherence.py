@@ -6,12 +6,12 @@ import numpy as np
 
 from apertura.echo.sidelink import divide
 from apertura.simulation.impairments import Impairments, Timing, UniformPhase
-from apertura.simulation.recording import Geometry
+from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare
 from apertura.study.paper.formulas import snr_of_coherence_factor
 from apertura.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
-from apertura.study.point_response import coherence_factors, divided_history, phase_history
+from apertura.study.point_response import coherence_factors, phase_history
 
 PULSES = 200
 CORRECTED = (0.986, 0.9999, 0.9995)
@@ -23,13 +23,6 @@ def coherence_claims(*, draws: int = DRAWS, seed: int = 1) -> list[Claim]:
 
     The SNR of the corrected ones is the closed form of the paper's value, so they check only that the simulator, the
     division and the closed form are consistent.
-
-    Parameters
-    ----------
-    draws
-        Over which the factors are averaged.
-    seed
-        Of everything random.
     """
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9))
     uncorrected = [_factors(clocks, np.random.default_rng([seed, draw]))[0] for draw in range(draws)]
@@ -70,16 +63,14 @@ def coherence_claims(*, draws: int = DRAWS, seed: int = 1) -> list[Claim]:
 def _static() -> PaperScene:
     """Return a recording that does not move: one reflector 15 m away, receiver 4.7 m beside the transmitter."""
     scene = reduced_scene(pulses=PULSES, subcarriers=128)
-    sender = np.tile([0.0, 0.0, 4.8], (PULSES, 1))
-    receiver = sender + [RX_AHEAD_M, 0.0, 0.0]
     target = Scatterers(np.array([[2.35, 14.0, 0.0]]), np.ones(1, np.complex128))
-    return replace(scene, scatterers=target, geometry=Geometry(sender, receiver, sender, receiver))
+    return replace(scene, scatterers=target, geometry=straight_pair(np.zeros(PULSES), 4.8, rx_ahead_m=RX_AHEAD_M))
 
 
 def _factors(impairments: Impairments, generator: np.random.Generator) -> tuple[float, float]:
     """Return the coherence factor at the reflector without and with division by the sidelink."""
     scene = _static()
-    radar, sidelink, _ = receive_pair(scene, Disturbance(impairments, Impairments()), generator)
-    histories = phase_history(scene, radar), divided_history(scene, divide(radar, sidelink))
+    radar, sidelink, _ = receive_pair(scene, Disturbance(impairments), generator)
+    histories = phase_history(scene, radar), phase_history(scene, divide(radar, sidelink), divided=True)
     before, after = (float(coherence_factors(one, scene.scatterers.position_m)[0]) for one in histories)
     return before, after

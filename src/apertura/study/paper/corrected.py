@@ -12,7 +12,7 @@ from apertura.study.dft_window import demodulated
 from apertura.study.paper.claims import Claim, require
 from apertura.study.paper_scene import (
     RX_AHEAD_M,
-    UNDISTURBED_PAIR,
+    UNDISTURBED,
     Complexes,
     Disturbance,
     PaperScene,
@@ -22,10 +22,10 @@ from apertura.study.paper_scene import (
 from apertura.study.point_response import (
     Floats,
     amplitude_db,
-    divided_history,
     error_floor_db,
     find_peaks,
     mean_image,
+    phase_history,
     random_pixels,
     range_tables,
 )
@@ -39,8 +39,8 @@ def corrected_claims(*, seed: int = 1) -> list[Claim]:
     """Return what carrier phase and timing cost after each sidelink correction, as large as the prefix allows."""
     scene = reduced_scene(pulses=150, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=2e-6))
-    disturbed = Disturbance(clocks, Impairments(), sampled=True)
-    clean, direct, _ = receive_pair(scene, UNDISTURBED_PAIR, np.random.default_rng(seed))
+    disturbed = Disturbance(clocks, sampled=True)
+    clean, direct, _ = receive_pair(scene, UNDISTURBED, np.random.default_rng(seed))
     radar, sidelink, _ = receive_pair(scene, disturbed, np.random.default_rng(seed))
     ideal = _peaks(scene, divide(clean, direct))
     rows = []
@@ -55,24 +55,14 @@ def corrected_claims(*, seed: int = 1) -> list[Claim]:
 
 def _peaks(scene: PaperScene, corrected: Complexes) -> Floats:
     targets = scene.scatterers.position_m
-    return find_peaks(range_tables(divided_history(scene, corrected), targets), targets)[1]
+    return find_peaks(range_tables(phase_history(scene, corrected, divided=True), targets), targets)[1]
 
 
-def clock_claims(*, pulses: int = 150, ppm: float = CLOCK_PPM, seed: int = 1) -> list[Claim]:
-    """Return the floor that one clock leaves in the divided image, without and with correction in the samples.
-
-    Parameters
-    ----------
-    pulses
-        Over the aperture.
-    ppm
-        By which the receiver's clock is fast.
-    seed
-        Of the random pixels.
-    """
+def clock_claims(*, pulses: int = 150) -> list[Claim]:
+    """Return the floor that a fast clock leaves in the divided image, without and with correction in the samples."""
     scene = reduced_scene(pulses=pulses, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     wave = scene.waveform
-    clock = Clock.of_ppm(ppm, carrier_hz=wave.carrier_hz, sample_rate_hz=wave.sample_rate_hz)
+    clock = Clock.of_ppm(CLOCK_PPM, carrier_hz=wave.carrier_hz, sample_rate_hz=wave.sample_rate_hz)
     captures = _captures(scene, Impairments(clock=clock))
     symbol = Numerology(
         wave.carrier_hz,
@@ -84,27 +74,30 @@ def clock_claims(*, pulses: int = 150, ppm: float = CLOCK_PPM, seed: int = 1) ->
     offset = estimate_clock(captures[1], symbol)
     cfo_hz = offset.cfo_of_pulses_hz(pulses)
     corrected = [correct_clock(capture, symbol, cfo_hz=cfo_hz, sfo_ppm=offset.sfo_ppm) for capture in captures]
-    ideal, _ = _image(scene, _captures(scene, Impairments()), seed)
-    images = (_image(scene, pair, seed) for pair in (captures, corrected))
+    ideal, _ = _image(scene, _captures(scene, Impairments()))
+    images = (_image(scene, pair) for pair in (captures, corrected))
     before_db, after_db = (error_floor_db(values, ideal, peaks) for values, peaks in images)
     gain_db = before_db - after_db
     note = (
         f"consistency check: noise-free samples, corrected by the model that made them; floor {before_db:.1f} dB "
         f"without, {after_db:.1f} dB with, measured as {offset.sfo_ppm:.3f} ppm"
     )
-    title, limit = f"{ppm:g} ppm clock: floor lower by correction in the samples", f"at least {LEAST_GAIN_DB:g} dB"
+    title, limit = (
+        f"{CLOCK_PPM:g} ppm clock: floor lower by correction in the samples",
+        f"at least {LEAST_GAIN_DB:g} dB",
+    )
     return [require(title, gain_db, "dB", limit=limit, met=gain_db >= LEAST_GAIN_DB, style=".1f", note=note)]
 
 
 def _captures(scene: PaperScene, receiver: Impairments) -> list[Complexes]:
-    _, _, observation = receive_pair(scene, Disturbance(receiver, Impairments()), np.random.default_rng(0))
+    _, _, observation = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
     return [samples(observation.channels[name], None).astype(np.complex64) for name in ("radar", "sidelink")]
 
 
-def _image(scene: PaperScene, captures: list[Complexes], seed: int) -> tuple[Complexes, Floats]:
+def _image(scene: PaperScene, captures: list[Complexes]) -> tuple[Complexes, Floats]:
     """Return the divided image at random pixels, and the peaks of the targets."""
     window = slice(scene.waveform.prefix_samples, scene.waveform.prefix_samples + scene.waveform.dft_samples)
     radar, sidelink = (demodulated(capture[:, window], scene.waveform) for capture in captures)
     targets = scene.scatterers.position_m
-    tables = range_tables(divided_history(scene, divide(radar, sidelink)), targets)
-    return mean_image(tables, random_pixels(np.random.default_rng(seed))), find_peaks(tables, targets)[1]
+    tables = range_tables(phase_history(scene, divide(radar, sidelink), divided=True), targets)
+    return mean_image(tables, random_pixels(np.random.default_rng(1))), find_peaks(tables, targets)[1]

@@ -9,9 +9,9 @@ from matplotlib.image import AxesImage
 
 from apertura.focus.engines import numba
 from apertura.study.paper.losses import ERRORS, history_of
-from apertura.study.paper_scene import Complexes, Disturbance, PaperScene, receive_pair
+from apertura.study.paper_scene import UNDISTURBED, Complexes, PaperScene, receive_pair
+from apertura.study.png import save_png
 from apertura.study.point_response import Floats, amplitude_db, mean_image, pixels_around, range_tables
-from apertura.study.stability.charts import save
 
 SHOWN = {"carrier_phase": 1.0, "timing": 0.5, "cfo": 50.0, "sfo": 400.0, "localization": 3.0}
 """Size of each error that is drawn, in its unit."""
@@ -25,25 +25,14 @@ _GROUND_M = np.linspace(2, 28, 261)
 
 
 def draw_error(name: str, path: Path, *, seed: int = 1) -> Path:
-    """Draw what one error does to data and image.
-
-    Parameters
-    ----------
-    name
-        A key of `apertura.study.paper.losses.ERRORS`.
-    path
-        PNG to write.
-    seed
-        Of what is random.
-    """
+    """Draw what one error, a key of `SHOWN`, does to data and image, as PNG; return its path."""
     error = ERRORS[name]
     scene = error.scene(max(error.pulses, PULSES))
     figure = Figure(figsize=(12, 9), layout="constrained")
     axes = figure.subplots(2, 2)
-    undisturbed = Disturbance(transmitter=error.disturbance(0.0).transmitter)
-    label = f"{error.title} {SHOWN[name]:g} {error.unit}"
+    label = f"{error.sweep.title} {SHOWN[name]:g} {error.sweep.unit}"
     peaks: tuple[float, float] | None = None
-    cases = ((undisturbed, "no error"), (error.disturbance(SHOWN[name]), label))
+    cases = ((UNDISTURBED, "no error"), (error.disturbance(SHOWN[name]), label))
     for row, (disturbance, words) in zip(axes, cases, strict=True):
         radar, sidelink, _ = receive_pair(scene, disturbance, np.random.default_rng(seed))
         corners = pixels_around(np.zeros(3), _CROSS_M[[0, -1]], _GROUND_M[[0, -1]]).reshape(-1, 3)
@@ -53,7 +42,7 @@ def draw_error(name: str, path: Path, *, seed: int = 1) -> Path:
         _draw_data(row[0], scene, tables, peaks[0], words)
         picture = _draw_image(row[1], image, peaks[1], words)
     figure.colorbar(picture, ax=axes, label="dB against the peak without error", extend="min", fraction=0.03)
-    save(figure, path)
+    save_png(figure, path)
     return path
 
 

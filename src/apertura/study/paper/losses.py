@@ -1,19 +1,28 @@
 """The table of uncorrected losses: what each error costs the peaks of the five targets, beside an independent model."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from apertura.echo.sidelink import divide
 from apertura.focus.inputs import PhaseHistory
-from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
+from apertura.simulation.impairments import Clock, Timing
 from apertura.simulation.presets import paper_waveform
 from apertura.study import point_response
 from apertura.study.paper.claims import Claim, compare
-from apertura.study.paper_scene import RX_AHEAD_M, Complexes, Disturbance, PaperScene, receive_pair, reduced_scene
+from apertura.study.paper_scene import (
+    NO_IMPAIRMENTS,
+    RX_AHEAD_M,
+    Complexes,
+    Disturbance,
+    PaperScene,
+    receive_pair,
+    reduced_scene,
+)
 from apertura.study.point_response import REACH_M, Floats, find_peaks, range_tables, undisturbed_tables
+from apertura.study.stability.sweeps import SWEEPS, Sweep
 
 DESTROYED_DB = -12.0
 """Beyond it there is no peak to measure: the largest speckle near the target is reported."""
@@ -25,36 +34,25 @@ class UncorrectedError:
 
     Attributes
     ----------
-    title, unit
-        For rows and figures.
+    sweep
+        The impairment; here it comes alone.
     independent_model_db
-        Size, in `unit` → mean peak loss of an independent model, dB.
-    disturbance
-        Size → what goes wrong.
+        Size → mean peak loss of an independent model, dB; `within_db` of it agrees.
     pulses
         That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
-    subcarriers, rx_ahead_m, qpsk
-        As in `reduced_scene`.
     draws
         Over which the loss is averaged; 1 where nothing is random.
-    within_db
-        Largest difference that agrees.
     divided
         Whether the sidelink is divided out (and its length is as wrong as the positions).
     reach_m
         How far peaks are looked for.
-    note
-        Appended to each verdict.
     """
 
-    title: str
-    unit: str
+    sweep: Sweep
     independent_model_db: Mapping[float, float]
-    disturbance: Callable[[float], Disturbance]
     pulses: int
     subcarriers: int = 128
     rx_ahead_m: float = 0.0
-    qpsk: bool = False
     draws: int = 1
     within_db: float = 0.5
     divided: bool = False
@@ -63,60 +61,47 @@ class UncorrectedError:
 
     def scene(self, pulses: int) -> PaperScene:
         """Return the scene with so many pulses."""
-        return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=self.qpsk)
+        qpsk = self.sweep.sampled
+        return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=qpsk)
+
+    def disturbance(self, size: float) -> Disturbance:
+        """Return what goes wrong at one size."""
+        return self.sweep.disturbance(size, besides=NO_IMPAIRMENTS)
 
 
-def _sfo(khz: float) -> Disturbance:
+def _sfo(khz: float) -> dict[str, object]:
     """Return a sampling rate off by so much, the time error counted from the start of the DFT window."""
     wave, off_hz = paper_waveform(), 1e3 * khz
     start_s = wave.cyclic_prefix_s * off_hz / (wave.sample_rate_hz + off_hz)
-    return Disturbance(Impairments(clock=Clock(sfo_hz=off_hz), timing=Timing(offset_s=start_s)), sampled=True)
-
-
-def _localization(centimetres: float) -> Disturbance:
-    wrong = Impairments(localization=Localization(centimetres / 100))
-    return Disturbance(wrong, wrong)
+    return {"clock": Clock(sfo_hz=off_hz), "timing": Timing(offset_s=start_s)}
 
 
 ERRORS: Mapping[str, UncorrectedError] = {
     "carrier_phase": UncorrectedError(
-        "Carrier phase per pulse, uniform ±", "π rad", {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0},
-        lambda size: Disturbance(Impairments(carrier_phase=UniformPhase(size * np.pi))), pulses=3000, draws=4,
+        SWEEPS["carrier_phase"], {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0}, pulses=3000, draws=4
     ),
     "timing": UncorrectedError(
-        "Timing offset per pulse, uniform ±", "ns", {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0},
-        lambda size: Disturbance(Impairments(timing=Timing(half_width_s=1e-9 * size))), pulses=3000, draws=4,
+        SWEEPS["timing"], {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0}, pulses=3000, draws=4
     ),
     "cfo": UncorrectedError(
-        "Carrier frequency offset", "kHz", {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5},
-        lambda size: Disturbance(Impairments(clock=Clock(cfo_hz=1e3 * size)), sampled=True),
-        pulses=150, subcarriers=4096, qpsk=True,
+        SWEEPS["cfo"], {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5}, pulses=150, subcarriers=4096,
         note="random QPSK code; a quadratic-phase code loses half as much, in dB, and shifts the targets",
     ),
     "sfo": UncorrectedError(
-        "Sampling frequency offset", "kHz", {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
-        _sfo, pulses=150, subcarriers=4096, qpsk=True, reach_m=(0.16, 1.5),
+        replace(SWEEPS["sfo"], receiver=_sfo), {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
+        pulses=150, subcarriers=4096, reach_m=(0.16, 1.5),
         note="time error counted from the DFT window; counted from the prefix a third more is lost, by defocusing",
     ),
     "localization": UncorrectedError(
-        "Localization error, σ per axis after 1 s, bistatic", "cm", {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
-        _localization, pulses=600, rx_ahead_m=RX_AHEAD_M, draws=40, within_db=1.0, divided=True,
+        replace(SWEEPS["localization"], title=SWEEPS["localization"].title + ", bistatic"),
+        {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
+        pulses=600, rx_ahead_m=RX_AHEAD_M, draws=40, within_db=1.0, divided=True,
     ),
 }  # fmt: skip
 
 
 def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[Claim]:
-    """Return a row for each size of one error: mean peak loss over five targets and all draws.
-
-    Parameters
-    ----------
-    name
-        A key of `ERRORS`.
-    draws
-        Instead of the error's own.
-    seed
-        Of everything random.
-    """
+    """Return a row for each size of a key of `ERRORS`: mean peak loss over five targets and all draws."""
     error = ERRORS[name]
     count = draws or error.draws
     rows = []
@@ -138,9 +123,7 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
 
 def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
     """Return what is focused: the radar alone, or divided by the sidelink."""
-    if divided:
-        return point_response.divided_history(scene, divide(radar, sidelink))
-    return point_response.phase_history(scene, radar)
+    return point_response.phase_history(scene, divide(radar, sidelink) if divided else radar, divided=divided)
 
 
 @lru_cache(maxsize=2)
@@ -158,7 +141,7 @@ def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Fl
     destroyed = expected_db < DESTROYED_DB and mean_db < DESTROYED_DB
     over = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "nothing random"
     return compare(
-        f"uncorrected loss: {error.title} {size:g} {error.unit}",
+        f"uncorrected loss: {error.sweep.title} {size:g} {error.sweep.unit}",
         mean_db,
         "dB",
         independent_model=expected_db,

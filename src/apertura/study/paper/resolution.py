@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from apertura.simulation.recording import Geometry
+from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare
 from apertura.study.paper.formulas import HALF_POWER_OF_HANN, cross_range_resolution_m, ground_range_resolution_m
@@ -33,17 +33,14 @@ SEPARATION_M = 4.7
 def simulated_table(*, pulses: int = 600) -> list[Claim]:
     """Return ground-range and cross-range widths of the five targets beside an independent model and closed forms.
 
-    Parameters
-    ----------
-    pulses
-        Of the 3000; widths do not change from 150 on.
+    Of the paper's 3000 pulses as few as 150 do not change the widths.
     """
     scene = reduced_scene(pulses=pulses, subcarriers=256)
     targets = scene.scatterers.position_m
     tables = undisturbed_tables(scene)
     peaks, _ = find_peaks(tables, targets)
     height_m, aperture_m = scene.geometry.radar_tx[0, 2], float(np.ptp(scene.geometry.radar_tx[:, 0]))
-    middle_hz = float(scene.frequency_hz.mean())
+    middle_hz = float(scene.waveform.frequency_hz.mean())
     rows = []
     for peak, ground_cm, cross_cm in zip(peaks, GROUND_CM, CROSS_CM, strict=True):
         ground, cross = (100 * width for width in half_power_widths(lambda at: mean_image(tables, at), peak))
@@ -60,19 +57,13 @@ def simulated_table(*, pulses: int = 600) -> list[Claim]:
 
 
 def uav_table(*, pulses: int = 200) -> list[Claim]:
-    """Return the widths of the UAV flight with a Hann window, mono and fused.
-
-    Parameters
-    ----------
-    pulses
-        Per segment.
-    """
+    """Return the widths of the UAV flight with a Hann window, mono and fused, from `pulses` per segment."""
     scene = reduced_scene(pulses=pulses, subcarriers=512)
     ground_m, slant_m = UAV_TARGET_M[0, 1], float(np.hypot(UAV_TARGET_M[0, 1], UAV_HEIGHT_M))
     closed_m = ground_range_resolution_m(_bandwidth_hz(scene), ground_m, UAV_HEIGHT_M, half_power=HALF_POWER_OF_HANN)
     closed = f"closed form {100 * closed_m:.1f} cm"
     short_m, long_m = (
-        cross_range_resolution_m(float(scene.frequency_hz.mean()), slant_m, length_m)
+        cross_range_resolution_m(float(scene.waveform.frequency_hz.mean()), slant_m, length_m)
         for length_m in (UAV_APERTURE_M, SEGMENT_LENGTH_M)
     )
     contradiction = (
@@ -99,15 +90,13 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
 
 
 def _bandwidth_hz(scene: PaperScene) -> float:
-    return len(scene.frequency_hz) * scene.waveform.subcarrier_spacing_hz
+    return len(scene.waveform.frequency_hz) * scene.waveform.subcarrier_spacing_hz
 
 
 def _segment(scene: PaperScene, middle_m: float, length_m: float, *, rx_ahead_m: float = 0.0) -> PaperScene:
     along = middle_m + np.linspace(-length_m / 2, length_m / 2, len(scene.geometry.radar_tx))
-    sender = np.column_stack([along, np.zeros_like(along), np.full_like(along, UAV_HEIGHT_M)])
-    receiver = sender + [rx_ahead_m, 0.0, 0.0]
     target = Scatterers(UAV_TARGET_M, np.ones(1, np.complex128))
-    return replace(scene, scatterers=target, geometry=Geometry(sender, receiver, sender, receiver))
+    return replace(scene, scatterers=target, geometry=straight_pair(along, UAV_HEIGHT_M, rx_ahead_m=rx_ahead_m))
 
 
 def _uav_widths_cm(segments: list[PaperScene]) -> tuple[float, float]:

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from apertura.atomic import replacement
+from apertura.study.png import save_png
 from apertura.study.stability.outcomes import Outcome
 from apertura.study.stability.summary import LEVELS_DB, Tolerance
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
@@ -52,7 +51,7 @@ def draw_impairment(impairment: str, outcomes: Sequence[Outcome], path: Path) ->
         axis.set_xlabel(f"{sweep.title}, {sweep.unit}" if sweep.unit != "1" else sweep.title)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(CHOICES))
     figure.suptitle(sweep.title)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _draw_line(axis: Axes, method: str, sizes: list[float], values: list[float]) -> None:
@@ -96,7 +95,7 @@ def draw_summary(tolerances: Sequence[Tolerance], path: Path) -> None:
     axes.tick_params(labeltop=True, labelbottom=False, length=0)
     axes.set_title("Size at which the peaks are wrong by 1 dB | 3 dB (> or <: not within the sweep)", pad=24)
     figure.colorbar(picture, ax=axes, label="Share of the sweep below 1 dB", pad=0.01, fraction=0.03)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _share(tolerance: Tolerance) -> float:
@@ -116,10 +115,3 @@ def _words(tolerance: Tolerance) -> str:
         for size in (tolerance.size_at_1_db, tolerance.size_at_3_db)
     ]
     return sizes[0] if sizes[0] == sizes[1] and np.isnan(tolerance.size_at_1_db) else " | ".join(sizes)
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG that is the same for the same figure."""
-    FigureCanvasAgg(figure)
-    with replacement(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

@@ -28,8 +28,6 @@ class Outcome:
 
     Attributes
     ----------
-    impairment, unit, size, method
-        What was tried.
     loss_db, loss_spread_db
         Loss of the five peaks against the undisturbed scene, and its standard deviation over the draws.
     coherence_factor
@@ -42,8 +40,6 @@ class Outcome:
         Mean share of the pulses that were imaged.
     chosen
         Method that was applied in most draws; `refused` where none locks.
-    draws, seed
-        How often, from which seed.
     """
 
     impairment: str
@@ -63,16 +59,9 @@ class Outcome:
 
 
 def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcome]:
-    """Yield the outcome at each size of one impairment under one correction.
+    """Yield the outcome at each size of one impairment of `SWEEPS` under one correction of `CHOICES`.
 
-    Parameters
-    ----------
-    impairment
-        A key of `SWEEPS`.
-    method
-        One of `CHOICES`.
-    seed
-        Draws depend on it and on their number alone: every method and size meets the same random numbers.
+    Draws depend on the seed and on their number alone: every method and size meets the same random numbers.
     """
     sweep = SWEEPS[impairment]
     for size in sweep.sizes:
@@ -87,13 +76,8 @@ def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcom
             unit=sweep.unit,
             size=float(size),
             method=method,
-            loss_db=mean.loss_db,
             loss_spread_db=spread.loss_db,
-            coherence_factor=mean.coherence_factor,
-            ground_width_m=width.ground_width_m,
-            cross_width_m=width.cross_width_m,
-            floor_db=mean.floor_db,
-            pulses_used=mean.pulses_used,
+            **mean._replace(ground_width_m=width.ground_width_m, cross_width_m=width.cross_width_m)._asdict(),
             chosen=max(sorted(set(chosen)), key=chosen.count),
             draws=sweep.draws,
             seed=seed,
@@ -138,8 +122,7 @@ def _draw(
     kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
     if not kept.any():
         return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
-    history_of = point_response.phase_history if chosen == "none" else point_response.divided_history
-    history = history_of(logged, transfer, pulses=kept)
+    history = point_response.phase_history(logged, transfer, divided=chosen != "none", pulses=kept)
     return _measured(history, ideal, float(kept.mean()), flown.scatterers.position_m), chosen
 
 
@@ -157,7 +140,7 @@ def correct(
     radar, sidelink
         (pulse, subcarrier) complex64.
     recorded
-        (pulse,) bool, which pulses the receiver recorded.
+        (pulse,) bool.
     """
     if method == "none":
         return recorded, radar[recorded], "none"

@@ -29,14 +29,10 @@ class Tolerance:
 
     Attributes
     ----------
-    impairment, unit, method
-        What was tried.
     size_at_1_db, size_at_3_db
         Interpolated; NaN where the peaks never get that wrong, too low or too high.
     first_size, last_size
         Between which sizes it was tried.
-    draws, seed
-        As `Outcome`.
     """
 
     impairment: str
@@ -90,10 +86,7 @@ def _of_method(outcomes: Sequence[Outcome], method: str) -> list[Outcome]:
 def write_sidelink_tables(folder: Path) -> Path:
     """Write sidelink.csv: each method at each SNR of the sidelink, the best, and how far `auto` is from it.
 
-    Returns
-    -------
-    Path
-        Of the table; beside it sidelink_methods.csv says at which SNR each method fails.
+    Beside it sidelink_methods.csv says at which SNR each method fails.
     """
     outcomes = read_table(folder / "sidelink_noise.csv", Outcome)
     methods = [method for method in CHOICES if method not in ("none", "auto")]
@@ -133,10 +126,8 @@ def crossing(sizes: Floats, losses_db: Floats, level_db: float, *, logarithmic: 
 
     Parameters
     ----------
-    sizes
-        (size,) float64 from negligible to destructive, rising or falling.
-    losses_db
-        (size,) float64.
+    sizes, losses_db
+        (size,) float64, from negligible to destructive; sizes rise or fall.
     level_db
         What is passed.
     logarithmic

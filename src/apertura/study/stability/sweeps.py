@@ -35,22 +35,14 @@ _CELL_M = SPEED_OF_LIGHT_M_S / 409.6e6
 
 @dataclass(frozen=True)
 class Sweep:
-    """One impairment and the sizes at which it is tried.
+    """One impairment and the sizes at which it is tried, from negligible to destructive.
 
     Attributes
     ----------
-    title, unit
-        For charts.
-    sizes
-        From negligible to destructive.
-    receiver
-        Size → what replaces fields of `ORDINARY` in the receiving node.
-    transmitter
-        Size → what is wrong with the transmitting node.
+    receiver, transmitter
+        Size → the fields of `Impairments` that it sets in the receiving node, and all of the transmitting one's.
     subcarriers
         1024 where the band matters, 4096 where the SNR or the spacing of the subcarriers does.
-    sampled, quantised
-        As in `Disturbance`.
     logarithmic
         Whether sizes are drawn and interpolated on a logarithmic axis.
     draws
@@ -72,9 +64,9 @@ class Sweep:
     moving: bool = False
     tagged: bool = False
 
-    def disturbance(self, size: float) -> Disturbance:
-        """Return what goes wrong at one size."""
-        receiver = replace(ORDINARY, **self.receiver(size))  # type: ignore[arg-type]
+    def disturbance(self, size: float, *, besides: Impairments = ORDINARY) -> Disturbance:
+        """Return what goes wrong at one size, and `besides` in the receiving node."""
+        receiver = replace(besides, **self.receiver(size))  # type: ignore[arg-type]
         return Disturbance(receiver, self.transmitter(size), self.sampled, self.quantised)
 
     def flown(self, size: float) -> PaperScene:
@@ -94,10 +86,6 @@ class Sweep:
         geometry = flown.geometry
         wrong = replace(geometry, radar_rx=geometry.radar_rx + along, sidelink_rx=geometry.sidelink_rx + along)
         return replace(flown, geometry=wrong)
-
-
-def _localization(size: float) -> dict[str, object]:
-    return {"localization": Localization(size / 100)}
 
 
 def _one_clock(size: float) -> dict[str, object]:
@@ -191,7 +179,8 @@ SWEEPS: Mapping[str, Sweep] = {
     ),
     "localization": Sweep(
         "Localization error, σ per axis after 1 s", "cm", (0.1, 0.3, 0.5, 1, 1.5, 2, 3, 5),
-        _localization, lambda size: Impairments(localization=Localization(size / 100)), draws=6,
+        lambda size: {"localization": Localization(size / 100)},
+        lambda size: Impairments(localization=Localization(size / 100)), draws=6,
     ),
     "time_tag": Sweep(
         "Error of the receiver's time tags at 1 m/s, σ", "ms", (1, 3, 10, 20, 30, 50, 100), lambda _: {}, draws=4,

@@ -1,0 +1,77 @@
+"""What a person may ask of an image, from Python or in section `processing` of a campaign."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from apertura.focus.engines import ENGINES, load_engine
+
+PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
+"""Choices that are the planner's where they are 'auto'."""
+
+
+def _options_of_each_engine(schema: dict[str, Any]) -> None:
+    engines = {name: load_engine(name).Options.model_json_schema() for name in ENGINES}
+    schema.update(additionalProperties=False, properties=engines)
+
+
+class ImagingChoices(BaseModel):
+    """How to form an image; every choice has a default.
+
+    Examples
+    --------
+    >>> ImagingChoices(accuracy_db=-40).planned["presum"]
+    'auto'
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
+    accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
+    engine: str = Field(
+        "auto",
+        description=f"backprojection engine: auto, {', '.join(ENGINES)}",
+        json_schema_extra={"enum": ["auto", *ENGINES]},
+    )
+    engine_options: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="options of engines that the planner shall not choose: engine → option → value",
+        examples=[{}],
+        json_schema_extra=_options_of_each_engine,
+    )
+    tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
+    presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
+        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
+    )
+    pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
+        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
+    )
+    terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
+        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
+    )
+
+    @property
+    def planned(self) -> dict[str, Any]:
+        """What the planner is asked."""
+        return {name: getattr(self, name) for name in PLANNED}
+
+    @field_validator("engine")
+    @classmethod
+    def _engine_is_known(cls, name: str) -> str:
+        if name not in {"auto", *ENGINES}:
+            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
+        return name
+
+    @model_validator(mode="after")
+    def _options_are_those_of_engines(self) -> Self:
+        for name, options in self.engine_options.items():
+            if name not in ENGINES:
+                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
+            try:
+                load_engine(name).Options.model_validate(options)
+            except ValidationError as error:
+                first = error.errors()[0]
+                known = ", ".join(load_engine(name).Options.model_fields) or "none"
+                option = ".".join(map(str, first["loc"]))
+                raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
+        return self
