@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,10 +19,11 @@ from apertura.export import exports_in
 from apertura.export.cog import READ, write_power, write_slc
 from apertura.export.db import write_db
 from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
-from apertura.export.map_layout import DPI, LEFT, TOP
+from apertura.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.export.quicklook import below_peak, shrink, write_quicklook
 from apertura.geometry.geodesy import local_crs
 
+ROOT = Path(__file__).parents[1]
 UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
 TAGS = {
     "APERTURA_RUNSPEC": '{"processing":{"window":"hann"}}',
@@ -336,3 +338,41 @@ def test_the_quicklook_carries_its_origin_in_the_file(tmp_path):
     )
     with rasterio.open(tmp_path / "q.png") as png:
         assert TAGS.items() <= png.tags().items()
+
+
+def written_on(layout: MapLayout) -> list[str]:
+    """Return the words on a layout; every one must lie inside the figure and on no other."""
+    layout.figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in layout.figure.texts]
+    assert all(box.x0 >= 0 and box.x1 <= layout.figure.bbox.x1 for box in boxes)
+    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+    return [text.get_text() for text in layout.figure.texts]
+
+
+@pytest.mark.parametrize("size_m", [(40, 400), (400, 40)])
+@pytest.mark.parametrize("count", [0, 1, 4, 9, 29])
+def test_flags_are_counted_and_named_as_far_as_there_is_room(size_m, count):
+    flags = re.findall("`([a-z_]+)`(?=[^|]*\\| [a-z])", (ROOT / "docs" / "flags.md").read_text(encoding="utf-8"))[
+        :count
+    ]
+    assert len(flags) == count
+    layout = MapLayout.for_bounds((0, 0, *size_m))
+    layout.draw_frame("WGS 84 / UTM zone 32N")
+    layout.draw_scale_and_north()
+    layout.write_words("f01", "uav1-uav2", "apertura 0.1.0 · numerical error −61.2 dB · code aaaaaaaaaaaa")
+    layout.write_flags(flags)
+    words = " ".join(written_on(layout)).replace("and ", "")
+    assert ("no flags" if not count else f"{count} flag") in words
+    left = int(re.search(r"(\d+) more in image\.json", words)[1]) if "more in" in words else 0
+    assert sum(f"{flag}," in f"{words}," for flag in flags) == count - left
+    assert left == 0 or count > 4
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_the_quicklook_names_the_flags_of_its_image(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(MapLayout, "write_flags", lambda _, flags: written.append(flags))
+    for flags in ("{}", '{"sidelink_noisy":"SNR 3 dB","beam_misses":"12 %"}'):
+        write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS | {"APERTURA_FLAGS": flags})
+    write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS)  # not an image of a campaign
+    assert written == [[], ["sidelink_noisy", "beam_misses"]]

@@ -78,9 +78,9 @@ def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
     names = "expected one of raw, track, echo, profile, terrain, image, cube."
     assert names in complaint(lambda: opened.stage("ecko", *PAIR))
     assert "no flight 'f02'; expected one of f01." in complaint(lambda: opened.stage("echo", "f02", "uav1-uav2"))
-    pairs = "no pair 'uav2-uav1'; expected one of uav1-uav1, uav1-uav2."
-    assert pairs in complaint(lambda: opened.image("f01", "uav2-uav1"))
-    assert pairs in complaint(lambda: opened.flags("f01", "uav2-uav1"))
+    pairs = "no pair 'uav2-uav1'; expected one of uav1-uav1, uav1-uav2"
+    assert f"{pairs}." in complaint(lambda: opened.image("f01", "uav2-uav1"))
+    assert f"{pairs}, fused." in complaint(lambda: opened.flags("f01", "uav2-uav1"))
     assert "no flight 'f02'" in complaint(lambda: opened.report("f02", "fused"))
     assert "no node 'uav3'; expected one of uav1, uav2." in complaint(lambda: opened.stage("raw", "f01", "uav3"))
 

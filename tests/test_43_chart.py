@@ -7,15 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import toy_engine
 import yaml
 from folders import copy_writable
+from scenes import TARGET_GRID, plan, point_history
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.focus.engines import reference
+from apertura.focus.engines.engine import Setting
+from apertura.focus.inputs import PhaseHistory
+from apertura.imaging.range_profiles import range_compress
+from apertura.scene.terrain import FlatGround
 from apertura.steps import image
 from apertura.steps.plan import expected_plan
 from apertura.study.chart.pareto import Point, with_front
-from apertura.study.chart.speed_accuracy import speed_accuracy
+from apertura.study.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
 from apertura.study.tables import write_table
 
 
@@ -91,3 +98,41 @@ def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tin
     config.write_text(yaml.safe_dump(document))
     with pytest.raises(CampaignError, match=r"engine_options\.toy\.refined: .*its options: refine"):
         Campaign.load(root)
+
+
+@pytest.fixture
+def part():
+    """All of a small image, which some pulses see."""
+    history, pixels = point_history(24), TARGET_GRID.positions(0.0)
+    picked = np.random.default_rng(1).integers(0, (LEAST_ROWS, 160), (50, 2))
+    exact = reference.form(history, pixels[tuple(picked.T)])
+    profiles = range_compress(history, TARGET_GRID, FlatGround(0.0))
+    return Part(history, profiles, pixels, picked, exact, 160 * 160, 0.1)
+
+
+def measured_by_toy(part, seconds):
+    asked = plan(overrides={"engine": "numba", "presum": 1})
+    points = measure(part, asked, [Setting("toy", {"refine": 4}, {}, -38.0, seconds)], seconds=60.0)
+    return next(point for point in points if point.engine == "toy")
+
+
+@pytest.mark.parametrize(("seconds", "rows"), [(1e-6, 160), (0.6, 80), (1e6, LEAST_ROWS)])
+def test_whatever_engine_is_predicted_to_be_slow_is_timed_on_fewer_rows(part, toy, monkeypatch, seconds, rows):
+    shapes, form = set(), toy_engine.form
+
+    def recorded(prepared, pixels, *, beams=None):
+        shapes.add(pixels.shape)
+        return form(prepared, pixels)
+
+    monkeypatch.setattr(toy_engine, "form", recorded)
+    assert measured_by_toy(part, seconds).error_db < -10  # where there is next to nothing but sidelobes
+    assert shapes == {(rows, 160, 3)}
+
+
+def test_an_engine_that_reads_the_phase_history_is_charted_on_it(part, toy, monkeypatch):
+    given = []
+    monkeypatch.setattr(toy_engine, "READS", "phase_history")
+    monkeypatch.setattr(toy_engine, "prepare", lambda history, **_: given.append(history) or history)
+    monkeypatch.setattr(toy_engine, "form", reference.form)
+    assert measured_by_toy(part, 1e6).error_db < -130
+    assert {type(history) for history in given} == {PhaseHistory}

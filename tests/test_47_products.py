@@ -69,6 +69,7 @@ def test_a_raster_says_how_exact_it_is(finished_tiny, name):
     assert -160 < float(tags["APERTURA_ERROR_DB"]) < -60
     assert -160 < float(tags["APERTURA_PEAK_ERROR_DB"]) < -50
     assert json.loads(tags["APERTURA_MODELS"]) == report["models"]
+    assert json.loads(tags["APERTURA_FLAGS"]) == report["flags"]
     assert "APERTURA_REDONE" not in tags
 
 

@@ -162,8 +162,16 @@ class Campaign:
         return chosen.get(stage, {})
 
     def flight(self, name: str) -> Flight:
-        """Return the flight called `name`."""
-        return next(flight for flight in self.flights if flight.name == name)
+        """Return the flight called `name`; raise CampaignError with the names there are if it is none of them."""
+        flights = {flight.name: flight for flight in self.flights}
+        if name not in flights:
+            raise CampaignError(
+                f"no flight {name!r}",
+                where=self.root / FLIGHTS,
+                expected=f"one of {', '.join(flights)}",
+                remedy="Correct the flight's name, or add its line.",
+            )
+        return flights[name]
 
     def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
         """Return raw/<flight>/<node><suffix>, which must exist."""

@@ -1,9 +1,10 @@
 """The layout of a quicklook: metric axes, scale bar, north arrow, colour bar and words around a picture."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import ceil, floor, log10
+from textwrap import wrap
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -19,6 +20,7 @@ LONGER_SIDE = 6.4  # of the picture, inch
 PICTURE_DOTS = floor(LONGER_SIDE * DPI)
 LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the picture, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # room kept for words and colour bar beside a narrow or flat picture, inch
+LONGEST_FLAG = 24  # letters with the comma: so many the first of two lines may leave empty
 
 Marker = tuple[float, float, str]
 
@@ -118,10 +120,39 @@ class MapLayout:
         room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
         self._write(LEFT, height - 0.65, subtitle, size=9)
-        self._write(LEFT, 0.2, footer, size=7, color="0.3")
+        self._write(LEFT, 0.16, footer, size=7, color="0.3")
+
+    def write_flags(self, flags: Sequence[str]) -> None:
+        """Write the number and the names of an image's flags above the footer, on two lines where one is too short."""
+        most = int((self.figure.get_size_inches()[0] - LEFT - 0.1) * 72 / (0.64 * 7))  # letters of a line
+        lines = wrap(flag_words(flags, 2 * most - LONGEST_FLAG), most, max_lines=2)
+        style = {"size": 7, "color": "firebrick" if flags else "0.3"}
+        for line, height in zip(lines, (0.42, 0.3) if len(lines) > 1 else (0.3,), strict=True):
+            self._write(LEFT, height, line, **style)
 
     def _write(self, x: float, y: float, words: str, **style: Any) -> None:
         self.figure.text(x, y, words, transform=self.figure.dpi_scale_trans, parse_math=False, **style)
+
+
+def flag_words(flags: Sequence[str], most: int) -> str:
+    """Return the number of flags and as many of their names as `most` letters hold, and how many are left out.
+
+    Examples
+    --------
+    >>> flag_words([], 40), flag_words(["beam_misses"], 40)
+    ('no flags', '1 flag: beam_misses')
+    >>> flag_words(["sidelink_noisy", "pulses_sparse", "beam_misses"], 40)
+    '3 flags: sidelink_noisy, and 2 more in image.json'
+    """
+    if not flags:
+        return "no flags"
+    words = f"{len(flags)} flag{'s' if len(flags) > 1 else ''}: "
+    for number in range(len(flags), 0, -1):
+        left = f", and {len(flags) - number} more in image.json" if number < len(flags) else ""
+        line = f"{words}{', '.join(flags[:number])}{left}"
+        if len(line) <= most:
+            break
+    return line
 
 
 def round_origin(low_m: float, high_m: float) -> float:

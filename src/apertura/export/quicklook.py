@@ -1,5 +1,6 @@
 """One picture of an image for people: power in dB on metric axes, north up, its origin in the footer."""
 
+import json
 from collections.abc import Iterable, Mapping
 from math import ceil
 from pathlib import Path
@@ -45,7 +46,7 @@ def write_quicklook(
     transform, crs
         As `apertura.export.cog.write_slc`.
     tags
-        Provenance: version, numerical error and code hash are drawn, all of them lie in the file.
+        Provenance: flags by name, version, numerical error and code hash are drawn, all of them lie in the file.
     title, subtitle
         Flight and pair; whatever else a reader should know at a glance.
     markers
@@ -92,6 +93,8 @@ def write_quicklook(
                 0.5, 0.5, "no power in any pixel", transform=layout.axes.transAxes, ha="center", va="center"
             )
         layout.write_words(title, subtitle, _footer(tags))
+        if "APERTURA_FLAGS" in tags:
+            layout.write_flags(list(json.loads(tags["APERTURA_FLAGS"])))
         with replacement(path) as temporary:
             layout.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
 

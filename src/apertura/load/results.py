@@ -10,7 +10,6 @@ from apertura.campaign import Campaign
 from apertura.contracts import STAGES
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
-from apertura.settings import FLIGHTS
 from apertura.store import open_stage
 
 if TYPE_CHECKING:
@@ -65,7 +64,9 @@ class OpenCampaign:
         else:
             kind = "node" if name in _OF_NODES else "pair"
             _check_count(where, 2, name, f"a flight and a {kind}")
-            self._check_place(*where, kind=kind)
+            flight = self.campaign.flight(where[0])
+            known = flight.nodes if kind == "node" else flight.pairs
+            _check_name(where[1], kind, known, where=f"campaign.stage({name!r}, {flight.name!r})")
         return open_stage(self.campaign.stage(name, *where), name)
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":
@@ -75,10 +76,8 @@ class OpenCampaign:
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
-        if pair == "fused":
-            _check_name(flight, "flight", self.pairs, where=self.campaign.root / FLIGHTS)
-        else:
-            self._check_place(flight, pair, kind="pair")
+        known = (*self.campaign.flight(flight).pairs, "fused")
+        _check_name(pair, "pair", known, where=f"campaign.report({flight!r})")
         path = self.campaign.results / flight / pair / "image.json"
         if not path.is_file():
             raise CampaignError(
@@ -91,14 +90,6 @@ class OpenCampaign:
         """Return the limits that an image exceeds: name → what was measured, in one line."""
         flags: dict[str, str] = self.report(flight, pair)["flags"]
         return flags
-
-    def _check_place(self, flight: str, member: str, *, kind: str) -> None:
-        """Raise CampaignError unless there is such a flight, with such a node or pair in it."""
-        where = self.campaign.root / FLIGHTS
-        flights = {one.name: one for one in self.campaign.flights}
-        _check_name(flight, "flight", flights, where=where)
-        members = flights[flight].pairs if kind == "pair" else flights[flight].nodes
-        _check_name(member, kind, members, where=f"{where}: flight {flight}")
 
 
 def _check_name(name: str, kind: str, known: Iterable[str], *, where: object) -> None:

@@ -31,7 +31,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         campaign.results / flight / pair,
         {"image": image.image},
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=origin.tags() | _quality_tags(image.attrs["quality"]),
+        tags=origin.tags() | _quality_tags(image.attrs["quality"], image.attrs["flags"]),
         **_georeference(settled_scene(campaign).grid),
     )
 
@@ -51,7 +51,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         folder,
         sums,
         titles={source: f"{name} · {words} of {' + '.join(pairs)}" for source, words in titles.items()},
-        tags=_fused_provenance(cube, images).tags() | _quality_tags(quality),
+        tags=_fused_provenance(cube, images).tags() | _quality_tags(quality, _flags(images)),
         **_georeference(grid),
     )
     report = folder / "image.json"
@@ -128,11 +128,12 @@ def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
     }
 
 
-def _quality_tags(quality: Mapping[str, Any]) -> dict[str, str]:
+def _quality_tags(quality: Mapping[str, Any], flags: Mapping[str, str]) -> dict[str, str]:
     return {
         "APERTURA_ERROR_DB": f"{quality['numerical_error_db']:.2f}",
         "APERTURA_ERROR_STD_DB": f"{quality['numerical_error_std_db']:.2f}",
         "APERTURA_PEAK_ERROR_DB": f"{quality['peak_error_db']:.2f}",
+        "APERTURA_FLAGS": canonical_json(flags),
         "APERTURA_MODELS": canonical_json(quality["models"]),
         **({"APERTURA_REDONE": canonical_json(quality["redone"])} if quality["redone"] else {}),
     }

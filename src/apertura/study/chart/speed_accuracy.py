@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,12 @@ from apertura.study.tables import write_table
 
 FOLDER = Path("results/study")
 PULSES, SIDE_PX, PIXELS = 1024, 256, 200
+LEAST_ROWS = 32
+"""Rows of the window that every setting forms: the pixels whose exact values are known lie in them."""
+
 _TOLERANCES_RAD = (1.5e-3, 1.5e-4)
 _SLOW_SECONDS = 0.3
-"""A former slower than this on the window is timed on fewer of its rows."""
+"""A setting predicted to take longer than this on the window is timed on fewer of its rows."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +42,19 @@ class Part:
 
     Attributes
     ----------
-    profiles, beams
+    history, profiles, beams
         Of the block; None where the antennas have no beams.
     pixels
         (y, x, 3) float64, the window.
     picked
-        (pixel, 2) int64, rows and columns in the window whose exact values are known.
+        (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known.
     exact
         (pixel,) complex128.
     reference_seconds
         What the exact values took.
     """
 
+    history: PhaseHistory
     profiles: Profiles
     pixels: NDArray[np.float64]
     picked: NDArray[np.int64]
@@ -112,27 +116,32 @@ def _part(
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
         window.append(slice(first, min(size, first + SIDE_PX)))
     pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
-    picked = np.random.default_rng(0).integers(0, pixels.shape[:2], (PIXELS, 2))
+    rows = min(LEAST_ROWS, len(pixels))
+    picked = np.random.default_rng(0).integers(0, (rows, pixels.shape[1]), (PIXELS, 2))
     begin = perf_counter()
     exact = reference.form(history, pixels[picked[:, 0], picked[:, 1]], beams=beams)
-    return Part(profiles, pixels, picked, exact, total_pixels, perf_counter() - begin, beams)
+    return Part(history, profiles, pixels, picked, exact, total_pixels, perf_counter() - begin, beams)
 
 
 def _settings(search: Search) -> list[Setting]:
-    """Return the settings to measure, cheapest first: of each engine, all but the reference."""
+    """Return the settings to measure, cheapest first: of every engine but the reference, which is timed once."""
     return [
         setting
         for setting in search.settings(len(search.job.aperture))
-        if setting.engine != "reference"
+        if not _is_reference(setting)
         and setting.form_options.get("tolerance_rad", _TOLERANCES_RAD[0]) in _TOLERANCES_RAD
     ]
+
+
+def _is_reference(setting: Setting) -> bool:
+    return cast("object", load_engine(setting.engine)) is reference
 
 
 def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
     """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
     begin = perf_counter()
     points = [_reference_point(part, plan)]
-    if plan.engine != "reference":
+    if not _is_reference(plan.setting):
         points.append(_measured(part, plan.setting, plan))
     unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
     for setting in unplanned:
@@ -146,31 +155,22 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     engine = load_engine(setting.engine)
 
     def prepare() -> Any:
-        history = part.profiles if plan is None else plan.inputs(part.profiles)
-        return engine.prepare(history, **setting.options)
+        if engine.READS == "phase_history":
+            return engine.prepare(part.history, **setting.options)
+        return engine.prepare(part.profiles if plan is None else plan.inputs(part.profiles), **setting.options)
 
     tables_s, prepared = _least(prepare, repeats=2)
-    rows = len(part.pixels)
-    if setting.engine == "numba":  # any shape of pixels will do, so errors need not wait for the whole window
-        engine.form(prepared, part.pixels[:1, :1], beams=part.beams)
-        rows = max(
-            1, min(rows, round(_SLOW_SECONDS / max(setting.seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]))
-        )
-        values = engine.form(prepared, part.pixels[part.picked[:, 0], part.picked[:, 1]][None], beams=part.beams)[0]
-        form_s, _ = _least(lambda: engine.form(prepared, part.pixels[:rows], beams=part.beams), repeats=2)
-    else:
-        form_s, image = _least(
-            lambda: engine.form(prepared, part.pixels, beams=part.beams, **setting.form_options), repeats=3
-        )
-        values = image[part.picked[:, 0], part.picked[:, 1]]
-    pixels = rows * part.pixels.shape[1]
-    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels, values, plan)
+    quick = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
+    pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
+    form_s, image = _least(lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3)
+    values = image[part.picked[:, 0], part.picked[:, 1]]
+    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, values, plan)
 
 
 def _reference_point(part: Part, plan: Plan) -> Point:
     setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
     taken = part.reference_seconds * part.total_pixels / PIXELS
-    return replace(_point(part, setting, taken, part.exact, None), planned=plan.engine == "reference")
+    return replace(_point(part, setting, taken, part.exact, None), planned=_is_reference(plan.setting))
 
 
 def _point(part: Part, setting: Setting, taken: float, values: NDArray[np.complexfloating], plan: Plan | None) -> Point:
