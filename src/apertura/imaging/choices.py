@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from apertura.focus.engines import ENGINES, load_engine
+from apertura.focus.engines.engine import PATCH_PX
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
 """Choices that are the planner's where they are 'auto'."""
@@ -39,7 +40,7 @@ class ImagingChoices(BaseModel):
         examples=[{}],
         json_schema_extra=_options_of_each_engine,
     )
-    tile_px: int = Field(256, ge=16, multiple_of=16, description="side of a tile, pixels")
+    tile_px: int = Field(256, ge=PATCH_PX, multiple_of=PATCH_PX, description="side of a tile, pixels")
     presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
         "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
     )

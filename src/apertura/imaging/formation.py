@@ -10,8 +10,7 @@ from apertura.antenna.beam import Beams
 from apertura.contracts import Window
 from apertura.focus.band_limited import band_limited_image
 from apertura.focus.engines import load_engine, reference
-from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.native_constants import KERNEL
+from apertura.focus.engines.engine import PATCH_PX, Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.tiles import image_array
 from apertura.planning.plan import Plan
@@ -80,7 +79,7 @@ class Formation:
 
     def values(self, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
         """Return the planned image at (pixel, 2) rows and columns, (pixel,) complex64, forming just their patches."""
-        setting, side = self.plan.setting, KERNEL.patch_side
+        setting, side = self.plan.setting, PATCH_PX
         engine, inputs = load_engine(setting.engine), self._inputs(setting)
         if isinstance(inputs, Profiles):
             inputs = self.plan.inputs(inputs)
