@@ -4,8 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from apertura.focus.engines import ENGINES, load_engine
-from apertura.focus.engines.engine import PATCH_PX
+from apertura.focus.engines import ENGINES, PATCH_PX, load_engine
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
 """Choices that are the planner's where they are 'auto'."""

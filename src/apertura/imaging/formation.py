@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from apertura.antenna.beam import Beams
 from apertura.contracts import Window
 from apertura.focus.band_limited import band_limited_image
-from apertura.focus.engines import load_engine, reference
-from apertura.focus.engines.engine import PATCH_PX, Setting
+from apertura.focus.engines import PATCH_PX, load_engine, reference
+from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.tiles import image_array
 from apertura.planning.plan import Plan

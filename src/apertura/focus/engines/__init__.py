@@ -13,6 +13,9 @@ ENGINES: dict[str, str] = {
 }
 """Name → module that is an `Engine`; a module is imported when its engine is asked for."""
 
+PATCH_PX = 16
+"""Tiles begin at multiples of this: an engine may work in patches of it and give the same bits in every tiling."""
+
 
 def load_engine(name: str) -> "Engine":
     """Return an engine.

@@ -9,9 +9,6 @@ from pydantic import BaseModel, ConfigDict
 
 from apertura.focus.job import Job
 
-PATCH_PX = 16
-"""Tiles begin at multiples of this: an engine may work in patches of it and give the same bits in every tiling."""
-
 BEAM_S = 1.2e-7
 """Seconds that `Beams.weight` takes for a pixel, a pulse and an antenna."""
 
