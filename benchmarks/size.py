@@ -21,7 +21,7 @@ import numpy as np
 import zarr
 
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native
+from apertura.focus.engines import PATCH_PX, native
 from apertura.focus.engines.engine import Setting
 from apertura.focus.engines.native_tables import Tables
 from apertura.focus.inputs import Profiles
@@ -55,7 +55,7 @@ def profiles(grid: SceneGrid, pulses: int, height_m: float = 400.0) -> Profiles:
 
 def kernel_seconds(tables: Tables, grid: SceneGrid, threads: int) -> float:
     """Return seconds of the whole image by the kernel alone, from tiles on its diagonal."""
-    corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // native.PATCH * native.PATCH
+    corners = np.linspace(0, grid.shape[0] - TILE, 2 * threads).astype(int) // PATCH_PX * PATCH_PX
     tiles = [grid[c : c + TILE, c : c + TILE].positions(0.0) for c in corners]
     begin = time.perf_counter()
     with ThreadPoolExecutor(threads) as pool:

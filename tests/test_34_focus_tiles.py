@@ -5,8 +5,9 @@ import pytest
 import toy_engine
 from campaigns import draw
 
-from apertura.focus.engines import load_engine
+from apertura.focus.engines import PATCH_PX, load_engine
 from apertura.focus.engines.engine import Setting
+from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.tiles import compute_tiles, image_array
 from apertura.quality.measures import numerical_error
 from apertura.scene.terrain import FlatGround
@@ -55,3 +56,7 @@ def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
         compute_tiles(image, [window], tile, threads=2)
     assert toy_engine.CALLS == ["prepare", "form"] * 3
     np.testing.assert_array_equal(tile[window], whole[window])
+
+
+def test_tiles_begin_at_patches_of_the_kernel():
+    assert PATCH_PX % KERNEL.patch_side == 0

@@ -8,27 +8,11 @@ from dask.highlevelgraph import MaterializedLayer
 Place = tuple[int, int]
 
 
-class _Tiles(MaterializedLayer):
+class TilesLayer(MaterializedLayer):
     """The tasks of some tiles of an image.
 
     Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
     dask would therefore compute all tiles for the sake of one; here whoever asks for some gets the graph of those.
-    """
-
-    def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):
-        self.name, self.graph, self.places = name, graph, list(places)
-        super().__init__(graph(self.places))
-
-    def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:
-        """Return the layer of the tiles among the keys, and the dependencies of its tasks."""
-        asked = _Tiles(self.name, self.graph, [place for place in self.places if (self.name, *place) in keys])
-        return asked, {key: asked.get_dependencies(key, all_hlg_keys) for key in asked}
-
-
-def tiles_layer(
-    name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]
-) -> MaterializedLayer:
-    """Return the layer of an array whose chunks are tiles.
 
     Parameters
     ----------
@@ -39,4 +23,13 @@ def tiles_layer(
     places
         Row and column of every tile.
     """
-    return _Tiles(name, graph, places)
+
+    def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):
+        self.name, self.graph, self.places = name, graph, list(places)
+        super().__init__(graph(self.places))
+
+    def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:
+        """Return the layer of the tiles among the keys, and the dependencies of its tasks."""
+        places = [place for place in self.places if (self.name, *place) in keys]
+        asked = TilesLayer(self.name, self.graph, places)
+        return asked, {key: asked.get_dependencies(key, all_hlg_keys) for key in asked}

@@ -61,13 +61,13 @@ def image_array(
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
 
-    from apertura.focus.layer import tiles_layer
+    from apertura.focus.layer import TilesLayer
 
     name = f"image-{uuid4().hex}"
     graph = partial(_graph, name, inputs, setting, grid, terrain, side_px, beams, presum)
     chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
     places = product(range(len(chunks[0])), range(len(chunks[1])))
-    return Array(HighLevelGraph({name: tiles_layer(name, graph, places)}, {name: set()}), name, chunks, np.complex64)
+    return Array(HighLevelGraph({name: TilesLayer(name, graph, places)}, {name: set()}), name, chunks, np.complex64)
 
 
 def _graph(  # noqa: PLR0917

@@ -114,10 +114,9 @@ def backproject(
     inputs = inputs_of(profiles, asked.window)
     ground = _ground(terrain, grid)
     flags = check_inputs(inputs, grid, ground)
-    level = ground if isinstance(ground, FlatGround) else FlatGround(float(np.nanmean(ground.heights(grid.coarse(33)))))
     history = inputs if isinstance(inputs, PhaseHistory) else None
     compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
-    job = replace(_job(compressed, history, grid, GroundModels.of(ground, level, grid), beams), tile_px=asked.tile_px)
+    job = replace(_job(compressed, history, grid, GroundModels.of(ground, None, grid), beams), tile_px=asked.tile_px)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
     formation = Formation(history, compressed, grid, plan, asked.tile_px, beams)
     attributes: dict[str, Any] = {}

@@ -29,8 +29,10 @@ class GroundModels:
     off_plane_m: float
 
     @classmethod
-    def of(cls, terrain: Terrain, level: FlatGround, grid: SceneGrid) -> "GroundModels":
+    def of(cls, terrain: Terrain, level: FlatGround | None, grid: SceneGrid) -> "GroundModels":
         """Return the models of a ground from its heights in the middle of blocks of pixels.
+
+        Without a level it is their mean, or the ground itself where that is flat.
 
         Examples
         --------
@@ -41,6 +43,8 @@ class GroundModels:
         """
         blocks = grid.coarse(_BLOCKS)
         heights = terrain.heights(blocks)
+        if level is None:
+            level = terrain if isinstance(terrain, FlatGround) else FlatGround(float(np.nanmean(heights)))
         heights = np.where(np.isfinite(heights), heights, level.height_m)  # a void between pixels is not imaged
         plane = Plane.through(blocks, heights)
         off_m = (np.abs(heights - model.heights(blocks)).max() for model in (level, plane))

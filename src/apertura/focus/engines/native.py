@@ -28,10 +28,9 @@ from apertura.focus.engines.native_prediction import candidates
 from apertura.focus.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table
 from apertura.focus.inputs import Profiles
 
-__all__ = ["INSTRUCTION_SETS", "PATCH", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
+__all__ = ["INSTRUCTION_SETS", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
-PATCH = KERNEL.patch_side  # pixels; tiles must begin at multiples of it for images to be independent of the tiling
 
 
 class Options(EngineOptions):
