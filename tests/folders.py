@@ -28,7 +28,8 @@ from apertura.simulation import (
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.steps import cube, echo, export, image, ingest, layers, profile, scene, terrain
+from apertura.store import open_stage
+from apertura.steps import assess, cube, echo, export, image, ingest, layers, profile, scene, terrain
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
@@ -69,14 +70,21 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
             image.image(campaign, flight.name, pair, threads=2)
-            if exports:
-                export.export(campaign, flight.name, pair)
+        assess.assess(campaign, flight.name)
     cube.cube(campaign)
     if exports:
         layers.layers(campaign, threads=2)
         for flight in campaign.image_flights:
+            for pair in flight.pairs:
+                export.export(campaign, flight.name, pair)
             export.export_fused(campaign, flight.name)
     return campaign
+
+
+def quality_of(campaign: Campaign, pair: str) -> dict[str, Any]:
+    """Return what the image of a pair of flight f01 says of itself, before its flight is assessed."""
+    quality: dict[str, Any] = open_stage(campaign.stage("image", "f01", pair), "image").attrs["quality"]
+    return quality
 
 
 def edit_config(root: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy_engine
 import yaml
-from folders import copy_writable
+from folders import copy_writable, quality_of
 from scenes import TARGET_GRID, plan, point_history
 
 from apertura.campaign import Campaign
@@ -89,7 +89,7 @@ def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tin
     campaign = Campaign.load(root)
     assert expected_plan(campaign, "f01", "uav1-uav2").setting.line == "toy refine=2"
     image.image(campaign, "f01", "uav1-uav2")
-    report = json.loads((root / "results/f01/uav1-uav2/image.json").read_text())
+    report = quality_of(campaign, "uav1-uav2")
     assert report["engine"] == "toy"
     assert report["numerical_error_db"] < -20
     paths = speed_accuracy(campaign, "f01", "uav1-uav2", seconds=5.0)

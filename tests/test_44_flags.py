@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, ingest_all
+from folders import complaint, edit_config, ingest_all, quality_of
 
 from apertura.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
@@ -127,7 +127,7 @@ def test_flags_reach_image_json(tmp_path):
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav2")
     image.image(campaign, "f01", "uav1-uav2")
-    report = json.loads((campaign.results / "f01" / "uav1-uav2" / "image.json").read_text())
+    report = quality_of(campaign, "uav1-uav2")
     assert report["flags"] == dataset.attrs["flags"] != {}
     assert report["sidelink"]["lock_rate"] == 1.0
     assert report["clock"]["corrected"] is False
@@ -143,6 +143,6 @@ def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav1")
     image.image(campaign, "f01", "uav1-uav1", threads=2)
-    report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
+    report = quality_of(campaign, "uav1-uav1")
     assert report["numerical_error_db"] < -120
     assert "accuracy_missed" not in report["flags"]

@@ -30,7 +30,7 @@ def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
     files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in {".tif", ".png"}}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
-    assert len(RASTERS) == 11
+    assert len(RASTERS) == 12
     assert files | reports == set(PRODUCTS)
 
 
@@ -50,7 +50,8 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
 def test_a_raster_says_where_it_comes_from(finished_tiny, name):
     tags, pair = tags_of(finished_tiny, name), name.split("/")[1]
     spec = json.loads(tags["APERTURA_RUNSPEC"])
-    for runspec in spec.values() if pair == "fused" else [spec]:
+    assert ("fusion" in spec) == (pair == "fused")
+    for runspec in [spec[name] for name in ("uav1-uav1", "uav1-uav2")] if pair == "fused" else [spec]:
         assert runspec["waveform"]["carrier_hz"] == 1.2e9
         assert runspec["window"] == "hann"
     inputs = json.loads(tags["APERTURA_INPUTS"])
@@ -77,7 +78,7 @@ def test_a_fused_raster_keeps_the_settings_of_its_pairs_apart(finished_tiny):
     apart = json.loads(tags_of(finished_tiny, "f01/fused/coherent_db.tif")["APERTURA_RUNSPEC"])
     for pair in PAIRS:
         assert apart[pair] == json.loads(tags_of(finished_tiny, f"f01/{pair}/db.tif")["APERTURA_RUNSPEC"])
-    assert set(apart) == set(PAIRS)
+    assert set(apart) == {*PAIRS, "fusion"}
     assert apart["uav1-uav1"] != apart["uav1-uav2"]
 
 

@@ -45,7 +45,10 @@ def test_the_step_writes_a_toy_product_with_the_others(finished_tiny, toy_packag
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     written = output_of(toy_package, "apertura", "step", "export", "f01", "uav1-uav1", "--campaign", str(root))
     folder = root / "results" / "f01" / "uav1-uav1"
-    assert [Path(line).name for line in written.splitlines() if line.startswith(str(folder))][-1] == "power.json"
+    assert [Path(line).name for line in written.splitlines() if line.startswith(str(folder))][-2:] == [
+        "power.json",
+        "image.json",
+    ]
     with rasterio.open(folder / "power.tif") as raster:
         mean, tags = raster.read(1).mean(), raster.tags()
     toy = json.loads((folder / "power.json").read_text())

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from folders import complaint, copy_writable, edit_config
+from folders import complaint, copy_writable, edit_config, quality_of
 
 from apertura.campaign import Campaign
 from apertura.quality.point_targets import cut_through, find_peak
@@ -89,7 +89,7 @@ def imaged(campaign):
     profile.profile(campaign, "f01", "uav1-uav1")
     image.image(campaign, "f01", "uav1-uav1", threads=2)
     folder = campaign.results / "f01" / "uav1-uav1"
-    report = json.loads((folder / "image.json").read_text())
+    report = quality_of(campaign, "uav1-uav1")
     return open_stage(folder / "image.zarr", "image").image.values, report
 
 
@@ -196,7 +196,7 @@ def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beam
     for part in ("uav1's radar_tx", "uav1's radar_rx", "right is +90", "yaw (clockwise from north)", "pattern ends at"):
         assert part in before
     assert complaint(lambda: imaged(campaign)) == before
-    assert not (beamed / "results/f01/uav1-uav1/image.json").exists()
+    assert not (beamed / "results/f01/uav1-uav1/image.manifest.json").exists()
 
 
 @pytest.mark.parametrize(("turn_deg", "misses"), [(0.0, False), (28.0, True)])

@@ -73,6 +73,10 @@ class Campaign:
         """Return where the path offsets of a calibration flight lie."""
         return f"results/{flight}/calibration.json"
 
+    def assessment_file(self, flight: str) -> str:
+        """Return where it stands how the images of a flight agree."""
+        return f"results/{flight}/assessment.json"
+
     def scene_sources(self) -> list[str]:
         """Return what the grid is settled from: nothing, or the first image flight where something is `auto`."""
         scene, first = self.settings.scene, self.image_flights[0]
@@ -148,10 +152,11 @@ class Campaign:
             "scene": {"scene": settings["scene"]},
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
             "profile": {"window": processing["window"]},
+            "assess": {"fusion": processing["fusion"]},
             "image": {
                 name: value
                 for name, value in processing.items()
-                if name not in {"window", "sidelink", "false_alarms_per_s"}
+                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion"}
             }
             | (
                 {"antennas": {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}}

@@ -207,7 +207,7 @@ def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 @step.command()
 def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
-    """Focus a pair's image, image.zarr and image.json."""
+    """Focus a pair's image, image.zarr."""
     _run("apertura.steps.image:image", campaign, flight, pair, threads=threads)
 
 
@@ -221,6 +221,12 @@ def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, thread
 def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
     """Time and measure every engine and setting on a pair, for at most so many seconds."""
     _run("apertura.study.chart.speed_accuracy:speed_accuracy", campaign, flight, pair, seconds=seconds)
+
+
+@step.command()
+def assess(flight: str, campaign: Directory = HERE) -> None:
+    """Compare the images of a flight with each other, and choose what is added up, assessment.json."""
+    _run("apertura.steps.assess:assess", campaign, flight)
 
 
 @step.command()

@@ -118,8 +118,9 @@ STAGES: Mapping[str, Stage] = {
             ),
             "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
             "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),
+            "magnitude": Variable(("flight", "y", "x"), "float32", "1", "mean magnitude of the peak-normalised images"),
         },
-        {},
+        {"fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why"},
     ),
 }
 

@@ -1,6 +1,7 @@
 rule cube:
     input:
         [campaign.manifest("image", flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs],
+        [campaign.assessment_file(flight.name) for flight in campaign.image_flights],
     output:
         "results/cube.manifest.json",
     log:

@@ -2,6 +2,7 @@
 rule export:
     input:
         "results/{flight}/{pair}/image.manifest.json",
+        "results/{flight}/assessment.json",
         "results/scene.json",
     output:
         [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("pair") if not export.pictured],
@@ -15,6 +16,7 @@ rule export:
             for export in exports_in("pair")
             if export.pictured
         ],
+        "results/{flight}/{pair}/image.json",
     log:
         "results/logs/{flight}/{pair}.export.log",
     benchmark:
@@ -35,6 +37,7 @@ rule export:
 rule export_fused:
     input:
         "results/cube.manifest.json",
+        "results/{flight}/assessment.json",
         "results/scene.json",
         lambda wildcards: [
             campaign.manifest("image", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs

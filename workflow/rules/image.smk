@@ -117,7 +117,6 @@ rule image:
         ],
     output:
         "results/{flight}/{pair}/image.manifest.json",
-        "results/{flight}/{pair}/image.json",
     log:
         "results/logs/{flight}/{pair}.image.log",
     benchmark:
@@ -134,3 +133,29 @@ rule image:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:
         "apertura step image {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
+
+
+rule assess:
+    input:
+        lambda wildcards: [
+            campaign.manifest("image", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
+        ],
+        "results/scene.json",
+    output:
+        "results/{flight}/assessment.json",
+    log:
+        "results/logs/{flight}/assess.log",
+    benchmark:
+        "results/benchmarks/{flight}/assess.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        settings=campaign.relevant("assess"),
+        code=code_sha256("apertura.steps.assess"),
+    message:
+        "{wildcards.flight}: comparing the images with each other"
+    shell:
+        "apertura step assess {wildcards.flight} > {log} 2>&1"

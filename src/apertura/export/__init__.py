@@ -17,6 +17,7 @@ SOURCES: Mapping[str, str] = {
     "image": "pair",
     "coherent": "fused",
     "noncoherent": "fused",
+    "magnitude": "fused",
     "incidence": "layers",
     "bistatic_angle": "layers",
     "mask": "layers",
@@ -24,7 +25,8 @@ SOURCES: Mapping[str, str] = {
 """Raster that a file may be written from → kind of folder the file lies in.
 
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase; the others are layers of the scene's geometry, real.
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers of the scene's
+geometry, real.
 """
 
 
@@ -73,6 +75,7 @@ EXPORTS: tuple[Export, ...] = (
     Export("quicklook.png", "coherent", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("noncoherent_power.tif", "noncoherent", "apertura.export.cog:write_power"),
     Export("noncoherent_db.tif", "noncoherent", "apertura.export.db:write_db"),
+    Export("noncoherent_magnitude.tif", "magnitude", "apertura.export.cog:write_magnitude"),
     Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
     Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
     Export("mask.tif", "mask", "apertura.export.layers:write_mask"),

@@ -61,6 +61,7 @@ class Band:
 
 
 SLC = Band("complex64", np.nan, "1", "focused scene, carrier kept", "AVERAGE_MAGPHASE")
+MAGNITUDE = Band("float32", np.nan, "1", "mean magnitude of the focused scenes", "AVERAGE")
 POWER = Band("float32", np.nan, "1", "power of the focused scene, linear", "AVERAGE")
 
 
@@ -116,6 +117,13 @@ def write_power(
 ) -> None:
     """Write |image|² as a float32 COG; overviews average the power. Parameters and errors as `write_slc`."""
     write_cog(path, image, POWER, transform=transform, crs=crs, tags=tags, title=title, value=power)
+
+
+def write_magnitude(
+    path: Path, image: Raster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write a real raster of magnitudes as a float32 COG. Parameters and errors as `write_slc`."""
+    write_cog(path, image, MAGNITUDE, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_cog(

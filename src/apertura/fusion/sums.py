@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def coherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:
+def coherent_sum(
+    images: NDArray[np.complex64], peaks: NDArray[np.float64], phases_rad: NDArray[np.float64] | float = 0.0
+) -> NDArray[np.complex64]:
     """Return the complex mean of peak-normalised images.
 
     Their spectra lie side by side, so the sum resolves finer than either: mono- and bistatic images add in phase
@@ -16,6 +18,8 @@ def coherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> N
         (pair, y, x) complex64 on one grid or a block of it, carriers kept.
     peaks
         (pair,) float64, largest magnitude of each whole image.
+    phases_rad
+        (pair,) float64, taken off each image first.
 
     Returns
     -------
@@ -32,7 +36,8 @@ def coherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> N
     >>> coherent_sum(np.array([[[2.0, 0.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0])).round(3)
     array([[0.5+0.5j, 0. +0.j ]], dtype=complex64)
     """
-    return np.asarray(_normalised(images, peaks).mean(axis=0), np.complex64)
+    turned = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
+    return np.asarray((_normalised(images, peaks) * turned.reshape(-1, 1, 1)).mean(axis=0), np.complex64)
 
 
 def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -47,6 +52,19 @@ def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -
     """
     power = np.abs(_normalised(images, peaks)).astype(np.float64) ** 2
     return np.asarray(power.mean(axis=0), np.float32)
+
+
+def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the mean magnitude of peak-normalised images, the paper's sum without phase.
+
+    Parameters and errors as `coherent_sum`; returns (y, x) float32.
+
+    Examples
+    --------
+    >>> magnitude_sum(np.array([[[2.0, 1.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0]))
+    array([[1.  , 0.25]], dtype=float32)
+    """
+    return np.asarray(np.abs(_normalised(images, peaks)).mean(axis=0), np.float32)
 
 
 def _normalised(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:

@@ -12,7 +12,7 @@ from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job
 from apertura.imaging.checks import check_inputs
-from apertura.imaging.choices import ImagingChoices
+from apertura.imaging.choices import ACCURACY_DB, ImagingChoices
 from apertura.imaging.formation import Formation
 from apertura.imaging.job import imaging_job, profiles_job
 from apertura.imaging.range_profiles import range_compress
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 def backproject(
     profiles: "Profiles | PhaseHistory | xr.Dataset",
     grid: SceneGrid,
-    accuracy_db: float = -60.0,
+    accuracy_db: float = ACCURACY_DB,
     *,
     terrain: Terrain | float | None = None,
     engine: str = "auto",

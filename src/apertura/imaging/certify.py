@@ -69,6 +69,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
         for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
     }
+    terms = formation.contributions(peak.row, peak.column)[:, 0]
     return {
         "entropy": round(overview.entropy, 6),
         "noise_floor_db": overview.noise_floor_db,
@@ -76,7 +77,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(formation.contributions(peak.row, peak.column)),
+            "coherence_factor": coherence_factor(terms[terms != 0]),
             **{
                 f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
                 for name, cut in cuts.items()

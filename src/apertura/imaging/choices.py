@@ -6,6 +6,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from apertura.focus.engines import ENGINES, PATCH_PX, load_engine
 
+ACCURACY_DB = -60.0
+"""Numerical error asked where nothing is known of other errors."""
+
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
 """Choices that are the planner's where they are 'auto'."""
 
@@ -27,7 +30,10 @@ class ImagingChoices(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
-    accuracy_db: float = Field(-60.0, le=-10, ge=-120, description="numerical error asked of the image, dB")
+    accuracy_db: Annotated[float, Field(le=-10, ge=-120)] | Literal["auto"] = Field(
+        "auto",
+        description="numerical error asked of the image, dB; auto: 10 dB below what else spoils it, from -40 to -60",
+    )
     engine: str = Field(
         "auto",
         description=f"backprojection engine: auto, {', '.join(ENGINES)}",
@@ -54,6 +60,11 @@ class ImagingChoices(BaseModel):
     def planned(self) -> dict[str, Any]:
         """What the planner is asked."""
         return {name: getattr(self, name) for name in PLANNED}
+
+    @property
+    def asked_db(self) -> float:
+        """The numerical error asked, or that of `ACCURACY_DB` where it is to follow from other errors."""
+        return ACCURACY_DB if self.accuracy_db == "auto" else self.accuracy_db
 
     @field_validator("engine")
     @classmethod

@@ -19,6 +19,8 @@ from apertura.scene.grid import SceneGrid
 if TYPE_CHECKING:
     from dask.array.core import Array
 
+_PULSES_AT_ONCE = 64
+
 
 @dataclass(frozen=True, eq=False)
 class Formation:
@@ -91,8 +93,8 @@ class Formation:
             values[index] = patch[row - top, column - left] / len(self.profiles)
         return values
 
-    def contributions(self, row: float, column: float) -> NDArray[np.complex128]:
-        """Return what each pulse that sees a place adds there, (pulse,) complex128.
+    def contributions(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
+        """Return what each pulse adds at fractional pixels, (pulse, pixel) complex128; 0 where it does not see one.
 
         Raises
         ------
@@ -101,9 +103,10 @@ class Formation:
         """
         if self.history is None:
             raise ValueError("profiles do not tell what each pulse adds")
-        place = self.positions_at(np.array([row]), np.array([column]))
-        terms = reference.terms(self.history, place, self.beams)[:, 0]
-        return np.asarray(terms[terms != 0])
+        places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
+        parts = [slice(first, first + _PULSES_AT_ONCE) for first in range(0, len(self.history), _PULSES_AT_ONCE)]
+        beams = self.beams
+        return np.concatenate([reference.terms(self.history[part], places, beams and beams[part]) for part in parts])
 
     def _inputs(self, setting: Setting) -> PhaseHistory | Profiles:
         if load_engine(setting.engine).READS == "profiles":

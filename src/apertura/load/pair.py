@@ -1,6 +1,7 @@
 """A pair, opened once: from its echo, or before that is formed from what the flight logs promise."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import Flown
+from apertura.quality.budget import NodePositions
 from apertura.settings import OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
@@ -37,10 +39,16 @@ class OpenPair:
         (subcarrier,) float64, RF frequency and window.
     path_limit_m
         Longest total path inside the cyclic prefix.
+    time_s
+        (pulse,) float64, seconds from the first.
+    positions
+        What is known of the node's positions, or of the transmitter's and the receiver's.
     history
         The echo itself; None before it is formed.
     beams
         Of the antennas; None where they are isotropic.
+    report
+        What the echo stage says of itself: its attributes; empty before it is formed.
     """
 
     flight: str
@@ -49,8 +57,17 @@ class OpenPair:
     frequency_hz: NDArray[np.float64]
     weight: NDArray[np.float64]
     path_limit_m: float
+    time_s: NDArray[np.float64]
+    positions: tuple[NodePositions, ...]
     history: PhaseHistory | None = None
     beams: Beams | None = None
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def monostatic(self) -> bool:
+        """Whether one node sends and receives."""
+        tx, rx = self.name.split("-")
+        return tx == rx
 
     @property
     def flown(self) -> Flown:
@@ -71,7 +88,20 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
-    return OpenPair(flight, pair, history.aperture, history.frequency_hz, history.weight, limit_m, history, beams)
+    stated = echo.attrs.get("positions", {})
+    return OpenPair(
+        flight,
+        pair,
+        history.aperture,
+        history.frequency_hz,
+        history.weight,
+        limit_m,
+        time_s=_seconds(echo.time.values),
+        positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
+        history=history,
+        beams=beams,
+        report=echo.attrs,
+    )
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
@@ -97,7 +127,17 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     weight = window_weights(campaign.settings.processing.window, len(frequency))
     limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
     aperture = Aperture(places[0], places[1])
-    return OpenPair(flight, pair, aperture, frequency, weight, limit_m, beams=beams_of(campaign, pair, axes))
+    return OpenPair(
+        flight,
+        pair,
+        aperture,
+        frequency,
+        weight,
+        limit_m,
+        time_s=_seconds(times),
+        positions=tuple(NodePositions(None) for _ in _legs(pair)),
+        beams=beams_of(campaign, pair, axes),
+    )
 
 
 def _pulse_times(
@@ -108,3 +148,20 @@ def _pulse_times(
         count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
         recorded = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
     return recorded[(recorded >= first) & (recorded <= last)]
+
+
+def _legs(pair: str) -> tuple[str, ...]:
+    """Return which legs of a pair have positions of their own: one where one node sends and receives."""
+    tx, rx = pair.split("-")
+    return ("tx",) if tx == rx else ("tx", "rx")
+
+
+def _positions(stated: Mapping[str, Any]) -> NodePositions:
+    """Return what an echo stage says of a node's positions; its deviations are north, east, up."""
+    std = stated.get("std_m")
+    axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
+    return NodePositions(axes, float(stated.get("correlation_s", 1.0)), str(stated.get("stated_by", "nobody")))
+
+
+def _seconds(times: NDArray[np.datetime64]) -> NDArray[np.float64]:
+    return np.asarray((times - times[0]) / np.timedelta64(1, "s"), np.float64)

@@ -10,10 +10,12 @@ from apertura.errors import CampaignError
 from apertura.focus.job import Job
 from apertura.imaging.job import imaging_job
 from apertura.load.antennas import lit
+from apertura.load.budget import budget_of
 from apertura.load.pair import OpenPair
 from apertura.load.scene import OpenScene
+from apertura.planning.accuracy import decide_accuracy
 from apertura.planning.memory import memory_limit
-from apertura.planning.plan import Plan
+from apertura.planning.plan import Decision, Plan
 from apertura.planning.planner import make_plan
 from apertura.scene.clearance import check_antennas
 from apertura.scene.ground_models import GroundModels
@@ -40,20 +42,28 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
-    plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads))
-    plan = replace(plan, flags={**flags, **plan.flags})
+    accuracy = _accuracy(campaign, pair, scene)
+    plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
+    plan = replace(plan, decisions=(*plan.decisions, accuracy), flags={**flags, **plan.flags})
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
     free_disk = None if written else shutil.disk_usage(campaign.root).free
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
     return plan
 
 
-def plan_job(campaign: Campaign, job: Job) -> Plan:
-    """Return how a job will be done at the accuracy and with the overrides of a campaign."""
+def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float | None = None) -> Plan:
+    """Return how a job will be done with the overrides of a campaign, at its accuracy where none is given."""
     processing = campaign.settings.processing
-    return make_plan(
-        job, accuracy_db=processing.accuracy_db, overrides=processing.planned, where=f"{CONFIG}: processing"
-    )
+    asked_db = processing.asked_db if accuracy_db is None else accuracy_db
+    return make_plan(job, accuracy_db=asked_db, overrides=processing.planned, where=f"{CONFIG}: processing")
+
+
+def _accuracy(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
+    """Return the numerical error to ask for, and why."""
+    asked = campaign.settings.processing.accuracy_db
+    if asked != "auto":
+        return Decision("accuracy_db", asked, "asked for")
+    return decide_accuracy(budget_of(campaign, pair, scene))
 
 
 def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Job:

@@ -130,3 +130,18 @@ def open_campaign(path: str | Path) -> OpenCampaign:
     apertura.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
     """
     return OpenCampaign(Campaign.load(path))
+
+
+def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
+    """Return what step `assess` wrote of a flight: how its images agree, their flags, what the coherent sum holds.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there.
+    """
+    path = campaign.root / campaign.assessment_file(flight)
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected="what step assess writes", remedy="Run the workflow.")
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document

@@ -46,6 +46,8 @@ class Plan:
         Next better settings, for tiles whose certified error is worse than asked; the last one is `reference`.
     decisions
         Every choice with its reason.
+    accuracy_db
+        The numerical error asked.
     predicted_error_db
         RMS on random pixels: of the setting and of the models.
     predicted_seconds
@@ -65,6 +67,7 @@ class Plan:
     setting: Setting
     fallbacks: tuple[Setting, ...]
     decisions: tuple[Decision, ...]
+    accuracy_db: float
     predicted_error_db: float
     predicted_seconds: float
     memory_bytes: int

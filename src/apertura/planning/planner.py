@@ -73,6 +73,7 @@ def make_plan(
             terrain,
             *(Decision("antenna", value, reason) for value, reason in antennas),
         ),
+        accuracy_db=accuracy_db,
         predicted_error_db=expected_db + max(0.0, job.content_db or 0.0),
         predicted_seconds=chosen.table_seconds + chosen.form_seconds / min(job.threads, job.tiles),
         memory_bytes=memory,

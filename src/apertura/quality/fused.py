@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.quality.bright_points import BrightPoint
 from apertura.quality.measures import Raster, coherence_factor
-from apertura.quality.point_targets import Patch, Peak
+from apertura.quality.point_targets import Patch
 
 
 @dataclass(frozen=True)
@@ -38,28 +39,33 @@ class Amplitude:
         return np.asarray(np.sqrt(power), np.complex64)
 
 
-def coherence_of_images(
-    images: Sequence[Raster], amplitudes: Sequence[float], pixel: tuple[int, int], peak: Peak
+def coherence_between(
+    images: Sequence[Raster], phases_rad: NDArray[np.float64], points: Sequence[BrightPoint]
 ) -> float:
-    """Return the coherence factor of what each image contributes to a peak of their sum: 1 in phase, 1/M at random.
+    """Return how well images agree in phase at bright points: 1 in phase, 1 over their number by chance.
 
     Parameters
     ----------
     images
         (y, x) complex64 on one grid, carriers kept.
-    amplitudes
-        By which each is divided before it is added, its largest magnitude.
-    pixel
-        Row and column of the brightest pixel of the sum.
-    peak
-        The peak beside it.
+    phases_rad
+        (image,) float64, taken off each.
+    points
+        Where; all count alike.
 
     Notes
     -----
-    Source: docs/theory.md, eq. 7.
+    Source: docs/theory.md, eq. 7. Amplitudes are taken off: a sum's own maximum would choose where they agree.
+
+    Examples
+    --------
+    >>> image = np.ones((64, 64), np.complex64)
+    >>> coherence_between([image, -image], np.array([0.0, np.pi]), [BrightPoint(30.0, 31.0, 1.0)])
+    1.0
     """
-    values = [
-        complex(Patch(image, *pixel).at(peak.row, peak.column)) / amplitude
-        for image, amplitude in zip(images, amplitudes, strict=True)
-    ]
-    return coherence_factor(np.array(values))
+    found = []
+    for point in points:
+        at = round(point.row), round(point.column)
+        values = np.array([complex(Patch(image, *at).at(point.row, point.column)) for image in images])
+        found.append(coherence_factor(np.exp(1j * (np.angle(values) - phases_rad))))
+    return float(np.mean(found))

@@ -8,12 +8,21 @@ from apertura.imaging.choices import ImagingChoices
 from apertura.settings.section import Metres3, Name, Section
 
 
+class Fusion(Section):
+    """How the images of a flight's pairs are added up."""
+
+    align_phase: bool = Field(
+        False, description="take a constant phase between pairs, measured at bright points, off before they are added"
+    )
+
+
 class Processing(ImagingChoices):
     """How to compute; every key has a default."""
 
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
+    fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )

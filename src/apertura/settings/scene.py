@@ -18,6 +18,9 @@ class Scene(Section):
     )
     spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
     height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
+    height_std_m: float | None = Field(
+        None, ge=0, description="standard deviation of the ground's heights, m; null: nobody said"
+    )
     height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
     dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
     dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(

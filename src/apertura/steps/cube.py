@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from apertura.campaign import Campaign
-from apertura.fusion.sums import coherent_sum, noncoherent_sum
+from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.steps.stamping import stamped
 from apertura.store import create, finish, open_array, open_stage, writing
@@ -22,38 +24,47 @@ def cube(campaign: Campaign) -> Path:
         for flight in flights
         for pair in flight.pairs
     }
+    fusion = {flight.name: assessment_of(campaign, flight.name)["fusion"] for flight in flights}
     side = campaign.settings.processing.tile_px
     windows, folder = list(settled_scene(campaign).grid.tiles(side)), campaign.stage("cube")
     with writing(folder) as wip:
         empty = stamped(
-            _empty(images, [flight.name for flight in flights], pairs), "cube", modules=[__name__], parents=images
+            _empty(images, fusion, pairs), "cube", modules=[__name__], parents=images, settings={"fusion": fusion}
         )
-        chunks = {"image": (1, 1, side, side), "coherent": (1, side, side), "noncoherent": (1, side, side)}
+        chunks = {"image": (1, 1, side, side)} | dict.fromkeys(
+            ("coherent", "noncoherent", "magnitude"), (1, side, side)
+        )
         create(wip, empty, chunks)
         arrays = {name: open_array(wip, name) for name in chunks}
         for place, flight in enumerate(flights):
             present = [images[f"{flight.name}/{pair}"] for pair in flight.pairs]
             peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present])
+            phases_rad = fusion[flight.name]["phases_rad"]
+            added = np.array([pair in phases_rad for pair in flight.pairs])
+            turned = np.array([phases_rad[pair] for pair in flight.pairs if pair in phases_rad])
             for window in windows:
                 stack = np.stack([image.image[window].values for image in present])
                 for pair, block in zip(flight.pairs, stack, strict=True):
                     arrays["image"][place, pairs.index(pair), *window] = block
-                arrays["coherent"][place, *window] = coherent_sum(stack, peaks)
+                arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
                 arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
+                arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
         finish(wip, folder)
     return folder
 
 
-def _empty(images: Mapping[str, xr.Dataset], flights: Sequence[str], pairs: Sequence[str]) -> xr.Dataset:
+def _empty(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any], pairs: Sequence[str]) -> xr.Dataset:
     first = next(iter(images.values()))
     shape = first.image.shape
+    flights = list(fusion)
     missing = np.complex64(np.nan + 1j * np.nan)
     return xr.Dataset(
         {
             "image": (("flight", "pair", "y", "x"), np.broadcast_to(missing, (len(flights), len(pairs), *shape))),
             "coherent": (("flight", "y", "x"), np.broadcast_to(np.complex64(0), (len(flights), *shape))),
             "noncoherent": (("flight", "y", "x"), np.broadcast_to(np.float32(0), (len(flights), *shape))),
+            "magnitude": (("flight", "y", "x"), np.broadcast_to(np.float32(0), (len(flights), *shape))),
         },
         coords={"y": first.y, "x": first.x, "spatial_ref": first.spatial_ref},
-        attrs={"flights": flights, "pairs": pairs},
+        attrs={"flights": flights, "pairs": pairs, "fusion": fusion},
     )

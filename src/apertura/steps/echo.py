@@ -107,7 +107,7 @@ def _transfer(
         symbol_samples=symbol_samples(waveform),
         sidelink_m=length_m,
         method=processing.sidelink,
-        accuracy_db=processing.accuracy_db,
+        accuracy_db=processing.asked_db,
         where=str(rx.files),
     )
     return measured, length_m[measured.kept]

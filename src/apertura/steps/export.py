@@ -1,19 +1,22 @@
-"""Rules `export` and `export_fused`: rasters and pictures of one image, or of what a flight's images add up to."""
+"""Rules `export` and `export_fused`: rasters, pictures and report of one image, or of the sums of a flight's images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 from rasterio import Affine
 
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.export import export_modules, write_exports
+from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256
-from apertura.quality.fused import Amplitude, coherence_of_images
+from apertura.quality.bright_points import BrightPoint
+from apertura.quality.fused import Amplitude, coherence_between
 from apertura.quality.measures import Raster, survey
 from apertura.quality.point_targets import find_peak
 from apertura.scene.grid import SceneGrid
@@ -21,19 +24,30 @@ from apertura.store import open_stage
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
-    """Write the products of one pair, or of 'fused'; return their paths."""
+    """Write the products of one pair, or of 'fused', and image.json; return their paths."""
     if pair == "fused":
         return export_fused(campaign, flight)
     image = open_stage(campaign.stage("image", flight, pair), "image")
-    origin = Provenance.of([__name__, *export_modules("pair")], [image])
-    return write_exports(
+    assessed = assessment_of(campaign, flight)
+    agreed, quality = assessed["pairs"][pair], image.attrs["quality"]
+    report = quality | {
+        "reference": assessed["reference"],
+        "agreement": agreed["agreement"],
+        "hypotheses": agreed["hypotheses"],
+        "flags": {**image.attrs["flags"], **agreed["flags"]},
+    }
+    origin = _with_code(Provenance.of([__name__, *export_modules("pair")], [image]), assessed)
+    folder = campaign.results / flight / pair
+    written = write_exports(
         "pair",
-        campaign.results / flight / pair,
+        folder,
         {"image": image.image},
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=origin.tags() | _quality_tags(image.attrs["quality"], image.attrs["flags"]),
+        tags=origin.tags() | _quality_tags(report),
         **_georeference(settled_scene(campaign).grid),
     )
+    write_json(folder / "image.json", {"flight": flight, "pair": pair, **report})
+    return [*written, folder / "image.json"]
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
@@ -41,68 +55,90 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     cube = open_stage(campaign.stage("cube"), "cube")
     index = cube.attrs["flights"].index(flight)
     sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
-    pairs = campaign.flight(flight).pairs
+    pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    quality, name = _worst(list(images.values())), f"{campaign.settings.campaign} · flight {flight}"
-    titles = {"coherent": "coherent sum", "noncoherent": "non-coherent sum"}
     folder, grid = campaign.results / flight / "fused", settled_scene(campaign).grid
+    report = {
+        **_worst(list(images.values()), assessed["fusion"]),
+        **_measures(grid, campaign.settings.processing.tile_px, sums),
+        "fusion": assessed["fusion"],
+        "coherence": _coherence(grid, images, assessed),
+        "flags": _flags(
+            {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()}
+        ),
+    }
+    name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
+    titles = {
+        "coherent": f"coherent sum of {' + '.join(coherently)}",
+        "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
+        "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
+    }
     written = write_exports(
         "fused",
         folder,
-        sums,
-        titles={source: f"{name} · {words} of {' + '.join(pairs)}" for source, words in titles.items()},
-        tags=_fused_provenance(cube, images).tags() | _quality_tags(quality, _flags(images)),
+        {**sums, "magnitude": cube.magnitude[index]},
+        titles={source: f"{name} · {words}" for source, words in titles.items()},
+        tags=_fused_provenance(cube, images, assessed).tags() | _quality_tags(report),
         **_georeference(grid),
     )
-    report = folder / "image.json"
-    found = _measures(grid, campaign.settings.processing.tile_px, sums, images)
-    write_json(report, {"flight": flight, "pairs": list(pairs), **quality, **found})
-    return [*written, report]
+    write_json(folder / "image.json", {"flight": flight, "pairs": list(pairs), **report})
+    return [*written, folder / "image.json"]
 
 
 def _georeference(grid: SceneGrid) -> dict[str, Any]:
     return {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
 
 
-def _fused_provenance(cube: xr.Dataset, images: Mapping[str, xr.Dataset]) -> Provenance:
+def _with_code(origin: Provenance, assessed: Mapping[str, Any]) -> Provenance:
+    """Return where a file comes from, with the code that assessed its flight."""
+    return replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
+
+
+def _fused_provenance(cube: xr.Dataset, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]) -> Provenance:
     """Return settings and inputs of the flight's own pairs, each apart, and the code that made the cube and its files.
 
     The cube stands on every flight; a file of one flight does not.
     """
     modules = [__name__, *export_modules("fused")]
-    code = chained_sha256(code_sha256(*modules), [cube.attrs["code_sha256"]])
-    return replace(Provenance.of(modules, images), code_sha256=code)
+    origin = Provenance.of(modules, images, settings={"fusion": assessed["fusion"]})
+    return replace(origin, code_sha256=chained_sha256(code_sha256(*modules), [cube.attrs["code_sha256"]]))
 
 
-def _measures(
-    grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster], images: Mapping[str, xr.Dataset]
-) -> dict[str, Any]:
-    """Return what the pixels of the sums tell, and the flags of the images."""
+def _measures(grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster]) -> dict[str, Any]:
+    """Return what the pixels of the sums tell."""
     windows = list(grid.tiles(tile_px))
     surveys = {source: survey(layer, windows) for source, layer in sums.items()}
     top = surveys["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
-    amplitudes = [image.attrs["quality"]["brightest"]["amplitude"] for image in images.values()]
-    coherence = coherence_of_images([image.image for image in images.values()], amplitudes, (top.row, top.column), peak)
     return {
         "entropy": {source: round(one.entropy, 6) for source, one in surveys.items()},
         "noise_floor_db": top.noise_floor_db,
-        "brightest": {
-            "x_m": round(x, 4),
-            "y_m": round(y, 4),
-            "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence,
-        },
-        "flags": _flags(images),
+        "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},
     }
 
 
-def _flags(images: Mapping[str, xr.Dataset]) -> dict[str, str]:
+def _coherence(
+    grid: SceneGrid, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]
+) -> dict[str, float | int | None]:
+    """Return the coherence of the pairs that were added with their phases, at the reference's bright points."""
+    added = assessed["fusion"]["phases_rad"]
+    points = images[assessed["reference"]].attrs["quality"]["focus"]["points"]
+    chance = {"chance": round(1 / len(added), 4), "points": len(points)}
+    if len(added) < 2 or not points:
+        return {"mean": None, **chance}
+    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
+    places = [BrightPoint(float(row), float(column), 1.0) for row, column in zip(rows, columns, strict=True)]
+    turned = np.array(list(added.values()))
+    found = coherence_between([images[pair].image for pair in added], turned, places)
+    return {"mean": round(found, 4), **chance}
+
+
+def _flags(of_pairs: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
     """Return the flags of all pairs; where pairs say different things of one flag, each with its name."""
     raised: dict[str, dict[str, str]] = {}
-    for pair, image in images.items():
-        for flag, line in image.attrs["flags"].items():
+    for pair, flags in of_pairs.items():
+        for flag, line in flags.items():
             raised.setdefault(flag, {})[pair] = line
     return {
         flag: next(iter(lines.values()))
@@ -112,13 +148,14 @@ def _flags(images: Mapping[str, xr.Dataset]) -> dict[str, str]:
     }
 
 
-def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
+def _worst(images: Sequence[xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the errors and models of some images say of their sum."""
     qualities = [image.attrs["quality"] for image in images]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
+    left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
     return {
         "models": {
-            "fusion": "mean of the peak-normalised images, with and without phase",
+            "fusion": f"mean of the peak-normalised images, with and without phase{left_out}",
             "numerical_error": "that of the worst pair",
         },
         "numerical_error_db": worst["numerical_error_db"],
@@ -128,12 +165,13 @@ def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
     }
 
 
-def _quality_tags(quality: Mapping[str, Any], flags: Mapping[str, str]) -> dict[str, str]:
+def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
+    told = {name: report[name] for name in ("budget", "focus", "fusion", "redone") if report.get(name)}
     return {
-        "APERTURA_ERROR_DB": f"{quality['numerical_error_db']:.2f}",
-        "APERTURA_ERROR_STD_DB": f"{quality['numerical_error_std_db']:.2f}",
-        "APERTURA_PEAK_ERROR_DB": f"{quality['peak_error_db']:.2f}",
-        "APERTURA_FLAGS": canonical_json(flags),
-        "APERTURA_MODELS": canonical_json(quality["models"]),
-        **({"APERTURA_REDONE": canonical_json(quality["redone"])} if quality["redone"] else {}),
+        "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
+        "APERTURA_ERROR_STD_DB": f"{report['numerical_error_std_db']:.2f}",
+        "APERTURA_PEAK_ERROR_DB": f"{report['peak_error_db']:.2f}",
+        "APERTURA_FLAGS": canonical_json(report["flags"]),
+        "APERTURA_MODELS": canonical_json(report["models"]),
+        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in told.items()},
     }

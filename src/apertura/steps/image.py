@@ -13,13 +13,16 @@ from apertura.contracts import Window
 from apertura.focus.engines import ENGINES
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.certify import certified, measures
+from apertura.imaging.focus_check import focus_flags, focus_report
 from apertura.imaging.formation import Formation
 from apertura.imaging.stages import profiles_of
 from apertura.load.antennas import antennas_report
-from apertura.load.pair import open_pair
+from apertura.load.budget import arithmetic_line, budget_of
+from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import sha256_file
+from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
 from apertura.store import finish, open_array, open_stage, resume, sharing, writing
 
@@ -27,7 +30,7 @@ _QUOTED = ("pulses", "sidelink", "clock", "calibration")
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
-    """Write results/<flight>/<pair>/image.zarr and image.json.
+    """Write results/<flight>/<pair>/image.zarr.
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
@@ -37,19 +40,23 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         missing = resume(wip, work.empty, "image", work.formation.windows)
         target = open_array(wip, "image")
         work.compute(missing, target)
-        accuracy_db = campaign.settings.processing.accuracy_db
+        budget = budget_of(campaign, work.pair, work.scene)
         quality = {
             "engine": plan.engine,
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
-            **certified(work.formation, target, accuracy_db=accuracy_db, threads=threads),
+            **certified(work.formation, target, accuracy_db=plan.accuracy_db, threads=threads),
             **measures(work.formation, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
         }
-        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"]}
-        write_json(folder.with_name("image.json"), {"flight": flight, "pair": pair, **quality})
+        lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
+        focus = focus_report(work.formation, target)
+        quality |= {"focus": focus, "budget": [line.report for line in lines]}
+        expected_db = expected(lines).loss_db
+        focus["expected_db"] = round(expected_db, 3)
+        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"], **focus_flags(focus, expected_db)}
         finish(wip, folder, quality=quality, flags=quality["flags"])
     return folder
 
@@ -92,6 +99,7 @@ class _Work:
 
     folder: Path
     echo: xr.Dataset
+    pair: OpenPair
     scene: OpenScene
     formation: Formation
     empty: xr.Dataset
@@ -127,4 +135,4 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
     )
-    return _Work(campaign.stage("image", flight, pair), echo, scene, formation, empty, threads)
+    return _Work(campaign.stage("image", flight, pair), echo, opened, scene, formation, empty, threads)

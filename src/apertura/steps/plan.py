@@ -5,10 +5,13 @@ from typing import TYPE_CHECKING
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
-from apertura.load.pair import open_pair
+from apertura.load.budget import budget_of
+from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
-from apertura.load.scene import expected_scene
+from apertura.load.scene import OpenScene, expected_scene
 from apertura.planning.plan import Plan
+from apertura.quality.budget import BudgetLine, expected
+from apertura.quality.path_errors import Effect
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -16,8 +19,12 @@ if TYPE_CHECKING:
 
 def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
     """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran."""
+    return plan_pair(campaign, *_opened(campaign, flight, pair), threads=threads)
+
+
+def _opened(campaign: Campaign, flight: str, pair: str) -> tuple[OpenPair, OpenScene]:
     opened = open_pair(campaign, flight, pair)
-    return plan_pair(campaign, opened, expected_scene(campaign, opened.flown), threads=threads)
+    return opened, expected_scene(campaign, opened.flown)
 
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
@@ -29,8 +36,9 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     seconds, disk = 0.0, 0
     for flight in campaign.image_flights:
         for pair in flight.pairs:
-            plan = expected_plan(campaign, flight.name, pair, threads=threads)
-            console.print(_table(plan, f"{flight.name}/{pair}", campaign.settings.processing.accuracy_db))
+            opened = _opened(campaign, flight.name, pair)
+            plan = plan_pair(campaign, *opened, threads=threads)
+            console.print(_table(plan, f"{flight.name}/{pair}"), _budget_table(budget_of(campaign, *opened)))
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
@@ -47,7 +55,7 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         )
 
 
-def _table(plan: Plan, title: str, accuracy_db: float) -> "Table":
+def _table(plan: Plan, title: str) -> "Table":
     from rich.filesize import decimal
     from rich.table import Table
 
@@ -60,5 +68,23 @@ def _table(plan: Plan, title: str, accuracy_db: float) -> "Table":
     table.add_section()
     memory, disk = decimal(plan.memory_bytes), decimal(plan.disk_bytes)
     line = f"about {plan.predicted_seconds:.2g} s, {memory} of memory, {disk} on disk"
-    table.add_row("predicted", f"{accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
+    table.add_row("predicted", f"{plan.accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
     return table
+
+
+def _budget_table(lines: list[BudgetLine]) -> "Table":
+    from rich.table import Table
+
+    table = Table(title="error budget", title_justify="left")
+    for heading in ("cause", "stated", "loss of peak", "shift", "phase"):
+        table.add_column(heading, overflow="fold")
+    for line in lines:
+        report = line.report
+        table.add_row(report["cause"], report["stated"], *_effect(line.effect))
+    table.add_section()
+    table.add_row("all that is stated", "", *_effect(expected(lines)))
+    return table
+
+
+def _effect(effect: Effect) -> tuple[str, str, str]:
+    return f"{effect.loss_db:.2f} dB", f"{100 * effect.shift_m:.2g} cm", f"{effect.phase_rad:.2g} rad"

@@ -127,18 +127,17 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
 
 
 def _quality(campaign: Campaign) -> Table:
-    table = Table(
-        title="coherence at the brightest target, numerical error against the reference", title_justify="left"
-    )
-    for heading in ("flight", "image", "coherence factor", "numerical error", "pulses used", "dropped", "flags"):
+    table = Table(title="what each image says of itself", title_justify="left")
+    for heading in ("flight", "image", "focus", "coherence of pairs", "numerical error", "pulses", "dropped", "flags"):
         table.add_column(heading)
     for flight in campaign.image_flights:
         for name in (*flight.pairs, "fused"):
             report = json.loads((campaign.results / flight.name / name / "image.json").read_text(encoding="utf-8"))
-            coherence, pulses = report["brightest"].get("coherence_factor"), report.get("pulses", {})
+            pulses, coherence = report.get("pulses", {}), report.get("coherence", {}).get("mean")
             table.add_row(
                 flight.name,
                 name,
+                report.get("focus", {}).get("verdict", ""),
                 "" if coherence is None else f"{coherence:.4f}",
                 f"{report['numerical_error_db']:.1f} dB",
                 str(pulses.get("used", "")),

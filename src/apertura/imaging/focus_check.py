@@ -1,0 +1,94 @@
+"""How well an image is focused, measured on itself: bright points, and how much of a usual pixel is noise."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.imaging.formation import Formation
+from apertura.quality.bright_points import BrightPoint, bright_points
+from apertura.quality.focus import Focus, PointFocus, even_odd_snr_db, judge, point_focus
+
+APART_CELLS = 6.0
+"""Bright points stand so many resolution cells apart."""
+
+_USUAL_PIXELS = 48
+_CELL_POINTS = 5
+
+
+def resolution_cell_m(formation: Formation) -> float:
+    """Return the finest resolution cell of the image's scene, metres."""
+    profiles, grid = formation.profiles, formation.grid
+    half = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
+    pixels = grid.sample_pixels(_CELL_POINTS)
+    band = profiles.centre_frequency_hz - half, profiles.centre_frequency_hz + half
+    return profiles.aperture.resolution_cell_m(formation.positions_at(*pixels), band_hz=band)
+
+
+def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
+    """Return what image.json says of the focus: verdict, loss, and each bright point.
+
+    Parameters
+    ----------
+    formation
+        What forms the image; it must hold a phase history.
+    target
+        (y, x) complex64, the image where it was written.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md.
+    """
+    cell_m, grid = resolution_cell_m(formation), formation.grid
+    apart_px = max(8, int(np.ceil(APART_CELLS * cell_m / grid.spacing_m)))
+    points = bright_points(target, formation.windows, apart_px=apart_px)
+    terms = formation.contributions([point.row for point in points], [point.column for point in points])
+    measured = [_focus_of(column) for column in terms.T]
+    verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
+    return {
+        **_verdict_report(verdict),
+        "cell_m": round(cell_m, 4),
+        "even_odd_snr_db": round(_usual_snr_db(formation), 2),
+        "points": [
+            _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus
+        ],
+    }
+
+
+def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
+    """Return the flag `defocused` where the bright points say so."""
+    if report["verdict"] != "defocused":
+        return {}
+    return {
+        "defocused": f"{report['why']}; {-expected_db:.1f} dB expected of the errors that are stated: "
+        "positions, lever arms, heights or times are worse than that"
+    }
+
+
+def _focus_of(terms: NDArray[np.complex128]) -> PointFocus | None:
+    return point_focus(terms[terms != 0])
+
+
+def _usual_snr_db(formation: Formation) -> float:
+    """Return the SNR of a usual pixel: the median over some random ones, by even and odd pulses."""
+    rows, columns = np.random.default_rng(0).integers(0, formation.grid.shape, (_USUAL_PIXELS, 2)).T
+    return float(np.median([even_odd_snr_db(column) for column in formation.contributions(rows, columns).T]))
+
+
+def _verdict_report(verdict: Focus) -> dict[str, Any]:
+    measured = {} if verdict.points == 0 else {"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)}
+    return {"verdict": verdict.verdict, **measured, "why": verdict.why}
+
+
+def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -> dict[str, float]:
+    x, y = map(float, formation.grid.map_at(point.row, point.column))
+    return {
+        "x_m": round(x, 4),
+        "y_m": round(y, 4),
+        "amplitude": float(f"{point.amplitude:.6g}"),
+        "loss_db": round(focus.loss_db, 3),
+        "interference": round(focus.interference, 5),
+        "pulses": focus.pulses,
+        "snr_db": round(focus.snr_db, 2),
+    }

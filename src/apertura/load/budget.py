@@ -1,0 +1,123 @@
+"""The error budget of a pair: what the config, the logs and the echo say of each cause, before and after imaging."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.compression import centre_frequency
+from apertura.load.pair import OpenPair
+from apertura.load.scene import OpenScene
+from apertura.quality.budget import BudgetLine, noise_loss, offset_line, position_line
+from apertura.quality.path_errors import Effect, PointPaths
+from apertura.scene.grid import SceneGrid
+from apertura.settings import OfdmWaveform
+
+_MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
+
+
+def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[BudgetLine]:
+    """Return what is expected to spoil an image of a pair, but for arithmetic: one line per cause.
+
+    Parameters
+    ----------
+    campaign, pair, scene
+        What is known; before the echo is formed, what the config and the logs say.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Budget". The effects are those on a point in the middle of the scene.
+    """
+    paths = _paths(pair, scene)
+    monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
+    lines = [
+        position_line(
+            paths, pair.positions, sidelink=not monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
+        ),
+        offset_line(
+            paths, "heights", -paths.gradient[:, 2], campaign.settings.scene.height_std_m, unit="m", common=True
+        ),
+        offset_line(
+            paths,
+            "time tags",
+            -_MS * paths.rate_m_s,
+            _scaled(pair.report, "time_tags", "std_s", _MS),
+            unit="ms",
+            common=True,
+        ),
+        offset_line(
+            paths,
+            "calibration",
+            np.full(len(paths.time_s), _CM),
+            _scaled(pair.report, "calibration", "std_m", _CM),
+            unit="cm of path",
+        ),
+        _sampling(pair.report.get("pulses", {})),
+    ]
+    if not monostatic:
+        total = paths.aperture.path(paths.point_m)
+        lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
+        if "snr_db" in sidelink:
+            lines += _sidelink(sidelink, subcarriers=len(pair.frequency_hz))
+    if isinstance(campaign.settings.waveform, OfdmWaveform):
+        lasting_s = campaign.settings.waveform.cyclic_prefix_s + campaign.settings.waveform.symbol_s / 2
+        effect = paths.of_offset(lasting_s * paths.rate_m_s)
+        lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
+    return lines
+
+
+def arithmetic_line(error_db: float) -> BudgetLine:
+    """Return what the numerical error measured costs."""
+    return BudgetLine(
+        "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
+    )
+
+
+def _paths(pair: OpenPair, scene: OpenScene) -> PointPaths:
+    grid = scene.grid
+    row, column = (size // 2 for size in grid.shape)
+    height_m = float(scene.terrain.heights_at(grid, row, column))
+    return PointPaths.of(
+        pair.aperture,
+        pair.time_s,
+        point_m=grid.positions_at(row, column, height_m),
+        axes=_axes(grid, row, column, height_m),
+        wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
+    )
+
+
+def _axes(grid: SceneGrid, row: int, column: int, height_m: float) -> NDArray[np.float64]:
+    """Return unit vectors along the grid's easting, northing and height in the frame of the pixels."""
+    here = grid.positions_at(row, column, height_m)
+    steps = [
+        grid.positions_at(row, column + 1, height_m) - here,
+        grid.positions_at(row - 1, column, height_m) - here,
+        grid.positions_at(row, column, height_m + 1) - here,
+    ]
+    return np.array([step / np.linalg.norm(step) for step in steps])
+
+
+def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
+    value = (report.get(section) or {}).get(name)
+    return None if value is None else float(value) / unit
+
+
+def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
+    used, dropped = pulses.get("used"), pulses.get("dropped", 0)
+    stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
+    return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
+
+
+def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:
+    """Return noise of the sidelink as phase noise of each pulse, and what an echo in it turns the phase by at most."""
+    noise = noise_loss(10 ** (-report["snr_db"] / 10) / (2 * subcarriers))
+    echo = 10 ** (report["echo_db"] / 20)
+    return [
+        BudgetLine("sidelink noise", f"{report['snr_db']:.1f} dB per subcarrier", noise),
+        BudgetLine(
+            "sidelink echo", f"at most {report['echo_db']:.1f} dB", Effect(0.0, 0.0, float(np.arcsin(min(1.0, echo))))
+        ),
+    ]

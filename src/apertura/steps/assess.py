@@ -1,0 +1,126 @@
+"""Rule `assess`: what the images of one flight say of each other, and which of them may be added up."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from apertura.atomic import write_json
+from apertura.campaign import Campaign
+from apertura.fusion.choice import choose_fusion
+from apertura.load.scene import settled_scene
+from apertura.provenance import chained_sha256, code_sha256
+from apertura.quality.agreement import Agreement, agreement
+from apertura.quality.bright_points import BrightPoint
+from apertura.scene.grid import SceneGrid
+from apertura.store import open_stage
+
+_SURE_SNR_DB = 20.0
+"""A bright point this far above the noise should show in every image of the scene."""
+
+
+def assess(campaign: Campaign, flight: str) -> Path:
+    """Write results/<flight>/assessment.json: how the pairs agree, what to look at, what the coherent sum holds."""
+    pairs, grid = campaign.flight(flight).pairs, settled_scene(campaign).grid
+    images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
+    quality = {pair: image.attrs["quality"] for pair, image in images.items()}
+    reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
+    found = {pair: _agreement(images, reference, pair, grid) for pair in pairs if pair != reference}
+    cells = {pair: max(quality[name]["focus"]["cell_m"] for name in (reference, pair)) for pair in found}
+    unconfirmed = {pair for pair, one in found.items() if one is None and _sure(quality[reference]["focus"])}
+    fusion = choose_fusion(
+        reference, found, unconfirmed=unconfirmed, align=campaign.settings.processing.fusion.align_phase
+    )
+    flags: dict[str, dict[str, str]] = {pair: {} for pair in pairs}
+    for pair, one in found.items():
+        raised = _disagreement(one, cells[pair], (reference, pair), sure=pair in unconfirmed)
+        for side in (pair, reference):
+            flags[side] |= {
+                name: "; ".join([*flags[side].get(name, "").split("; "), line]).strip("; ")
+                for name, line in raised.items()
+            }
+    for pair, name, line in _wrong_codes(quality):
+        flags[pair][name] = line
+    report = {
+        "flight": flight,
+        "reference": reference,
+        "pairs": {
+            pair: {"agreement": _report(found.get(pair)), "hypotheses": [], "flags": flags[pair]} for pair in pairs
+        },
+        "fusion": fusion.report,
+        "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
+    }
+    path = campaign.root / campaign.assessment_file(flight)
+    write_json(path, report)
+    return path
+
+
+def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
+    """Return how little a pair's focus is to be trusted."""
+    return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
+
+
+def _points(quality: Mapping[str, Any], grid: SceneGrid) -> list[BrightPoint]:
+    points = quality["focus"]["points"]
+    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
+    return [
+        BrightPoint(float(row), float(column), point["amplitude"])
+        for row, column, point in zip(rows, columns, points, strict=True)
+    ]
+
+
+def _agreement(images: Mapping[str, xr.Dataset], reference: str, pair: str, grid: SceneGrid) -> Agreement | None:
+    two = [images[name] for name in (reference, pair)]
+    qualities = [image.attrs["quality"] for image in two]
+    points = [_points(quality, grid) for quality in qualities]
+    return agreement(
+        (two[0].image, two[1].image),
+        (points[0], points[1]),
+        spacing_m=grid.spacing_m,
+        cell_m=max(quality["focus"]["cell_m"] for quality in qualities),
+    )
+
+
+def _sure(focus: Mapping[str, Any]) -> bool:
+    return any(point["snr_db"] > _SURE_SNR_DB for point in focus["points"])
+
+
+def _disagreement(one: Agreement | None, cell_m: float, pairs: tuple[str, str], *, sure: bool) -> dict[str, str]:
+    """Return flags of the reference and another pair: which of them is wrong, their images alone cannot tell."""
+    reference, pair = pairs
+    if one is None:
+        line = f"{pair} shows none of the bright points of {reference}: its echo is too weak, or one of them is wrong"
+        return {"pair_unconfirmed": line} if sure else {}
+    raised = {}
+    if one.shifted(cell_m):
+        raised["pairs_apart"] = (
+            f"{one.points} bright points of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from "
+            f"where {reference} has them, {100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm "
+            "north: positions, lever arms, path offsets or heights of one are wrong"
+        )
+    if one.out_of_phase:
+        raised["pairs_out_of_phase"] = (
+            f"{pair} is {one.phase_rad:+.2f} ± {one.phase_std_rad:.2f} rad from {reference} at {one.points} bright "
+            "points: path offsets or positions of one are wrong by a fraction of the wavelength"
+        )
+    return raised
+
+
+def _wrong_codes(quality: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return pair, flag and line for each pair of a transmitter whose sidelink carries another code."""
+    evidence = {
+        pair.split("-")[0]: (pair, one["code"]["evidence"])
+        for pair, one in quality.items()
+        if one.get("code", {}).get("carried") is False
+    }
+    return [
+        (pair, "wrong_code", f"{evidence[tx][1]} (seen by {evidence[tx][0]})")
+        for pair, tx in ((pair, pair.split("-")[0]) for pair in quality)
+        if tx in evidence
+    ]
+
+
+def _report(one: Agreement | None) -> dict[str, float] | None:
+    return None if one is None else {name: float(f"{value:.4g}") for name, value in asdict(one).items()}

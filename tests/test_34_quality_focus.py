@@ -1,0 +1,174 @@
+"""An image knows whether it is focused: bright points, path errors, the error budget, pairs against each other."""
+
+import numpy as np
+import pytest
+
+from apertura.geometry.aperture import Aperture
+from apertura.quality.agreement import agreement
+from apertura.quality.bright_points import BrightPoint, bright_points, common_shift
+from apertura.quality.budget import BudgetLine, NodePositions, accuracy_for, expected, position_line
+from apertura.quality.focus import judge, point_focus
+from apertura.quality.path_errors import Effect, PointPaths
+
+PULSES, WAVELENGTH_M = 600, 0.214
+
+
+def moving_average_noise(generator, count, width):
+    """White noise after a moving average, standard deviation 1."""
+    return np.convolve(generator.standard_normal(count + width - 1), np.ones(width) / np.sqrt(width), "valid")
+
+
+def complex_noise(generator, count):
+    return (generator.standard_normal(count) + 1j * generator.standard_normal(count)) / np.sqrt(2)
+
+
+def straight(length_m=30.0, *, apart_m=0.0):
+    along = np.linspace(-length_m / 2, length_m / 2, PULSES)
+    track = np.stack([along, np.full(PULSES, -12.0), np.full(PULSES, 8.0)], -1)
+    ahead = np.array([apart_m, 0, 0])
+    return PointPaths.of(
+        Aperture(track - ahead / 2, track + ahead / 2),
+        np.linspace(0, 30, PULSES),
+        point_m=np.zeros(3),
+        axes=np.eye(3),
+        wavelength_m=WAVELENGTH_M,
+    )
+
+
+@pytest.mark.parametrize("noise_db", [-30.0, -10.0, -5.0])
+@pytest.mark.parametrize("rms_rad", [0.0, 0.5, 1.0])
+def test_a_phase_error_is_measured_whatever_noise_and_neighbours_add(noise_db, rms_rad):
+    generator = np.random.default_rng(1)
+    phase = rms_rad * moving_average_noise(generator, PULSES, 60)
+    taper = np.linspace(0.6, 1.0, PULSES)
+    contributions = taper * np.exp(1j * phase)
+    along = np.fft.fft(contributions, 8 * PULSES)
+    true_db = 20 * np.log10(np.abs(along).max() / taper.sum())
+    neighbour = 0.2 * np.exp(2j * np.pi * 47.3 * np.arange(PULSES) / PULSES)
+    focus = point_focus(contributions + neighbour + 10 ** (noise_db / 20) * complex_noise(generator, PULSES))
+    assert focus.loss_db == pytest.approx(true_db, abs=0.15 + 0.05 * abs(true_db))
+
+
+def test_noise_and_speckle_are_no_evidence():
+    generator = np.random.default_rng(2)
+    assert not any(point_focus(complex_noise(generator, 512)) for _ in range(200))
+    scatterers = np.exp(2j * np.pi * np.outer(generator.uniform(-100, 100, 40), np.arange(512) / 512))
+    assert point_focus((scatterers * complex_noise(generator, 40)[:, None]).sum(axis=0)) is None
+
+
+def test_the_snr_of_a_point_is_told_by_its_even_and_odd_pulses():
+    generator = np.random.default_rng(3)
+    focus = point_focus(1 + 0.1 * complex_noise(generator, 4096))
+    assert focus.snr_db == pytest.approx(20 + 10 * np.log10(4096), abs=0.5)
+
+
+def test_one_point_among_sidelobes_does_not_decide():
+    generator = np.random.default_rng(4)
+    sharp = point_focus(np.ones(200, complex))
+    blurred = point_focus(np.exp(2j * moving_average_noise(generator, 200, 20)))
+    assert judge([(1.0, sharp), (0.9, sharp), (0.3, blurred)]).verdict == "focused"
+    assert judge([(1.0, blurred), (0.9, blurred), (0.3, sharp)]).verdict == "defocused"
+
+
+@pytest.mark.parametrize("std_cm", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("apart_m", [0.0, 4.7])
+def test_the_loss_by_random_errors_is_what_draws_give(std_cm, apart_m):
+    """Mean over 60 draws of both nodes' tracks, best peak within a few cells; within 15 % in dB."""
+    paths, generator = straight(apart_m=apart_m), np.random.default_rng(5)
+    same = apart_m == 0
+    slopes = paths.by_node(same=same, sidelink=not same)
+    count, step = len(paths.time_s), 30 / (len(paths.time_s) - 1)
+    losses = []
+    for _ in range(60):
+        error = np.zeros(count)
+        for slope in slopes:
+            drawn = np.stack([moving_average_noise(generator, count, round(1 / step)) for _ in range(3)], -1)
+            error += (slope * 0.01 * std_cm * drawn).sum(axis=1)
+        along = np.abs(np.fft.fft(np.exp(2j * np.pi / WAVELENGTH_M * error), 8 * count)) / count
+        losses.append(20 * np.log10(np.r_[along[:24], along[-24:]].max()))
+    nodes = [NodePositions((0.01 * std_cm,) * 3, 1.0, "test")] * len(slopes)
+    predicted = position_line(paths, nodes, sidelink=not same).effect.loss_db
+    assert predicted == pytest.approx(np.mean(losses), rel=0.15, abs=0.05)
+
+
+def test_errors_along_the_sidelink_cancel_for_a_target_on_its_line():
+    paths = straight(apart_m=4.7)
+    far = PointPaths(paths.aperture, paths.time_s, np.array([500.0, -12.0, 8.0]), paths.axes, WAVELENGTH_M)
+    by_tx, by_rx = far.by_node(same=False, sidelink=True)
+    np.testing.assert_allclose(by_tx[:, 0], 0.0, atol=1e-3)
+    np.testing.assert_allclose(by_rx[:, 0], -2.0, atol=1e-3)
+
+
+def test_a_raised_point_moves_and_hardly_blurs():
+    higher = straight().of_offset(-straight().gradient[:, 2], common=True)
+    assert higher.shift_m == pytest.approx(8 / 12, rel=0.1)
+    assert higher.loss_db > -0.5
+
+
+def test_a_constant_path_error_turns_the_phase_between_pairs():
+    paths = straight()
+    effect = paths.of_offset(np.full(len(paths.time_s), 0.05))
+    assert effect.phase_rad == pytest.approx(2 * np.pi * 0.05 / WAVELENGTH_M)
+
+
+def test_what_nobody_stated_is_not_summed_and_does_not_set_the_arithmetic():
+    silent = BudgetLine("heights", None, Effect(-3.0, 1.0, 0.0), "1 m")
+    stated = BudgetLine("positions", "1 cm", Effect(-0.0001, 0.02, 0.1))
+    assert expected([silent, stated]) == stated.effect
+    assert accuracy_for([silent]) == -60.0
+    assert accuracy_for([silent, stated]) == pytest.approx(-56.4, abs=0.1)
+    assert accuracy_for([BudgetLine("positions", "1 cm", Effect(-1.2, 0.1, 0.1))]) == -40.0
+
+
+def lobes(places, *, turned=0.0, carrier=1.1):
+    y, x = np.mgrid[:256, :256]
+    image = sum(np.sinc((y - row) / 4) * np.sinc((x - column) / 4) * amplitude for row, column, amplitude in places)
+    return (image * np.exp(1j * (carrier * y + turned))).astype(np.complex64)
+
+
+PLACES = [(60.0, 70.0, 1.0), (150.3, 90.2, 0.8), (200.7, 190.1, 0.5)]
+SHIFT_PX = (0.8, -0.6)
+
+
+@pytest.fixture
+def two_images():
+    moved = [(row + SHIFT_PX[0], column + SHIFT_PX[1], amplitude) for row, column, amplitude in PLACES]
+    images = lobes(PLACES), lobes(moved, turned=-1.2)
+    points = [bright_points(image, [(slice(0, 256), slice(0, 256))], apart_px=24) for image in images]
+    return images, [some[:3] for some in points]
+
+
+def test_place_and_phase_between_images_are_told_to_a_tenth_of_a_cell(two_images):
+    images, points = two_images
+    found = agreement(images, points, spacing_m=0.1, cell_m=0.4)
+    assert found.points == 3
+    assert (found.shift_east_m, found.shift_north_m) == pytest.approx((-0.06, -0.08), abs=0.004)
+    assert found.phase_rad == pytest.approx(-1.2, abs=0.05)
+    assert found.coherence > 0.99
+    assert found.shifted(0.4)
+    assert found.out_of_phase
+
+
+def test_an_image_agrees_with_itself(two_images):
+    images, points = two_images
+    found = agreement((images[0],) * 2, (points[0],) * 2, spacing_m=0.1, cell_m=0.4)
+    assert found.shift_m == 0
+    assert found.phase_rad == pytest.approx(0, abs=1e-12)
+    assert not found.shifted(0.4)
+    assert not found.out_of_phase
+
+
+def test_images_without_a_point_in_common_say_nothing(two_images):
+    images, points = two_images
+    far = [BrightPoint(points[0][0].row + 150, points[0][0].column + 150, 1.0)]
+    assert agreement(images, (points[0][:1], far), spacing_m=0.1, cell_m=0.4) is None
+    assert agreement(images, (points[0], []), spacing_m=0.1, cell_m=0.4) is None
+
+
+def test_the_shift_is_the_one_that_most_brightness_agrees_on():
+    generator = np.random.default_rng(6)
+    here = [(*generator.uniform(0, 50, 2), 1.0) for _ in range(6)]
+    there = [(x + 2.5, y - 1.5, amplitude) for x, y, amplitude in here] + [(*generator.uniform(0, 50, 2), 0.4)]
+    shift, met = common_shift(here, there, reach=4.0, gate=0.3)
+    assert shift == pytest.approx((2.5, -1.5))
+    assert met == [(number, number) for number in range(6)]
