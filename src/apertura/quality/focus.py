@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 LEAST_BLOCKS = 32
 """Parts of the aperture that a point must dominate."""
 
-MOST_INTERFERENCE = 0.1
+MOST_INTERFERENCE = 0.08
 """Variance of the logarithm of a point's amplitude over the aperture, above which it does not dominate its cell."""
 
 DEFOCUSED_DB = -1.0
@@ -75,7 +75,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
             unrest = _unrest(np.log(amplitude))
             if unrest <= MOST_INTERFERENCE:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
-                loss = (best / amplitude.sum()) ** 2 * np.exp(unrest)
+                loss = (best / amplitude.sum()) ** 2 * (1 + unrest * (1 - 2.5 * unrest) / 2) ** 2
                 return PointFocus(10 * float(np.log10(min(1.0, loss))), unrest, pulses, even_odd_snr_db(contributions))
         pulses *= 2
     return None

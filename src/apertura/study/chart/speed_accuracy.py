@@ -103,8 +103,8 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     write_table(paths[0], points, digits=6)
-    draw_points(points, paths[1], title=title, accuracy_db=processing.accuracy_db)
-    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.accuracy_db)
+    draw_points(points, paths[1], title=title, accuracy_db=processing.asked_db)
+    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.asked_db)
     return paths
 
 
