@@ -97,7 +97,9 @@ def _rows(folder: Path, base: str, names: list[str]) -> Iterator[Row]:
 def _judged(base: str, name: str, outcome: Outcome, right: Right, root: Path) -> Iterator[Row]:
     """Yield a row per image, or one for a campaign that ended in an error."""
     known = MISTAKES.get(name)
-    kind = {"control": known.control, "alike": known.alike, "cause": known.cause} if known else {"control": True}
+    kind = (
+        {"control": known.control, "alike": base in known.alike, "cause": known.cause} if known else {"control": True}
+    )
     if outcome.error:
         yield Row(base, name, "-", error=outcome.error, seconds=round(outcome.seconds, 2), **kind)
     for pair, report in outcome.reports.items():

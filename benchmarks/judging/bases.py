@@ -18,7 +18,6 @@ from apertura.simulation.impairments import TimeTag
 from judging.run import copy_writable
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "data"
-_PULSES, _RADIUS_M, _HEIGHT_M = 140, 11.5, 4.8
 
 
 def sample(target: Path) -> Path:
@@ -27,7 +26,7 @@ def sample(target: Path) -> Path:
 
 
 def curved(target: Path) -> Path:
-    """Simulate two nodes on an arc of 45° about five targets, one 4 m behind the other and 0.4 m higher."""
+    """Simulate two nodes on bows of 36° about five targets, one 4 m behind the other and 0.4 m higher."""
     return ap.simulate(target, curved_specification(), seed=9)
 
 
@@ -40,16 +39,20 @@ def curved_specification() -> CampaignSpecification:
         "uav1": replace(primary, impairments=Impairments(radar_snr_db=25.0)),
         "uav2": replace(secondary, impairments=replace(secondary.impairments, time_tag=tag, missed_fraction=0.0)),
     }
-    tracks = {"uav1": arc(-12.0, _HEIGHT_M), "uav2": arc(-32.0, _HEIGHT_M + 0.4)}
-    flight = SimulatedFlight("f01", "uav1", tracks, _PULSES)
-    return replace(demo, campaign="curved", nodes=nodes, flights=(flight,))
+    tracks = {"uav1": bow(-8.0, 4.8), "uav2": bow(-28.0, 5.2)}
+    return replace(demo, campaign="curved", nodes=nodes, flights=(SimulatedFlight("f01", "uav1", tracks, 140),))
 
 
-def arc(first_deg: float, up_m: float) -> Waypoints:
-    """Return a counter-clockwise flight of 45° in 7 s about the origin, from an angle; it begins 5 s earlier."""
+def bow(first_deg: float, up_m: float) -> Waypoints:
+    """Return 36° about the origin in 7 s as flown by hand: speed, distance and height change.
+
+    A time offset on an even circle only turns the image; here it bends what is straight.
+    """
     time_s = np.arange(-5.0, 12.5, 0.5)
-    angle = np.radians(first_deg + 6.4 * time_s)
-    position = np.column_stack([_RADIUS_M * np.cos(angle), _RADIUS_M * np.sin(angle), np.full(angle.size, up_m)])
+    turns = 2 * np.pi * time_s / 7.0
+    angle = np.radians(first_deg + 5.2 * time_s + 1.5 * np.sin(turns))
+    distance, up = 11.5 + 0.7 * np.cos(turns), up_m + 0.3 * np.sin(turns)
+    position = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), up])
     return Waypoints(tuple(time_s.tolist()), tuple(map(tuple, position.tolist())), wobble=Wobble())
 
 

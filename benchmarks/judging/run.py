@@ -50,9 +50,9 @@ class Outcome:
 
 
 def copy_writable(source: Path, target: Path) -> Path:
-    """Copy a folder, which may be read-only, to a new one that may be changed; return that."""
+    """Copy a campaign, which may be read-only, without its results to a new folder; return that."""
     shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source, target, copy_function=shutil.copyfile)
+    shutil.copytree(source, target, copy_function=shutil.copyfile, ignore=shutil.ignore_patterns("results"))
     for folder in (target, *(path for path in target.rglob("*") if path.is_dir())):
         folder.chmod(0o755)
     return target

@@ -91,14 +91,14 @@ class Mistake:
     control
         Nothing in it is wrong: the image must stay right, and a flag on it is a false alarm.
     alike
-        It moves everything alike: nothing inside the campaign can tell.
+        Bases in which it moves everything alike: nothing inside the campaign can tell.
     """
 
     words: str
     spoil: Spoil
     cause: str = ""
     control: bool = False
-    alike: bool = False
+    alike: tuple[str, ...] = ()
 
 
 CAUSES = ("time", "height", "arm", "channels", "tracks", "range", "prefix", "carrier_is", "attitude")

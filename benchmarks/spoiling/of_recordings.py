@@ -137,7 +137,9 @@ MISTAKES = {
     "channels_swapped": Mistake("radar and sidelink swapped", lambda f: f.edit_meta(RX, _swap_channels), "channels"),
     "tags_rx_late_0s5": Mistake("tags of the receiver 0.5 s late", tags(_constant(0.5), RX), "time"),
     "tags_tx_late_0s5": Mistake("tags of the transmitter 0.5 s late", tags(_constant(0.5), TX), "time"),
-    "tags_both_late_0s5": Mistake("tags of both nodes 0.5 s late", tags(_constant(0.5), TX, RX), "time"),
+    "tags_both_late_0s5": Mistake(
+        "tags of both nodes 0.5 s late", tags(_constant(0.5), TX, RX), "time", alike=("sample",)
+    ),
     "tags_1h": Mistake("tags in local time", tags(_constant(3600.0), TX, RX), "time"),
     "tags_rx_1ms": Mistake("tags of the receiver 1 ms late", tags(_constant(1e-3), RX)),
     "tags_rx_one_pulse": Mistake("tags of the receiver one interval late", tags(_constant(0.05), RX), "time"),
@@ -178,6 +180,5 @@ MISTAKES = {
     "iq_swapped": Mistake("I and Q of all swapped", samples(lambda s: 1j * s.conj(), TX, RX)),
     "rx_conjugated": Mistake("Q of the receiver with the wrong sign", samples(np.conj, RX)),
     "rx_both_negated": Mistake("both channels of the receiver negated", samples(np.negative, RX), control=True),
-    "rx_half_gain": Mistake("receiver records half the amplitude", samples(lambda s: s / 2, RX), control=True),
     "tx_big_endian": Mistake("transmitter's samples big-endian", lambda f: f.edit_captures(TX, lambda c: c.byteswap())),
 }  # fmt: skip
