@@ -158,5 +158,7 @@ MISTAKES = {
     "zone_33": Mistake("scene in the neighbouring zone", section("scene", crs="EPSG:32633")),
     "zone_south": Mistake("scene in the southern zone", section("scene", crs="EPSG:32732")),
     "scene_moved_1m": Mistake("scene cut 1 m further east", section("scene", bounds_m=_shift(1.0, 0.0)), control=True),
-    "scene_moved_100m": Mistake("scene 100 m further north", section("scene", bounds_m=_shift(0.0, 100.0))),
+    "scene_moved_100m": Mistake(
+        "scene 100 m further north", section("scene", bounds_m=_shift(0.0, 100.0)), alike=("sample", "curved")
+    ),
 }  # fmt: skip
