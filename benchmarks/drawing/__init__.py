@@ -1,0 +1,1 @@
+"""Right campaigns of every kind, drawn at random."""

@@ -1,0 +1,125 @@
+"""One campaign through every step in this process: what was said of each image, and its pixels."""
+
+import contextlib
+import io
+import json
+import shutil
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import import_module, util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.load.scene import settled_scene
+from apertura.scene.grid import SceneGrid
+from apertura.settings import Flight
+from apertura.steps import cube, echo, export, image, ingest, profile, scene, terrain
+from apertura.store import open_stage
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a campaign.
+
+    Attributes
+    ----------
+    error
+        First line of the error that ended it; empty: it came to its end.
+    reports
+        Image (a pair, or fused) → its image.json.
+    images
+        Image → (y, x) complex64.
+    grid
+        On which they lie.
+    seconds
+        Time from the folder to the last file.
+    """
+
+    error: str
+    seconds: float
+    reports: dict[str, dict[str, Any]] = field(default_factory=dict)
+    images: dict[str, NDArray[np.complex64]] = field(default_factory=dict)
+    grid: SceneGrid | None = None
+
+
+def copy_writable(source: Path, target: Path) -> Path:
+    """Copy a campaign, which may be read-only, without its results to a new folder; return that."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target, copy_function=shutil.copyfile, ignore=shutil.ignore_patterns("results"))
+    for folder in (target, *(path for path in target.rglob("*") if path.is_dir())):
+        folder.chmod(0o755)
+    return target
+
+
+def run_campaign(root: Path) -> Outcome:
+    """Carry a campaign folder of one image flight through every step; errors are part of the outcome."""
+    begun = time.perf_counter()
+    shutil.rmtree(root / "results", ignore_errors=True)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            campaign = Campaign.load(root)
+            flight = campaign.image_flights[0]
+            _steps(campaign, flight)
+    except CampaignError as error:
+        return Outcome(str(error).splitlines()[0].replace(f"{root}/", ""), time.perf_counter() - begun)
+    except Exception as error:  # a crash is a finding too, and the others must go on
+        text = f"crash: {type(error).__name__}: {error}"
+        return Outcome(text.splitlines()[0], time.perf_counter() - begun)
+    seconds = time.perf_counter() - begun
+    return Outcome("", seconds, _reports(campaign, flight), dict(_images(campaign, flight)), _grid(campaign))
+
+
+def _steps(campaign: Campaign, flight: Flight) -> None:
+    """Run what the rules of the workflow run, in their order."""
+    for node in flight.nodes:
+        ingest.ingest(campaign, flight.name, node)
+    for pair in flight.pairs:
+        echo.echo(campaign, flight.name, pair)
+    scene.scene(campaign)
+    if campaign.settings.scene.dem:
+        terrain.terrain(campaign)
+    for pair in flight.pairs:
+        profile.profile(campaign, flight.name, pair)
+        image.image(campaign, flight.name, pair, threads=1)
+    if util.find_spec("apertura.steps.assess"):
+        import_module("apertura.steps.assess").assess(campaign, flight.name)
+    cube.cube(campaign)
+    for pair in flight.pairs:
+        export.export(campaign, flight.name, pair)
+    export.export_fused(campaign, flight.name)
+
+
+def _grid(campaign: Campaign) -> SceneGrid:
+    return settled_scene(campaign).grid
+
+
+def _reports(campaign: Campaign, flight: Flight) -> dict[str, dict[str, Any]]:
+    folders = {name: campaign.results / flight.name / name for name in (*flight.pairs, "fused")}
+    return {name: json.loads((folder / "image.json").read_text(encoding="utf-8")) for name, folder in folders.items()}
+
+
+def _images(campaign: Campaign, flight: Flight) -> Iterator[tuple[str, NDArray[np.complex64]]]:
+    for pair in flight.pairs:
+        yield pair, open_stage(campaign.stage("image", flight.name, pair), "image").image.values
+    yield "fused", open_stage(campaign.stage("cube"), "cube").coherent[0].values
+
+
+def verdict_of(report: dict[str, Any]) -> str:
+    """Return what an image.json says of its focus, in one line; empty where it says nothing."""
+    found = report.get("verdict") or report.get("focus", {}).get("verdict", "")
+    return found if isinstance(found, str) else json.dumps(found)
+
+
+def hypothesis_of(report: dict[str, Any]) -> str:
+    """Return the first hypothesis of an image.json in one line; empty where there is none."""
+    found = report.get("hypotheses") or []
+    first = next(iter(found.items() if isinstance(found, dict) else found), "")
+    return first if isinstance(first, str) else json.dumps(first)
