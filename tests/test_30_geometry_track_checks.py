@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from apertura.geometry.phase_centres import position_spline
 from apertura.geometry.track_checks import check_track
 from apertura.geometry.track_faults import find_frozen, find_spikes, find_steps, misfits, rounded_time_m, scatter_m
 
@@ -131,7 +132,8 @@ def test_pulses_of_a_poor_fix_are_barred_however_short_it_is():
     poor[[0, 1, 100, 399]] = True
     holes = checked(time_s, place, poor=poor).holes
     assert {hole.cause for hole in holes} == {"fix_poor"}
-    assert sorted(hole[:2] for hole in holes) == pytest.approx([(-np.inf, 0.2), (9.9, 10.1), (39.8, np.inf)])
+    edges = np.array(sorted(hole[:2] for hole in holes))
+    np.testing.assert_allclose(edges, [(-np.inf, 0.2), (9.9, 10.1), (39.8, np.inf)])
     assert checked(time_s, place, poor=np.ones(400, bool)).barred(time_s)["fix_poor"].all()
 
 
@@ -148,7 +150,7 @@ def test_a_log_that_writes_every_position_twice_uses_the_first_of_each():
     time_s, place = logged("circle")
     twice = np.repeat(place[::2], 2, axis=0)
     assert np.flatnonzero(find_frozen(time_s, twice)).tolist() == list(range(1, 400, 2))
-    assert checked(time_s, twice).holes == ()
+    assert [hole[1:3] for hole in checked(time_s, twice).holes] == [(np.inf, "track_frozen")]  # after the last
 
 
 @pytest.mark.parametrize(("grain_s", "found"), [(0.1, True), (0.001, False)])
@@ -161,12 +163,10 @@ def test_times_rounded_against_the_motion_are_found_with_what_they_cost(grain_s,
 
 
 def test_the_error_of_the_spline_between_epochs_is_estimated_from_the_epochs():
-    """A wave of 1 m and 1 s, at 5 and 10 Hz: the true error within a factor of two."""
-    for rate_hz in (5.0, 10.0):
+    """A wave of 1 m and 1 s, at 5 and 10 Hz: never less than the true error, the closer the finer it is logged."""
+    for rate_hz, most in ((5.0, 4.0), (10.0, 2.5)):
         time_s = np.arange(0, 40, 1 / rate_hz)
         wave = np.stack([np.sin(2 * np.pi * time_s), 0 * time_s, 0 * time_s], -1)
         between_s = np.linspace(5, 35, 4001)
-        from apertura.geometry.phase_centres import position_spline
-
         true_m = np.std(position_spline(time_s, wave)(between_s)[:, 0] - np.sin(2 * np.pi * between_s)) / np.sqrt(3)
-        assert 0.5 < checked(time_s, wave).interpolation_m / true_m < 2.5
+        assert 0.9 < checked(time_s, wave).interpolation_m / true_m < most

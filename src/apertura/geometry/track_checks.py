@@ -92,16 +92,12 @@ def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool
     """
     place = position_m - position_m.mean(axis=0)
     cause, size = _judged(time_s, place, poor_fix)
-    sound = np.flatnonzero(cause == "")
     steps = [
-        Hole(
-            float(time_s[sound[max(step.first - 1, 0)]]),
-            float(time_s[sound[min(step.last + 1, sound.size - 1)]]),
-            "track_outlier",
-            step.size_m,
-        )
-        for step in find_steps(time_s[sound], place[sound])
+        Hole(*time_s[[part[step.first - 1], part[step.last + 1]]].tolist(), "track_outlier", step.size_m)
+        for part in _parts(time_s, cause)
+        for step in find_steps(time_s[part], place[part])
     ]
+    sound = np.flatnonzero(cause == "")
     faults = {name: _listed(time_s[cause == name], size[cause == name]) for name in ("track_outlier", "track_frozen")}
     faults["track_outlier"] += [((step.start_s + step.end_s) / 2, step.size_m) for step in steps]
     rounded_m = rounded_time_m(time_s, place)
@@ -119,11 +115,20 @@ def _judged(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> 
     """Return (epoch,) the flag that keeps an epoch from being used, '' where it is sound, and by how much it is off."""
     cause, size = np.where(poor_fix, "fix_poor", "").astype("U16"), np.zeros(len(time_s))
     cause[find_frozen(time_s, position_m) & ~poor_fix] = "track_frozen"
-    sound = np.flatnonzero(cause == "")
-    for spike in find_spikes(time_s[sound], position_m[sound]):
-        inside = sound[spike.first : spike.last + 1]
-        cause[inside], size[inside] = "track_outlier", spike.size_m
+    for part in _parts(time_s, cause):
+        for spike in find_spikes(time_s[part], position_m[part]):
+            inside = part[spike.first : spike.last + 1]
+            cause[inside], size[inside] = "track_outlier", spike.size_m
     return cause, size
+
+
+def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
+    """Return the sound epochs between gaps: no epoch is judged by its neighbours beyond one."""
+    sound = np.flatnonzero(cause == "")
+    if sound.size < 2:
+        return []
+    lengths = np.diff(time_s[sound])
+    return np.split(sound, np.flatnonzero(lengths > LONG_GAP * np.median(lengths)) + 1)
 
 
 def _listed(time_s: Floats, size_m: Floats) -> list[tuple[float, float]]:

@@ -18,6 +18,7 @@ MATTERS_M = 5e-3
 _SIGMA = 10.0  # a fault is as many times the log's own scatter
 _SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # epochs taken out → how many times smoother their neighbours must become
 _STEP_SMOOTHER = 10.0
+_AGILE_M_S2 = 10.0  # a node may have flown a step that takes no more than this, forth and back within an interval
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _GRAIN_M = 0.01  # of the coarsest log that resolves centimetres
 _MOST_ROUNDS = 20
@@ -134,9 +135,9 @@ def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     """Return (epoch,) bool: epochs that only repeat the position before them although the node flew on.
 
-    Positions that repeat to the last digit while the node, by its speed over twenty epochs, moves by more than three
-    times the grain of a log that resolves centimetres were written, not measured: if three or more follow each other,
-    or every tenth of all repeats, since noise may repeat a coarse position by chance.
+    A node that stops comes to rest and starts from rest. One that was flying just before and just after, and is found
+    as far away as that takes it, did not stand where a log repeats to the last digit: if three repeats or more follow
+    each other, or every tenth epoch is one, since noise may repeat a coarse position by chance.
 
     Examples
     --------
@@ -147,16 +148,16 @@ def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     repeats = np.concatenate([[False], (np.diff(position_m, axis=0) == 0).all(axis=1)])
     if not repeats.any():
         return repeats
-    epoch = np.arange(len(time_s))
-    before, after = np.maximum(epoch - 10, 0), np.minimum(epoch + 10, len(time_s) - 1)
-    speed = np.linalg.norm(position_m[after] - position_m[before], axis=1) / (time_s[after] - time_s[before])
     run, first = np.cumsum(~repeats) - 1, np.flatnonzero(~repeats)
     last = np.append(first[1:] - 1, len(time_s) - 1)
-    moved = np.linalg.norm(position_m[np.minimum(last + 1, len(time_s) - 1)] - position_m[first], axis=1)
-    moved[-1] = np.inf  # the log ends before it moves again
-    travel = speed * (time_s[last] - time_s[first])[run]
-    frozen = repeats & (np.minimum(travel, moved[run]) > 3 * _GRAIN_M)
-    return np.asarray(frozen if frozen.mean() > 0.1 else frozen & (last - first >= 3)[run])
+    jump = np.linalg.norm(np.diff(position_m[first], axis=0), axis=1)
+    speed = np.concatenate([[np.inf], jump / np.diff(time_s[first]), [np.inf]])  # before, between and after the runs
+    travel = np.minimum(speed[:-2], speed[2:]) * (time_s[last] - time_s[first])[:-1]
+    still = np.append((np.minimum(travel, jump) > 3 * _GRAIN_M) & (jump > travel / 2), False)
+    length = last - first
+    still[-1] = length[-1] <= length[still].max(initial=-1)  # a landing is longer
+    frozen = repeats & still[run]
+    return np.asarray(frozen if frozen.mean() > 0.1 else frozen & (length >= 3)[run])
 
 
 def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
@@ -221,7 +222,7 @@ def _suspects(misfit_m: Floats, scatter: float) -> list[int]:
 def _spike(time_s: Floats, position_m: Floats, suspect: int, scatter: float) -> Fault | None:
     """Return the fewest epochs about a suspect without which its neighbours are smooth."""
     for count, smoother in _SMOOTHER.items():
-        for first in range(suspect - count + 1, suspect + 1):
+        for first in range(suspect - count, suspect + 2):
             last = first + count - 1
             if first < 6 or last > len(time_s) - 7:
                 continue
@@ -249,4 +250,5 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
     size = float(np.linalg.norm(step))
     left = misfit_m[near][2:-2] @ (step / max(size, 1e-12)) - size * pattern
     rough = _STEP_SMOOTHER * float(np.sqrt(np.mean(left**2) / power))
-    return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * _GRAIN_M, rough) else None
+    flown = _AGILE_M_S2 * float(time_s[before + 1] - time_s[before]) ** 2 / 4
+    return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * _GRAIN_M, rough, flown) else None
