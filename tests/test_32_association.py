@@ -109,6 +109,43 @@ def test_a_tag_that_steps_back_is_named():
         associate(tags, np.array([0, 1, 2, 3, 3, 5]) * NS, repetition_interval_s=1.0)
 
 
+@pytest.mark.parametrize(("offset_s", "flagged"), [(0.019, False), (0.021, True), (-0.019, False), (-0.021, True)])
+def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanwhile(offset_s, flagged):
+    (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
+    flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
+    assert ("time_tags_apart" in flags) == flagged
+    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m meanwhile")
+
+
+@pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])
+def test_a_tag_that_leaves_the_line_of_all_is_marked(late_s, left_out):
+    (tx, rx), _ = fly(np.random.default_rng(5), jitter_s=0.0002)
+    rx[70] += int(late_s * NS)
+    pairs = associate(tx, rx, repetition_interval_s=0.05)
+    assert np.flatnonzero(pairs.outlier).tolist() == [70] * left_out
+    assert ("time_tag_outlier" in pairs.flags) == left_out
+
+
+def test_tags_that_all_scatter_have_no_outlier():
+    (tx, rx), _ = fly(np.random.default_rng(5), jitter_s=0.005)
+    assert not associate(tx, rx, repetition_interval_s=0.05).outlier.any()
+
+
+@pytest.mark.parametrize(("early", "flagged"), [(20, False), (21, True)])
+def test_pulses_before_and_after_the_other_recording_are_remarked_from_five_percent_on(early, flagged):
+    (tx, rx), _ = fly(np.random.default_rng(5))
+    assert ("pulses_unpaired" in associate(tx, rx[early:], repetition_interval_s=0.05).flags) == flagged
+    assert associate(tx[early:], rx, repetition_interval_s=0.05).flags == {}  # the transmitter's are all paired
+
+
+def test_tags_late_by_whole_intervals_show_as_equal_recordings_that_begin_apart():
+    (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
+    shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
+    assert shifted.startswith("10 pulses before and 0 after the other recording, of 130: both recordings are equally")
+    assert "+0.499 s apart" in shifted
+    assert "equally" not in associate(tx, rx[10:], repetition_interval_s=0.05).flags["pulses_unpaired"]
+
+
 @pytest.mark.parametrize("offset_s", [0.0, 0.06, 1.3])
 def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_turn(offset_s):
     (tx, rx), numbers = fly(np.random.default_rng(9), 1500, offset_s=offset_s, jitter_s=0.003, missed=0.2)

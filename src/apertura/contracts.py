@@ -70,6 +70,17 @@ STAGES: Mapping[str, Stage] = {
             ),
         },
         {"node": "node name"},
+        {
+            "position_std": Variable(
+                ("epoch", "axis"),
+                "float64",
+                "m",
+                "what the log states of its error: north, east, up; NaN where nothing",
+            ),
+            "fix": Variable(
+                ("epoch",), "int8", "1", "kind of solution, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"
+            ),
+        },
     ),
     "echo": Stage(
         {

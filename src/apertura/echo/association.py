@@ -5,22 +5,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from apertura.echo.association_edges import association_flags, is_outlier
 from apertura.echo.frame_counter import pairs_by_frame
 from apertura.echo.framing import ABSENT
 from apertura.echo.time_tags import Floats, Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
 from apertura.errors import CampaignError
 
-LARGEST_JITTER = 1 / 6
-"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
-
 EXPLAINED_M = 0.05
 """Movement of a sidelink that errors of the logged positions alone may explain."""
 
 _MEDIAN_PULSES = 15  # of the running median that tells movement from jitter, an odd number
-
-NEAR_HALF = 0.4
-"""Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +35,8 @@ class Association:
         RMS of the tags about that line, seconds.
     method
         What the pairs rest on.
+    outlier
+        (pair,) bool, whose tags leave that line by more than a tag may err: one of the two is wrong.
     tx_dropped, rx_dropped
         Pulses of each recording without a partner.
     flags
@@ -51,6 +49,7 @@ class Association:
     drift_ppm: float
     residual_s: float
     method: Literal["frame counter", "time tags"]
+    outlier: NDArray[np.bool_]
     tx_dropped: int
     rx_dropped: int
     flags: Mapping[str, str]
@@ -64,6 +63,7 @@ def associate(
     tx_frame: Integers | None = None,
     rx_frame: Integers | None = None,
     frame_modulus: int | None = None,
+    speed_m_s: float | None = None,
     where: str = "raw",
 ) -> Association:
     """Pair the pulses of a transmitter with the captures of a receiver.
@@ -82,6 +82,8 @@ def associate(
     frame_modulus
         Count at which the counter returns to zero. None: the power of two above the largest number seen, if
         a counter ever steps back.
+    speed_m_s
+        Of the transmitter, to say how far tags that are apart move it, metres per second; None: unknown.
     where
         What to call the recordings in errors.
 
@@ -118,17 +120,20 @@ def associate(
     if pairs[0].size == 0:
         raise _nothing_in_common(tags, repetition_interval_s, where)
     line = fit_pairs(tags, pairs, interval_ns)
+    residual = residual_ns(tags, pairs, line) * 1e-9
     association = Association(
         *pairs,
         offset_s=line.offset_ns * 1e-9,
         drift_ppm=line.drift * 1e6,
-        residual_s=float(np.sqrt(np.mean(residual_ns(tags, pairs, line) ** 2))) * 1e-9,
+        residual_s=float(np.sqrt(np.mean(residual**2))),
         method="time tags" if by_frame is None else "frame counter",
+        outlier=is_outlier(residual),
         tx_dropped=tags[0].size - pairs[0].size,
         rx_dropped=tags[1].size - pairs[0].size,
         flags={},
     )
-    return replace(association, flags=_flags(association, repetition_interval_s, conflicts))
+    flags = association_flags(association, tags, repetition_interval_s, conflicts=conflicts, speed_m_s=speed_m_s)
+    return replace(association, flags=flags)
 
 
 def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) -> str | None:
@@ -211,28 +216,3 @@ def _agreed_pairs(
     tx, rx = tx[order], rx[order]
     ascending = np.concatenate([[True], rx[1:] > np.maximum.accumulate(rx)[:-1]]) if rx.size else np.zeros(0, bool)
     return (tx[ascending], rx[ascending]), int((~agreed).sum())
-
-
-def _flags(association: Association, interval_s: float, conflicts: int) -> dict[str, str]:
-    flags = {}
-    share = abs(association.offset_s) / interval_s
-    by_tags = association.method == "time tags"
-    if by_tags and share > NEAR_HALF:
-        flags["association_ambiguous"] = (
-            f"tags are {association.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
-            "every pair may be off by one pulse"
-        )
-    if not by_tags and share > 0.5:
-        flags["time_tags_apart"] = f"frame counters agree while time tags are {association.offset_s:+.4f} s apart"
-    if conflicts:
-        flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
-    if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
-        flags["time_tag_jitter"] = (
-            f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
-            "single pulses may be paired with a neighbour"
-        )
-    pairs = association.tx_index.size
-    shorter = pairs + min(association.tx_dropped, association.rx_dropped)
-    if pairs < shorter / 2:
-        flags["association_sparse"] = f"{pairs} pulses paired of {shorter} in the shorter recording"
-    return flags

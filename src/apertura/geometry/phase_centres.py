@@ -57,7 +57,7 @@ def phase_centres(
     (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
-    centres = _spline(track_time, position)(_seconds(at - track_time[0]))
+    centres = position_spline(_seconds(track_time - track_time[0]), position)(_seconds(at - track_time[0]))
     if not any(lever_arm_m):
         return np.asarray(centres)
     why = f"a lever arm of {list(lever_arm_m)} m"
@@ -93,10 +93,24 @@ def attitude_axes(
     return ned @ body
 
 
-def _spline(track_time: NDArray[np.datetime64], position: NDArray[np.float64]) -> "BSpline":
+def position_spline(time_s: NDArray[np.float64], position: NDArray[np.float64]) -> "BSpline":
+    """Return the cubic spline through the epochs of a log: what is said of positions between them.
+
+    Parameters
+    ----------
+    time_s
+        (epoch,) float64, seconds, ascending.
+    position
+        (epoch, 3) float64, metres.
+
+    Examples
+    --------
+    >>> position_spline(np.arange(5.0), np.arange(15.0).reshape(5, 3))(2.5).round(9)
+    array([7.5, 8.5, 9.5])
+    """
     from scipy.interpolate import make_interp_spline  # slow to import, and most steps only read finished positions
 
-    return make_interp_spline(_seconds(track_time - track_time[0]), position, k=min(3, len(track_time) - 1))
+    return make_interp_spline(time_s, position, k=min(3, len(time_s) - 1))
 
 
 def _turn(
@@ -110,7 +124,8 @@ def _turn(
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return NED → ECEF and body → NED at given times; `why` they are needed."""
-    pulses, spline = _seconds(at - track_time[0]), _spline(track_time, position)
+    pulses = _seconds(at - track_time[0])
+    spline = position_spline(_seconds(track_time - track_time[0]), position)
     ned = ned_axes(spline(pulses))
     angles = (
         _course(spline.derivative()(pulses), ned)
@@ -136,7 +151,8 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
             f"and ends {max(late, 0):.3f} s before the last",
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
-            remedy="Check the log's time system (GPST is 18 s ahead of UTC) or give the whole log.",
+            remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, by which both "
+            "nodes are placed, or give the whole log.",
         )
 
 

@@ -5,19 +5,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
-from apertura.ingest.track import make_track
+from apertura.ingest.track import FIXES, make_track
 
 _POSITION = ["latitude_deg", "longitude_deg", "height_m"]
 _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
+_STD = ["std_north_m", "std_east_m", "std_up_m"]
 
 
 def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
     """Return the `track` stage of a CSV log.
 
     Its columns are time_utc (ISO 8601), latitude_deg, longitude_deg, height_m (ellipsoidal, WGS 84) and, where
-    known, roll_deg, pitch_deg, yaw_deg.
+    known, roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind of
+    solution: a name or number of `FIXES`). Empty cells of the last two are epochs of which the log says nothing.
 
     Raises
     ------
@@ -31,12 +34,35 @@ def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
             raise ValueError(f"no column {missing[0]} among {list(table.columns)}")
         time = pd.to_datetime(table["time_utc"], utc=True, format="ISO8601").dt.tz_localize(None).to_numpy()
         geodetic = table[_POSITION].to_numpy(np.float64)
-        attitude = table[_ATTITUDE].to_numpy(np.float64) if set(_ATTITUDE) <= set(table.columns) else None
+        attitude, std = (
+            table[names].to_numpy(np.float64) if set(names) <= set(table.columns) else None
+            for names in (_ATTITUDE, _STD)
+        )
+        fix = _fix(table["quality"]) if "quality" in table else None
     except (ValueError, UnicodeDecodeError) as error:
         raise CampaignError(
             str(error).splitlines()[0],
             where=path,
-            expected=f"columns time_utc (ISO 8601), {', '.join(_POSITION)}, optionally {', '.join(_ATTITUDE)}",
+            expected=f"columns time_utc (ISO 8601), {', '.join(_POSITION)}, optionally {', '.join(_ATTITUDE)}, "
+            f"{', '.join(_STD)}, quality ({', '.join(FIXES)}, or their numbers 1 to 6)",
             remedy="Correct the log or export it again.",
         ) from error
-    return make_track(time.astype("datetime64[ns]"), geodetic, attitude_deg=attitude, node=node, where=path)
+    return make_track(
+        time.astype("datetime64[ns]"),
+        geodetic,
+        attitude_deg=attitude,
+        position_std_m=std,
+        fix=fix,
+        node=node,
+        where=path,
+    )
+
+
+def _fix(quality: "pd.Series[str]") -> NDArray[np.int8]:
+    """Return RTKLIB's numbers of kinds of solution that are named or numbered; 0 where a cell is empty."""
+    numbers = {**FIXES, "": 0, **{str(number): number for number in (0, *FIXES.values())}}
+    words = quality.map(lambda cell: "" if pd.isna(cell) else str(cell).strip().lower().removesuffix(".0"))
+    unknown = words[~words.isin(numbers)]
+    if len(unknown):
+        raise ValueError(f"quality {unknown.iloc[0]!r}")
+    return np.array([numbers[word] for word in words], np.int8)

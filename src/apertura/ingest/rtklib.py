@@ -11,6 +11,7 @@ from apertura.errors import CampaignError
 from apertura.ingest.track import make_track
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
+_QUALITY = ("Q", "sdn(m)", "sde(m)", "sdu(m)")
 _LEAP_SINCE = np.datetime64("2017-01-01", "ns")
 
 
@@ -18,7 +19,8 @@ def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
     """Return the `track` stage of an RTKLIB solution.
 
     It holds latitude, longitude (decimal degrees) and ellipsoidal height; its header says whether times are GPST
-    (ahead of UTC by 18 s since 2017) or UTC, as calendar dates or week and seconds.
+    (ahead of UTC by 18 s since 2017) or UTC, as calendar dates or week and seconds. Where it names columns Q and
+    sdn(m), sde(m), sdu(m), these are the kind of solution and its standard deviations to north, east and up.
 
     Raises
     ------
@@ -30,31 +32,43 @@ def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
     Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
     """
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    gpst = _time_system_is_gpst([line for line in lines if line.startswith("%")], path)
+    columns = _columns([line for line in lines if line.startswith("%")], path)
+    gpst = columns[0] == "GPST"
+    quality = [columns.index(name) + 1 for name in _QUALITY if name in columns]  # a time is two cells
+    quality = quality if len(quality) == len(_QUALITY) else quality[:1]
     rows = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "%"]
-    times, geodetic = [], []
+    times, geodetic, stated = [], [], []
     for number, cells in rows:
         try:
             times.append(_time(cells[0], cells[1]))
             geodetic.append([float(cell) for cell in cells[2:5]])
+            stated.append([float(cells[column]) if column < len(cells) else np.nan for column in quality])
         except (ValueError, IndexError) as error:
             raise _error(f"line {number} is {' '.join(cells)[:60]!r}", path) from error
         if len(geodetic[-1]) != 3:
             raise _error(f"line {number} has {len(cells)} columns", path)
     time = np.array(times, "datetime64[ns]")
-    return make_track(_utc(time, path) if gpst else time, np.array(geodetic).reshape(-1, 3), node=node, where=path)
+    return make_track(
+        _utc(time, path) if gpst else time,
+        np.array(geodetic).reshape(-1, 3),
+        fix=np.nan_to_num(np.array(stated)[:, 0]).astype(np.int8) if quality and times else None,
+        position_std_m=np.array(stated)[:, 1:] if len(quality) > 1 and times else None,
+        node=node,
+        where=path,
+    )
 
 
-def _time_system_is_gpst(header: list[str], path: Path) -> bool:
+def _columns(header: list[str], path: Path) -> list[str]:
+    """Return the names of the columns; the first is the time system."""
     columns = next((line for line in header if "latitude(deg)" in line), None)
     if columns is None:
         raise _error("no header line with latitude(deg), longitude(deg), height(m)", path)
     if any("/geodetic" in line for line in header):
         raise _error("heights are geodetic (above a geoid)", path)
-    system = columns.lstrip("% ").split()[0]
-    if system not in {"GPST", "UTC"}:
-        raise _error(f"time system {system!r}", path)
-    return system == "GPST"
+    names = columns.lstrip("% ").split()
+    if names[0] not in {"GPST", "UTC"}:
+        raise _error(f"time system {names[0]!r}", path)
+    return names
 
 
 def _time(first: str, second: str) -> np.datetime64:

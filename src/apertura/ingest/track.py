@@ -9,12 +9,17 @@ from numpy.typing import NDArray
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import ecef_from_geodetic
 
+FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
+"""Kinds of solution by RTKLIB's numbers, Q."""
+
 
 def make_track(
     time_utc: NDArray[np.datetime64],
     geodetic: NDArray[np.float64],
     *,
     attitude_deg: NDArray[np.float64] | None = None,
+    position_std_m: NDArray[np.float64] | None = None,
+    fix: NDArray[np.int8] | None = None,
     node: str,
     where: Path,
 ) -> xr.Dataset:
@@ -28,6 +33,11 @@ def make_track(
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; None where not logged.
+
+    position_std_m
+        (epoch, 3) float64: standard deviations to north, east and up, metres, NaN where not logged; None: nowhere.
+    fix
+        (epoch,) int8: kind of solution, a value of `FIXES`, 0 where not logged; None: nowhere.
 
     Raises
     ------
@@ -54,8 +64,14 @@ def make_track(
             "Drop those lines or export again.",
         )
     attitude = np.full_like(geodetic, np.nan) if attitude_deg is None else np.radians(attitude_deg)
+    quality = {
+        name: (dims, values)
+        for name, dims, values in (("position_std", ("epoch", "axis"), position_std_m), ("fix", ("epoch",), fix))
+        if values is not None
+    }
     return xr.Dataset(
         {
+            **quality,
             "time": ("epoch", time_utc.astype("datetime64[ns]")),
             "position": (("epoch", "axis"), ecef_from_geodetic(*geodetic.T)),
             "attitude": (("epoch", "axis"), attitude),

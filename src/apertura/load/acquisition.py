@@ -1,20 +1,26 @@
 """What one node recorded in one flight: its samples by channel and its antennas by pulse."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association, associate
 from apertura.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.errors import CampaignError
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
+from apertura.geometry.track_checks import CheckedTrack, check_track
+from apertura.ingest.track import FIXES
 from apertura.settings import Node, OfdmWaveform
 from apertura.store import open_stage
+
+Times = NDArray[np.datetime64]
 
 
 @dataclass(frozen=True)
@@ -71,30 +77,71 @@ class Acquisition:
             )
         return np.asarray(iq)
 
-    def antenna(
-        self, name: Literal["radar_tx", "radar_rx", "sidelink"], pulses: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        """Return the ECEF position of an antenna at the node's own time tags, (pulse, 3) float64 metres."""
-        return phase_centres(
-            self.track.time.values,
+    @cached_property
+    def checked(self) -> CheckedTrack:
+        """What may be used of the log: errors of λ/16 between its epochs are borne."""
+        poor = np.zeros(self.track.sizes["epoch"], bool)
+        if "fix" in self.track:
+            poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
+        return check_track(
+            self.log_seconds(self.track.time.values),
             self.track.position.values,
-            self.track.attitude.values,
-            at=self.raw.time.values[pulses],
-            lever_arm_m=getattr(self.settings.lever_arms_m, name),
-            attitude_from=self.settings.attitude,
-            where=self.log,
+            poor_fix=poor,
+            tolerated_m=SPEED_OF_LIGHT_M_S / float(self.numerology.frequency_hz[-1]) / 16,
         )
 
-    def body_axes(self, pulses: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return forward, right, down of the body in ECEF at the node's own time tags, (pulse, axis, body) float64."""
-        return attitude_axes(
-            self.track.time.values,
-            self.track.position.values,
-            self.track.attitude.values,
-            at=self.raw.time.values[pulses],
-            attitude_from=self.settings.attitude,
-            where=self.log,
+    def log_seconds(self, at: Times) -> NDArray[np.float64]:
+        """Return times as seconds since the log's first epoch, float64."""
+        return np.asarray((at - self.track.time.values[0]) / np.timedelta64(1, "s"))
+
+    def log_time(self, time_s: float) -> str:
+        """Return the UTC time of day, to 10 ms, of seconds since the log's first epoch."""
+        time = self.track.time.values[0] + np.timedelta64(round(time_s * 1e9), "ns")
+        return f"{np.datetime_as_string(time, 'ms')[11:-1]}Z"
+
+    @property
+    def interval_s(self) -> float:
+        """Median time between epochs of the log, seconds."""
+        return float(np.median(np.diff(self.log_seconds(self.track.time.values))))
+
+    @property
+    def speed_m_s(self) -> float:
+        """Median speed over the log, metres per second."""
+        step_m = np.linalg.norm(np.diff(self.track.position.values, axis=0), axis=1)
+        return float(np.median(step_m / np.diff(self.log_seconds(self.track.time.values))))
+
+    def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
+        """Return the ECEF position of an antenna at given times, (time, 3) float64 metres, by sound epochs of the log."""
+        return phase_centres(
+            *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
         )
+
+    def body_axes(self, at: Times) -> NDArray[np.float64]:
+        """Return forward, right, down of the body in ECEF at given times, (time, axis, body) float64."""
+        return attitude_axes(*self._sound, at=at, **self._from_log)
+
+    @property
+    def _sound(self) -> tuple[Times, NDArray[np.float64], NDArray[np.float64]]:
+        sound = self.track.isel(epoch=self.checked.kept)
+        return sound.time.values, sound.position.values, sound.attitude.values
+
+    @property
+    def _from_log(self) -> dict[str, Any]:
+        return {"attitude_from": self.settings.attitude, "where": self.log}
+
+
+def poorer_fix(fix: NDArray[np.int8], worst: Literal["fix", "float", "any"]) -> NDArray[np.bool_]:
+    """Return (epoch,) bool: solutions poorer than `worst`; none in a log without RTK, nor where nothing is logged.
+
+    Examples
+    --------
+    >>> poorer_fix(np.array([1, 2, 5, 0], np.int8), "fix"), poorer_fix(np.array([5, 4], np.int8), "fix")
+    (array([False,  True,  True, False]), array([False, False]))
+    """
+    rtk = FIXES["fix"], FIXES["float"]
+    if worst == "any" or not np.isin(fix, rtk).any():
+        return np.zeros(len(fix), bool)
+    return ~np.isin(fix, (0, *rtk[: 1 + (worst == "float")]))
 
 
 def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Acquisition:
@@ -145,5 +192,6 @@ def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Associa
         repetition_interval_s=1 / prf_hz,
         tx_frame=tx.raw.frame.values,
         rx_frame=rx.raw.frame.values,
+        speed_m_s=tx.speed_m_s,
         where=f"{tx.files} and {rx.files}",
     )

@@ -6,6 +6,7 @@ from pydantic import Field, model_validator
 
 from apertura.settings.section import Metres3, Section
 
+StandardDeviation = Annotated[float, Field(gt=0)]
 Beamwidth = Annotated[float, Field(gt=0, le=180)]
 
 
@@ -76,6 +77,22 @@ class Node(Section):
     )
     attitude: Literal["log", "course", "none"] = Field(
         "none", description="where attitude comes from: the log, the course over ground, or none"
+    )
+    worst_fix: Literal["fix", "float", "any"] = Field(
+        "fix",
+        description="poorest solution to image with where the log says and has RTK: fix, float, or any; "
+        "pulses of poorer ones are left out",
+    )
+    position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
+        None,
+        description="error of logged positions where the log does not state it, standard deviation, m: one number, "
+        "or [north, east, up]; null: nobody knows",
+    )
+    position_correlation_s: float = Field(
+        1.0, gt=0, description="how long an error of position lasts: where its autocorrelation has fallen to 1/e, s"
+    )
+    time_tag_std_s: float = Field(
+        3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
     )
 
     @model_validator(mode="after")

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association
+from apertura.echo.association_edges import tag_jitter_s
 from apertura.echo.demodulate import remove_path
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.ingest import read_phase_history
-from apertura.load.acquisition import Acquisition, common_pulses, open_acquisition
+from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
+from apertura.load.positions import Placed, place
 from apertura.load.transmitted import read_codes, symbol_samples
 from apertura.provenance import merged, sha256_file
 from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
@@ -55,53 +57,65 @@ def _echo(
     calibration: dict[str, Any] | None,
 ) -> xr.Dataset:
     pulses = common_pulses(tx, rx, prf_hz=waveform.prf_hz)
-    measured, sidelink_m = _transfer(tx, rx, pulses, codes, waveform, processing)
+    paired = np.flatnonzero(~pulses.outlier)
+    placed = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
+    paired = paired[placed.good]
+    at = tx.raw.time.values[pulses.tx_index[paired]]
+    measured, sidelink_m = _transfer(
+        (tx, rx), pulses.rx_index[paired], at, codes, waveform=waveform, processing=processing
+    )
     offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
     attrs = {
         "frame": "ecef",
         "pair": f"{tx.name}-{rx.name}",
         **measured.report,
         "stated_offset_m": offset_m,
-        "flags": {**pulses.flags, **measured.flags},
-        "pulses": {"used": len(measured.transfer), "dropped": len(tx.raw.time) - len(measured.transfer)},
+        "positions": placed.report,
+        "time_tags": _time_tags(tx, pulses),
+        "flags": {**pulses.flags, **placed.flags, **measured.flags},
+        "pulses": _counted(len(tx.raw.time), pulses, placed, measured),
     }
     if calibration:
         attrs["flags"] |= calibration["flags"]
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
-    index = pulses.tx_index[measured.kept], pulses.rx_index[measured.kept]
+    at = at[measured.kept]
     beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
     frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
     return xr.Dataset(
         {
-            "time": ("pulse", tx.raw.time.values[index[0]]),
-            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", index[0])),
-            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", index[1])),
+            "time": ("pulse", at),
+            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", at)),
+            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", at)),
             "transfer": (("pulse", "subcarrier"), remove_path(measured.transfer, frequency, delay_s=delay_s)),
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
-            **_axes((tx, rx), index),
+            **_axes((tx, rx), at),
         },
         attrs=attrs,
     )
 
 
 def _transfer(
-    tx: Acquisition,
-    rx: Acquisition,
-    pulses: Association,
+    nodes: tuple[Acquisition, Acquisition],
+    captures: NDArray[np.int64],
+    at: Times,
     codes: NDArray[np.complex64],
+    *,
     waveform: OfdmWaveform,
     processing: Processing,
 ) -> tuple[Transfer, NDArray[np.float64]]:
-    """Return what the pulses of a pair measured, and the sidelink's length (m) in those kept; 0 without one."""
+    """Return what some captures, sent `at` the transmitter's tags, measured, and the sidelink's length (m); 0 without.
+
+    Both of its ends are where the logs put them at the transmitter's tag (docs/theory.md, "Geometry").
+    """
+    tx, rx = nodes
     if tx.name == rx.name:
-        measured = transfer_by_code(rx.captures("radar", pulses.rx_index), codes, rx.numerology)
+        measured = transfer_by_code(rx.captures("radar", captures), codes, rx.numerology)
         return measured, np.zeros(len(measured.transfer))
-    ends = tx.antenna("sidelink", pulses.tx_index), rx.antenna("sidelink", pulses.rx_index)
-    length_m = np.linalg.norm(ends[0] - ends[1], axis=1)
+    length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
     measured = transfer_by_sidelink(
-        {channel: rx.captures(channel, pulses.rx_index) for channel in ("radar", "sidelink")},
+        {channel: rx.captures(channel, captures) for channel in ("radar", "sidelink")},
         codes,
         rx.numerology,
         symbol_samples=symbol_samples(waveform),
@@ -113,14 +127,33 @@ def _transfer(
     return measured, length_m[measured.kept]
 
 
-def _axes(
-    nodes: tuple[Acquisition, Acquisition], index: tuple[NDArray[np.int64], NDArray[np.int64]]
-) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
+def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
+    """Return how the nodes' tags lie to each other, and what is known of the transmitter's own errors."""
+    return {
+        **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
+        "std_s": tx.settings.time_tag_std_s,
+        "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
+    }
+
+
+def _counted(sent: int, pulses: Association, placed: Placed, measured: Transfer) -> dict[str, Any]:
+    """Return how many of the pulses sent are used, how many not, and why."""
+    used = len(measured.transfer)
+    reasons = {
+        "unpaired": pulses.tx_dropped,
+        "time_tag_outlier": int(pulses.outlier.sum()),
+        **placed.reasons,
+        "sidelink_lost": int((~measured.kept).sum()),
+    }
+    return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
+
+
+def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return the body axes of the nodes whose antennas have a beam."""
     beams = nodes[0].settings.antennas.radar_tx, nodes[1].settings.antennas.radar_rx
     return {
-        name: (("pulse", "axis", "body"), node.body_axes(pulses))
-        for name, node, pulses, beam in zip(("tx_axes", "rx_axes"), nodes, index, beams, strict=True)
+        name: (("pulse", "axis", "body"), node.body_axes(at))
+        for name, node, beam in zip(("tx_axes", "rx_axes"), nodes, beams, strict=True)
         if beam is not None
     }
 

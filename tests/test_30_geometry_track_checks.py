@@ -1,0 +1,172 @@
+"""What a flight log's own epochs say of it: faults are found, and good logs have none."""
+
+import numpy as np
+import pytest
+
+from apertura.geometry.phase_centres import position_spline
+from apertura.geometry.track_checks import check_track
+from apertura.geometry.track_faults import find_frozen, find_spikes, find_steps, misfits, rounded_time_m, scatter_m
+
+X_BAND_M = 0.0316 / 16
+
+
+def flight(kind, time_s, generator):
+    """Positions of a flight, (epoch, 3) metres."""
+    if kind == "hover":
+        return 0.03 * np.stack([np.sin(0.5 * time_s + phase) for phase in range(3)], -1)
+    if kind == "straight":
+        return np.stack([8 * time_s, 0 * time_s, 0 * time_s + 10], -1)
+    if kind == "circle":
+        return np.stack([20 * np.cos(0.4 * time_s), 20 * np.sin(0.4 * time_s), 10 + 0 * time_s], -1)
+    fine = np.arange(time_s[0], time_s[-1] + 0.02, 0.01)  # legs of constant speed, changed at 4 m/s²
+    velocity, wanted = np.zeros((len(fine), 3)), np.zeros(3)
+    for step in range(1, len(fine)):
+        if generator.random() < 0.002:
+            wanted = generator.normal(0, 5, 3) * [1, 1, 0.2]
+        change = wanted - velocity[step - 1]
+        velocity[step] = velocity[step - 1] + change * min(1, 0.04 / max(np.linalg.norm(change), 1e-9))
+    place = np.cumsum(velocity, axis=0) * 0.01
+    return np.stack([np.interp(time_s, fine, axis) for axis in place.T], -1)
+
+
+def logged(kind="straight", *, rate_hz=10.0, noise_m=0.003, grain_m=0.0, epochs=400, seed=0, unequal=0.0):
+    generator = np.random.default_rng(seed)
+    time_s = (np.arange(epochs) + unequal * generator.uniform(-0.5, 0.5, epochs)) / rate_hz
+    place = flight(kind, time_s, generator) + generator.normal(0, noise_m, (epochs, 3))
+    return time_s, np.round(place / grain_m) * grain_m if grain_m else place
+
+
+def checked(time_s, place, *, poor=None, tolerated_m=X_BAND_M):
+    nothing = np.zeros(len(time_s), bool)
+    return check_track(time_s, place, poor_fix=nothing if poor is None else poor, tolerated_m=tolerated_m)
+
+
+@pytest.mark.parametrize("kind", ["hover", "straight", "circle", "legs"])
+@pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0, 50.0, 100.0])
+def test_a_good_log_has_no_fault_and_no_hole(kind, rate_hz):
+    """Whatever its noise, its grain and its jitter; and 100 Hz logs of slow flights repeat coarse positions by right."""
+    for seed, noise_m in enumerate((0.0, 0.001, 0.01, 0.03)):
+        for grain_m, unequal in ((0.0, 0.0), (1e-4, 0.2), (0.01, 0.0), (0.01, 0.2)):
+            given = dict(rate_hz=rate_hz, noise_m=noise_m, grain_m=grain_m, unequal=unequal, seed=seed)
+            result = checked(*logged(kind, **given))
+            assert result.kept.all(), given
+            assert result.holes == (), given
+            assert result.faults == {}, given
+
+
+@pytest.mark.parametrize("kind", ["hover", "straight", "circle", "legs"])
+@pytest.mark.parametrize("epochs", [1, 3])
+def test_epochs_that_stand_out_are_found_and_left_out(kind, epochs):
+    time_s, place = logged(kind, seed=4)
+    place[200 : 200 + epochs] += [0.2, 0.3, -0.3]
+    result = checked(time_s, place)
+    assert np.flatnonzero(~result.kept).tolist() == list(range(200, 200 + epochs))
+    assert result.faults["track_outlier"][0] == pytest.approx((20.0, 0.47), abs=0.25)
+    assert len(result.faults["track_outlier"]) == epochs
+
+
+@pytest.mark.parametrize(("size_m", "found"), [(0.02, False), (0.08, True)])
+def test_an_outlier_counts_from_ten_times_the_logs_own_scatter(size_m, found):
+    """3 mm per axis is a scatter of the misfit of 4.2 mm."""
+    time_s, place = logged("straight", noise_m=0.003)
+    assert scatter_m(misfits(time_s, place)) == pytest.approx(0.0042, rel=0.1)
+    place[200, 2] += size_m
+    assert bool(find_spikes(time_s, place)) is found
+
+
+@pytest.mark.parametrize(("size_m", "found"), [(0.004, False), (0.007, True)])
+def test_an_outlier_of_a_noiseless_log_counts_from_five_millimetres(size_m, found):
+    time_s, place = logged("circle", noise_m=1e-5)
+    place[200, 2] += size_m
+    assert bool(find_spikes(time_s, place)) is found
+
+
+@pytest.mark.parametrize("kind", ["straight", "circle", "legs"])
+@pytest.mark.parametrize(("size_m", "found"), [(0.025, False), (0.3, True)])
+def test_a_step_of_all_later_positions_is_found_where_it_is(kind, size_m, found):
+    time_s, place = logged(kind, seed=4)
+    place[200:, 1] += size_m
+    steps = find_steps(time_s, place)
+    assert bool(steps) is found
+    if found:
+        assert (steps[0].first, steps[0].last, len(steps)) == (199, 200, 1)
+        assert steps[0].size_m == pytest.approx(size_m, rel=0.1)
+        hole = checked(time_s, place).holes[0]
+        assert (hole.start_s, hole.end_s) == pytest.approx((19.8, 20.1))
+
+
+def test_a_node_that_brakes_within_an_epoch_is_no_outlier():
+    """5 m/s to 0 at once, in a log of 1 Hz: the spline errs, but no epoch is wrong."""
+    time_s = np.arange(120.0)
+    for when in np.arange(60.0, 61.0, 0.1):
+        place = np.stack([5 * np.minimum(time_s, when), 0 * time_s, 0 * time_s], -1)
+        place += np.random.default_rng(1).normal(0, 0.005, place.shape)
+        assert checked(time_s, place).faults == {}
+
+
+@pytest.mark.parametrize(("missing", "barred"), [(2, False), (30, True)])
+def test_a_gap_bars_pulses_where_the_spline_through_it_would_err(missing, barred):
+    """Legs of a mission: 0.3 s are bridged well, 3.1 s are not."""
+    time_s, place = logged("legs", seed=4, noise_m=0.001)
+    rest = np.delete(np.arange(400), np.arange(200, 200 + missing))
+    result = checked(time_s[rest], place[rest])
+    assert [hole.cause for hole in result.holes] == ["track_gap"] * barred
+    if barred:
+        spline_m = result.holes[0].size_m
+        assert (result.holes[0].start_s, result.holes[0].end_s) == pytest.approx((19.9, 23.0))
+        assert 0.1 < spline_m < 30
+        at_s = np.array([19.9, 19.95, 22.9, 23.0, 23.1])
+        assert result.barred(at_s)["track_gap"].tolist() == [False, True, True, False, False]
+
+
+def test_a_long_gap_in_a_flight_that_the_spline_follows_bars_nothing():
+    """On a line at constant speed, to which it errs less than λ/16 of 1 GHz."""
+    time_s, place = logged("straight", noise_m=0.0)
+    rest = np.delete(np.arange(400), np.arange(200, 210))
+    assert checked(time_s[rest], place[rest], tolerated_m=0.019).holes == ()
+
+
+def test_pulses_of_a_poor_fix_are_barred_however_short_it_is():
+    time_s, place = logged()
+    poor = np.zeros(400, bool)
+    poor[[0, 1, 100, 399]] = True
+    holes = checked(time_s, place, poor=poor).holes
+    assert {hole.cause for hole in holes} == {"fix_poor"}
+    edges = np.array(sorted(hole[:2] for hole in holes))
+    np.testing.assert_allclose(edges, [(-np.inf, 0.2), (9.9, 10.1), (39.8, np.inf)])
+    assert checked(time_s, place, poor=np.ones(400, bool)).barred(time_s)["fix_poor"].all()
+
+
+def test_a_log_that_freezes_and_jumps_is_not_splined_through_the_frozen_epochs():
+    time_s, place = logged("legs", seed=4, noise_m=0.001)
+    place[200:230] = place[200]
+    result = checked(time_s, place)
+    assert np.flatnonzero(~result.kept).tolist() == list(range(201, 230))
+    assert {hole.cause for hole in result.holes} == {"track_frozen"}
+    assert len(result.faults["track_frozen"]) == 29
+
+
+def test_a_log_that_writes_every_position_twice_uses_the_first_of_each():
+    time_s, place = logged("circle")
+    twice = np.repeat(place[::2], 2, axis=0)
+    assert np.flatnonzero(find_frozen(time_s, twice)).tolist() == list(range(1, 400, 2))
+    assert [hole[1:3] for hole in checked(time_s, twice).holes] == [(np.inf, "track_frozen")]  # after the last
+
+
+@pytest.mark.parametrize(("grain_s", "found"), [(0.1, True), (0.001, False)])
+def test_times_rounded_against_the_motion_are_found_with_what_they_cost(grain_s, found):
+    """8 m/s · 0.1 s/√12 = 0.23 m."""
+    true_s, place = np.arange(300) * 0.137, logged("straight", rate_hz=1 / 0.137, epochs=300)[1]
+    size_m = rounded_time_m(np.round(true_s / grain_s) * grain_s, place)
+    assert size_m == pytest.approx(0.23 if found else 0.0, abs=0.01)
+    assert ("track_times" in checked(np.round(true_s / grain_s) * grain_s, place).faults) is found
+
+
+def test_the_error_of_the_spline_between_epochs_is_estimated_from_the_epochs():
+    """A wave of 1 m and 1 s, at 5 and 10 Hz: never less than the true error, the closer the finer it is logged."""
+    for rate_hz, most in ((5.0, 4.0), (10.0, 2.5)):
+        time_s = np.arange(0, 40, 1 / rate_hz)
+        wave = np.stack([np.sin(2 * np.pi * time_s), 0 * time_s, 0 * time_s], -1)
+        between_s = np.linspace(5, 35, 4001)
+        true_m = np.std(position_spline(time_s, wave)(between_s)[:, 0] - np.sin(2 * np.pi * between_s)) / np.sqrt(3)
+        assert 0.9 < checked(time_s, wave).interpolation_m / true_m < most

@@ -1,0 +1,191 @@
+"""Logs and time tags in the echo of a campaign: what is left out is counted and said, what is right raises nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from folders import complaint, edit_config, edit_track, small_simulation
+
+from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.geometry.aperture import Aperture
+from apertura.geometry.geodesy import ecef_from_geodetic
+from apertura.simulation import Impairments, PointTarget, Straight, simulate
+from apertura.simulation.impairments import TimeTag
+from apertura.simulation.trajectory import Wobble
+from apertura.steps import echo
+from apertura.store import open_stage
+
+
+def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):
+    """Two nodes that fly 5 m/s, both logged by RTKLIB in UTC, ten epochs a second."""
+    plan = small_simulation(pulses=pulses)
+    nodes = {name: replace(node, log_format="pos_utc", lever_arms_m={}) for name, node in plan.nodes.items()}
+    plan = replace(plan, nodes=nodes, waveform=replace(plan.waveform, prf_hz=prf_hz), **changes)
+    return Campaign.load(simulate(folder / "campaign", plan, seed=3))
+
+
+def echo_of(campaign, pair="a-b"):
+    ingest_all_of(campaign)
+    echo.echo(Campaign.load(campaign.root), "f01", pair)
+    return open_stage(campaign.stage("echo", "f01", pair), "echo")
+
+
+def ingest_all_of(campaign):
+    from apertura.steps import ingest
+
+    for node in ("a", "b"):
+        ingest.ingest(campaign, "f01", node)
+
+
+def flags_of(dataset):
+    """What was flagged but for converters, which the small campaign drives high."""
+    return {name: line for name, line in dataset.attrs["flags"].items() if not name.startswith("saturated")}
+
+
+def epochs(change):
+    """Return an edit of the epochs of a log, whose header stays."""
+
+    def edit(lines):
+        header = [line for line in lines if line.startswith("%")]
+        return header + change([line.split() for line in lines if not line.startswith("%")])
+
+    return edit
+
+
+def rows(table):
+    return ["   ".join(cells) for cells in table]
+
+
+def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
+    campaign = small_campaign(tmp_path)
+    for pair in ("a-a", "a-b"):
+        dataset = echo_of(campaign, pair)
+        attrs = dataset.attrs
+        assert flags_of(dataset) == {}
+        assert attrs["pulses"] == {"used": 40, "dropped": 0, "reasons": {}}
+        for leg, node in zip(("tx", "rx"), pair.split("-"), strict=True):
+            stated = attrs["positions"][leg]
+            assert stated["std_m"] == pytest.approx([0.005, 0.005, 0.01])
+            assert (stated["node"], stated["stated_by"], stated["correlation_s"]) == (node, "log", 1.0)
+            assert stated["interpolation_m"] < 1e-4
+    assert attrs["time_tags"]["std_s"] == 0.003
+    assert attrs["time_tags"]["jitter_s"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [(None, (None, "nobody")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
+)
+def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, expected):
+    campaign = small_campaign(tmp_path)
+    edit_track(campaign.root, "a", epochs(lambda table: rows(cells[:7] for cells in table)))
+    edit_config(campaign.root, lambda document: document["nodes"]["a"].update(position_std_m=asked))
+    stated = echo_of(campaign, "a-b").attrs["positions"]
+    assert (stated["tx"]["std_m"], stated["tx"]["stated_by"]) == expected
+    assert stated["rx"]["stated_by"] == "log"
+
+
+def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
+    campaign = small_campaign(tmp_path)
+
+    def floated(table):
+        for cells in table[25:30]:  # the log begins 2 s early
+            cells[5] = "2"
+        return rows(table)
+
+    edit_track(campaign.root, "b", epochs(floated))
+    dataset = echo_of(campaign)
+    left_out = dataset.attrs["pulses"]["reasons"]["fix_poor"]
+    assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
+    assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
+    assert dataset.attrs["flags"]["fix_poor"].startswith(f"b: {left_out} of 40 pulses left out: the log's solution is")
+    assert flags_of(echo_of(campaign, "a-a")) == {}
+    edit_config(campaign.root, lambda document: document["nodes"]["b"].update(worst_fix="float"))
+    assert echo_of(campaign).attrs["pulses"]["used"] == 40
+
+
+def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tmp_path):
+    campaign = small_campaign(tmp_path)
+    for quality, refused in (("2", True), ("5", False)):
+        edit_track(
+            campaign.root,
+            "a",
+            epochs(lambda table, quality=quality: rows([*cells[:5], quality, *cells[6:]] for cells in table)),
+        )
+        if refused:
+            message = complaint(lambda: echo_of(campaign))
+            assert "no pulse has a position: a: 40 of 40 pulses left out" in message
+            assert "worst_fix" in message
+        else:
+            assert flags_of(echo_of(campaign)) == {}
+
+
+def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_path):
+    plan = small_simulation().flights[0]
+    swaying = replace(plan.tracks["a"], wobble=Wobble((0.3, 0.3, 0.3), smoothing_s=0.3))
+    campaign = small_campaign(tmp_path, flights=(replace(plan, pulses=40, tracks={**plan.tracks, "a": swaying}),))
+    assert flags_of(echo_of(campaign)) == {}
+    edit_track(campaign.root, "a", epochs(lambda table: rows(table[:25] + table[39:])))
+    attrs = echo_of(campaign).attrs
+    assert "longest 1.50 s at 09:30:0" in attrs["flags"]["track_gap"]
+    assert attrs["pulses"]["reasons"]["track_gap"] in (28, 29, 30)
+
+
+def test_a_single_outlier_is_mended_and_counted(tmp_path):
+    campaign = small_campaign(tmp_path)
+    clean = echo_of(campaign).tx_position.values
+
+    def spiked(table):
+        table[28][4] = f"{float(table[28][4]) + 0.5:.5f}"
+        return rows(table)
+
+    edit_track(campaign.root, "a", epochs(spiked))
+    dataset = echo_of(campaign)
+    assert "1 epochs or steps, worst 0.500 m at 09:30:0" in dataset.attrs["flags"]["track_outlier"]
+    assert dataset.attrs["pulses"]["used"] == 40
+    np.testing.assert_allclose(dataset.tx_position.values, clean, atol=1e-4)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
+def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):
+    """12 m/s, 9.5 GHz, receiver 4.7 m ahead: placed at its own tag, 1 ms late, R_sl would err by 1.2 cm, -2.27 rad.
+
+    Both nodes are placed at the transmitter's tag, so that the target has one phase in both pairs.
+    """
+    speed = (12.0, 0.0, 0.0)
+    tracks = {"a": Straight((-2.0, -11.0, 5.0), speed), "b": Straight((2.7, -11.0, 5.0), speed)}
+    plan = small_simulation(pulses=24, secondary=Impairments(time_tag=TimeTag(offset_s=offset_s)))
+    nodes = {name: replace(node, lever_arms_m={}, attitude="none") for name, node in plan.nodes.items()}
+    plan = replace(
+        plan,
+        nodes=nodes,
+        targets=(PointTarget((0.0, 0.0, 0.0)),),
+        waveform=replace(plan.waveform, carrier_hz=9.5e9, prf_hz=100.0),
+        flights=(replace(plan.flights[0], tracks=tracks),),
+    )
+    campaign = Campaign.load(simulate(tmp_path / "campaign", plan, seed=3))
+    target = ecef_from_geodetic(np.array(48.0), np.array(9.0), np.array(500.0))
+    phases = []
+    for pair in ("a-a", "a-b"):
+        data = echo_of(campaign, pair)
+        path_m = Aperture(data.tx_position.values, data.rx_position.values).path(target)
+        turns = np.outer(path_m, data.frequency.values) / C
+        phases.append(np.angle((data.transfer.values * np.exp(2j * np.pi * turns)).sum()))
+    assert data.attrs["time_tags"]["offset_s"] == pytest.approx(offset_s, abs=1e-5)
+    assert abs(np.angle(np.exp(1j * (phases[1] - phases[0])))) < 0.05
+
+
+def test_a_single_wrong_tag_is_left_out(tmp_path):
+    campaign = small_campaign(tmp_path)
+    from folders import edit_meta
+
+    def late(meta):
+        capture = meta["captures"][20]
+        tag = np.datetime64(capture["core:datetime"].rstrip("Z"), "us") + np.timedelta64(12, "ms")
+        capture["core:datetime"] = f"{tag}Z"
+
+    edit_meta(campaign.root, "b", late)
+    attrs = echo_of(campaign).attrs
+    assert attrs["pulses"] == {"used": 39, "dropped": 1, "reasons": {"time_tag_outlier": 1}}
+    assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses left out")
