@@ -28,8 +28,8 @@ from apertura.simulation import (
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.store import open_stage
 from apertura.steps import assess, cube, echo, export, image, ingest, layers, profile, scene, terrain
+from apertura.store import open_stage
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"

@@ -1,7 +1,6 @@
 """The speed-accuracy chart: what is on the front, what is marked, and that its page needs nothing from elsewhere."""
 
 import csv
-import json
 import re
 from dataclasses import replace
 

@@ -1,6 +1,5 @@
 """Each failure edge raises its flag in the product, and only beyond the edge: recordings with one impairment each."""
 
-import json
 from dataclasses import replace
 
 import numpy as np

@@ -1,6 +1,5 @@
 """Antennas from the config to the image: a flight whose antennas have beams, imaged with and without knowing it."""
 
-import json
 from dataclasses import replace
 
 import numpy as np

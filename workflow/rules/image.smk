@@ -138,9 +138,12 @@ rule image:
 rule assess:
     input:
         lambda wildcards: [
-            campaign.manifest("image", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
+            campaign.manifest(stage, wildcards.flight, pair)
+            for pair in campaign.flight(wildcards.flight).pairs
+            for stage in ("echo", "image")
         ],
         "results/scene.json",
+        campaign.terrain_sources(),
     output:
         "results/{flight}/assessment.json",
     log:

@@ -154,7 +154,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
 
 def _std_db(focus: PointFocus) -> float:
     """Return how far noise and neighbours may move the loss of one point."""
-    return 10 / np.log(10) * focus.interference * np.sqrt(2 / LEAST_BLOCKS) + 0.02
+    return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:

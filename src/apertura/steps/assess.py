@@ -1,7 +1,8 @@
 """Rule `assess`: what the images of one flight say of each other, and which of them may be added up."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,11 @@ from apertura.provenance import chained_sha256, code_sha256
 from apertura.quality.agreement import Agreement, agreement
 from apertura.quality.bright_points import BrightPoint
 from apertura.scene.grid import SceneGrid
+from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage
+
+_LOOKS_WRONG = frozenset({"defocused", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
+"""Flags that a wrong geometry raises, and for which a remedy is looked for."""
 
 _SURE_SNR_DB = 20.0
 """A bright point this far above the noise should show in every image of the scene."""
@@ -33,28 +38,54 @@ def assess(campaign: Campaign, flight: str) -> Path:
     fusion = choose_fusion(
         reference, found, unconfirmed=unconfirmed, align=campaign.settings.processing.fusion.align_phase
     )
-    flags: dict[str, dict[str, str]] = {pair: {} for pair in pairs}
-    for pair, one in found.items():
-        raised = _disagreement(one, cells[pair], (reference, pair), sure=pair in unconfirmed)
-        for side in (pair, reference):
-            flags[side] |= {
-                name: "; ".join([*flags[side].get(name, "").split("; "), line]).strip("; ")
-                for name, line in raised.items()
-            }
+    flags = _flags(found, cells, reference, unconfirmed)
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
+    named = _suspected(campaign, flight, images, flags, reference)
     report = {
         "flight": flight,
         "reference": reference,
-        "pairs": {
-            pair: {"agreement": _report(found.get(pair)), "hypotheses": [], "flags": flags[pair]} for pair in pairs
-        },
+        "hypotheses": named,
+        "pairs": {pair: {"agreement": _report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
         "fusion": fusion.report,
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
     path = campaign.root / campaign.assessment_file(flight)
     write_json(path, report)
     return path
+
+
+def _flags(
+    found: Mapping[str, Agreement | None], cells: Mapping[str, float], reference: str, unconfirmed: Collection[str]
+) -> dict[str, dict[str, str]]:
+    """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell."""
+    lines: dict[str, dict[str, list[str]]] = {pair: {} for pair in (reference, *found)}
+    for pair, one in found.items():
+        raised = _disagreement(one, cells[pair], (reference, pair), sure=pair in unconfirmed)
+        for side, (name, line) in product((pair, reference), raised.items()):
+            lines[side].setdefault(name, []).append(line)
+    return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
+
+
+def _suspected(
+    campaign: Campaign,
+    flight: str,
+    images: Mapping[str, xr.Dataset],
+    flags: dict[str, dict[str, str]],
+    reference: str,
+) -> list[dict[str, Any]]:
+    """Try what may be wrong where the images look so; put the best behind their flags."""
+    looking = {pair: _LOOKS_WRONG & {*images[pair].attrs["flags"], *raised} for pair, raised in flags.items()}
+    if not any(looking.values()):
+        return []
+    quality = images[reference].attrs["quality"]
+    brightest = quality["brightest"]["x_m"], quality["brightest"]["y_m"]
+    named = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"])
+    for pair, names in looking.items():
+        for name in names:
+            line = flags[pair].get(name) or images[pair].attrs["flags"][name]
+            flags[pair][name] = line + hypothesis_line(named)
+    return named
 
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:

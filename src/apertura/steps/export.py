@@ -33,7 +33,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     report = quality | {
         "reference": assessed["reference"],
         "agreement": agreed["agreement"],
-        "hypotheses": agreed["hypotheses"],
+        "hypotheses": assessed["hypotheses"],
         "flags": {**image.attrs["flags"], **agreed["flags"]},
     }
     origin = _with_code(Provenance.of([__name__, *export_modules("pair")], [image]), assessed)

@@ -1,0 +1,92 @@
+"""What would make a bad image better: hypotheses tried on one bright place, the best of them named."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from apertura.campaign import Campaign
+from apertura.imaging.sharpness import gathered
+from apertura.imaging.stages import phase_history_of
+from apertura.load.acquisition import open_acquisition
+from apertura.load.scene import OpenScene, open_scene
+from apertura.load.suspects import Evidence, Suspicion, evidence_of, suspicions
+from apertura.scene.grid import SceneGrid
+from apertura.settings import OfdmWaveform
+from apertura.store import open_stage
+
+LEAST_GAIN_DB = 1.0
+"""A hypothesis is named if the echoes of the flight gather better by so much where it is true."""
+
+_SIDE_PX = 128
+_PIXELS_PER_CELL = 2.5
+_MOST_NAMED = 3
+
+
+def hypotheses(
+    campaign: Campaign, flight: str, *, brightest: tuple[float, float], cell_m: float
+) -> list[dict[str, Any]]:
+    """Return what would make the images of a flight sharper and agree, the best first; nothing is changed by it.
+
+    Parameters
+    ----------
+    campaign, flight
+        Which.
+    brightest
+        Easting and northing of a bright place in the scene's CRS, metres.
+    cell_m
+        Resolution cell.
+
+    Returns
+    -------
+    list
+        what, kind, and gain_db: how much more of the echoes gathers at one place.
+    """
+    waveform = campaign.settings.waveform
+    if not isinstance(waveform, OfdmWaveform):
+        return []
+    nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in campaign.flight(flight).nodes}
+    found = []
+    for pair in campaign.flight(flight).pairs:
+        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
+        history = phase_history_of(echo, campaign.settings.processing.window)
+        found.append(evidence_of(nodes, pair, history, echo.time.values))
+    scene = open_scene(campaign)
+    now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
+    named: list[tuple[float, Suspicion]] = []
+    for suspicion in suspicions(nodes, found):
+        grid = _around(scene, _moved(scene.grid, brightest, found, suspicion.histories), cell_m)
+        try:
+            then = gathered(suspicion.histories, grid, scene.level.height_m + suspicion.height_m)
+        except ValueError:  # the places are too far apart for one pulse: it is not that
+            continue
+        gain_db = 10 * float(np.log10(max(then, 1e-12) / now))
+        if gain_db > LEAST_GAIN_DB:
+            named.append((gain_db, suspicion))
+    named.sort(key=lambda one: -one[0])
+    return [{"what": one.what, "kind": one.kind, "gain_db": round(gain_db, 2)} for gain_db, one in named[:_MOST_NAMED]]
+
+
+def hypothesis_line(named: Sequence[dict[str, Any]]) -> str:
+    """Return what to look at first, to be put behind a flag; nothing where no hypothesis helps."""
+    return f"; focus improves {named[0]['gain_db']:.1f} dB if {named[0]['what']}" if named else ""
+
+
+def _around(scene: OpenScene, place: tuple[float, float], cell_m: float) -> SceneGrid:
+    """Return a grid about a place, coarser than the scene's."""
+    spacing_m, (x, y) = cell_m / _PIXELS_PER_CELL, place
+    half = _SIDE_PX / 2 * spacing_m
+    return SceneGrid(scene.grid.crs, x - half, y + half, spacing_m, (_SIDE_PX, _SIDE_PX), name=scene.grid.name)
+
+
+def _moved(
+    grid: SceneGrid, place: tuple[float, float], found: Sequence[Evidence], histories: Sequence[Any]
+) -> tuple[float, float]:
+    """Return where a place is expected if the antennas were elsewhere: as far away as they are, on average."""
+    rows, columns = [], []
+    for one, history in zip(found, histories, strict=True):
+        for before, after in zip(one.history.aperture.legs, history.aperture.legs, strict=True):
+            ends = grid.pixel_below(np.stack([before.mean(axis=0), after.mean(axis=0)]))
+            rows.append(ends[1, 0] - ends[0, 0])
+            columns.append(ends[1, 1] - ends[0, 1])
+    return place[0] + grid.spacing_m * float(np.mean(columns)), place[1] - grid.spacing_m * float(np.mean(rows))
