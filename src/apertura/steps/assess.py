@@ -1,7 +1,6 @@
 """Rule `assess`: what the images of one flight say of each other, and which of them may be added up."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ import xarray as xr
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.fusion.choice import choose_fusion
+from apertura.load.agreement import agreement_of, agreement_report, common_cell_m
 from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
-from apertura.quality.agreement import Agreement, agreement
-from apertura.quality.bright_points import BrightPoint
-from apertura.scene.grid import SceneGrid
+from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage
 
@@ -32,8 +30,8 @@ def assess(campaign: Campaign, flight: str) -> Path:
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
     reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
-    found = {pair: _agreement(images, reference, pair, grid) for pair in pairs if pair != reference}
-    cells = {pair: max(quality[name]["focus"]["cell_m"] for name in (reference, pair)) for pair in found}
+    found = {pair: agreement_of(images[reference], images[pair], grid) for pair in pairs if pair != reference}
+    cells = {pair: common_cell_m(images[reference], images[pair]) for pair in found}
     unconfirmed = {pair for pair, one in found.items() if one is None and _sure(quality[reference]["focus"])}
     fusion = choose_fusion(
         reference, found, unconfirmed=unconfirmed, align=campaign.settings.processing.fusion.align_phase
@@ -46,7 +44,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "flight": flight,
         "reference": reference,
         "hypotheses": named,
-        "pairs": {pair: {"agreement": _report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
+        "pairs": {pair: {"agreement": agreement_report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
         "fusion": fusion.report,
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
@@ -93,27 +91,6 @@ def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
 
 
-def _points(quality: Mapping[str, Any], grid: SceneGrid) -> list[BrightPoint]:
-    points = quality["focus"]["points"]
-    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
-    return [
-        BrightPoint(float(row), float(column), point["amplitude"])
-        for row, column, point in zip(rows, columns, points, strict=True)
-    ]
-
-
-def _agreement(images: Mapping[str, xr.Dataset], reference: str, pair: str, grid: SceneGrid) -> Agreement | None:
-    two = [images[name] for name in (reference, pair)]
-    qualities = [image.attrs["quality"] for image in two]
-    points = [_points(quality, grid) for quality in qualities]
-    return agreement(
-        (two[0].image, two[1].image),
-        (points[0], points[1]),
-        spacing_m=grid.spacing_m,
-        cell_m=max(quality["focus"]["cell_m"] for quality in qualities),
-    )
-
-
 def _sure(focus: Mapping[str, Any]) -> bool:
     return any(point["snr_db"] > _SURE_SNR_DB for point in focus["points"])
 
@@ -151,7 +128,3 @@ def _wrong_codes(quality: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, st
         for pair, tx in ((pair, pair.split("-")[0]) for pair in quality)
         if tx in evidence
     ]
-
-
-def _report(one: Agreement | None) -> dict[str, float] | None:
-    return None if one is None else {name: float(f"{value:.4g}") for name, value in asdict(one).items()}

@@ -63,9 +63,11 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         **_measures(grid, campaign.settings.processing.tile_px, sums),
         "fusion": assessed["fusion"],
         "coherence": _coherence(grid, images, assessed),
+        "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": _flags(
             {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()}
-        ),
+        )
+        | cube.attrs["flags"].get(flight, {}),
     }
     name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
     titles = {
