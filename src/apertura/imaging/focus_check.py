@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.imaging.echo_place import echo_elsewhere
 from apertura.imaging.formation import Formation
 from apertura.imaging.parts import PART_PX, part_images
 from apertura.quality.bright_points import BrightPoint, bright_points
@@ -51,10 +52,13 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     measured = [_focus_of(column) for column in terms.T]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
-    if verdict.points == 0:
+    elsewhere = None
+    if verdict.points == 0 and formation.history is not None:
         verdict = judge_parts(parts, cell_m=cell_m)
+        elsewhere = echo_elsewhere(formation.history, grid, formation.plan.terrain)
     return {
         **_verdict_report(verdict),
+        **({"elsewhere": elsewhere} if elsewhere else {}),
         "cell_m": round(cell_m, 4),
         "parts": {name: round(value, 4) if np.isfinite(value) else None for name, value in asdict(parts).items()},
         "points": [
@@ -64,10 +68,11 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
-    """Return the flag `defocused` where the bright points say so."""
+    """Return the flags `defocused` where the bright points say so, and `echo_elsewhere`."""
+    flags = {"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {}
     if report["verdict"] != "defocused":
-        return {}
-    return {
+        return flags
+    return flags | {
         "defocused": f"{report['why']}; {-expected_db:.1f} dB expected of the errors that are stated: "
         "positions, lever arms, heights or times are worse than that"
     }

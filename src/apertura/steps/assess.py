@@ -17,7 +17,7 @@ from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage
 
-_LOOKS_WRONG = frozenset({"defocused", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
 """Flags that a wrong geometry raises, and for which a remedy is looked for."""
 
 _SURE_SNR_DB = 20.0
