@@ -34,7 +34,10 @@ def assess(campaign: Campaign, flight: str) -> Path:
     cells = {pair: common_cell_m(images[reference], images[pair]) for pair in found}
     unconfirmed = {pair for pair, one in found.items() if one is None and _sure(quality[reference]["focus"])}
     fusion = choose_fusion(
-        reference, found, unconfirmed=unconfirmed, align=campaign.settings.processing.fusion.align_phase
+        reference,
+        found,
+        unfit=_unfit(found, cells, unconfirmed, reference),
+        align=campaign.settings.processing.fusion.align_phase,
     )
     flags = _flags(found, cells, reference, unconfirmed)
     for pair, name, line in _wrong_codes(quality):
@@ -63,6 +66,18 @@ def _flags(
         for side, (name, line) in product((pair, reference), raised.items()):
             lines[side].setdefault(name, []).append(line)
     return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
+
+
+def _unfit(
+    found: Mapping[str, Agreement | None], cells: Mapping[str, float], unconfirmed: Collection[str], reference: str
+) -> dict[str, str]:
+    """Return pairs that show other places than the reference, whose phases there mean nothing → why."""
+    apart = {
+        pair: f"its bright points lie {100 * one.shift_m:.0f} cm from those of {reference}"
+        for pair, one in found.items()
+        if one is not None and one.shifted(cells[pair]) and one.shift_m > cells[pair] / 2
+    }
+    return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 
 
 def _suspected(
