@@ -93,7 +93,7 @@ def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool
     place = position_m - position_m.mean(axis=0)
     cause, size = _judged(time_s, place, poor_fix)
     steps = [
-        Hole(*time_s[[part[step.first - 1], part[step.last + 1]]].tolist(), "track_outlier", step.size_m)
+        Hole(float(time_s[part[step.first - 1]]), float(time_s[part[step.last + 1]]), "track_outlier", step.size_m)
         for part in _parts(time_s, cause)
         for step in find_steps(time_s[part], place[part])
     ]

@@ -12,6 +12,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association
 from apertura.echo.association_edges import tag_jitter_s
 from apertura.echo.demodulate import remove_path
+from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.ingest import read_phase_history
 from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
@@ -79,6 +80,7 @@ def _echo(
         attrs["flags"] |= calibration["flags"]
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
     at = at[measured.kept]
+    attrs["flags"] |= missing_flags(at.astype("datetime64[ns]").astype(np.int64))
     beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
     frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
     return xr.Dataset(

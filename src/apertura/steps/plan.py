@@ -7,7 +7,7 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.load.pair import open_pair
 from apertura.load.plan import plan_pair
-from apertura.load.scene import expected_scene
+from apertura.load.scene import Flown, expected_scene
 from apertura.planning.plan import Plan
 
 if TYPE_CHECKING:
@@ -16,8 +16,14 @@ if TYPE_CHECKING:
 
 def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
     """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran."""
-    opened = open_pair(campaign, flight, pair)
-    return plan_pair(campaign, opened, expected_scene(campaign, opened.flown), threads=threads)
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
+    return plan_pair(campaign, open_pair(campaign, flight, pair), scene, threads=threads)
+
+
+def first_flight(campaign: Campaign) -> Flown:
+    """Return what all pairs of the first image flight fly, from which the one grid of all images is settled."""
+    flight = campaign.image_flights[0]
+    return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
 
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
@@ -27,9 +33,10 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
 
     console = Console(width=max(140, Console().width))
     seconds, disk = 0.0, 0
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
     for flight in campaign.image_flights:
         for pair in flight.pairs:
-            plan = expected_plan(campaign, flight.name, pair, threads=threads)
+            plan = plan_pair(campaign, open_pair(campaign, flight.name, pair), scene, threads=threads)
             console.print(_table(plan, f"{flight.name}/{pair}", campaign.settings.processing.accuracy_db))
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
