@@ -5,7 +5,8 @@ import pytest
 
 from apertura.geometry.phase_centres import position_spline
 from apertura.geometry.track_checks import check_track
-from apertura.geometry.track_faults import find_frozen, find_spikes, find_steps, misfits, rounded_time_m, scatter_m
+from apertura.geometry.track_faults import find_spikes, find_steps, misfits, scatter_m
+from apertura.geometry.track_writing import find_frozen, rounded_time_m
 
 X_BAND_M = 0.0316 / 16
 

@@ -8,15 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.geometry.phase_centres import position_spline
-from apertura.geometry.track_faults import (
-    Floats,
-    find_frozen,
-    find_spikes,
-    find_steps,
-    misfits,
-    rounded_time_m,
-    scatter_m,
-)
+from apertura.geometry.track_faults import Floats, find_spikes, find_steps, misfits, scatter_m
+from apertura.geometry.track_writing import find_frozen, rounded_time_m
 
 LONG_GAP = 3.5
 """Intervals between epochs, in the log's own median, from which on a gap is asked what it costs."""
