@@ -130,6 +130,7 @@ def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_p
     attrs = echo_of(campaign).attrs
     assert "longest 1.50 s at 09:30:0" in attrs["flags"]["track_gap"]
     assert attrs["pulses"]["reasons"]["track_gap"] in (28, 29, 30)
+    assert attrs["pulses"]["used"] == 40 - attrs["pulses"]["reasons"]["track_gap"]
 
 
 def test_a_single_outlier_is_mended_and_counted(tmp_path):
