@@ -10,6 +10,7 @@ from folders import complaint, copy_writable, edit_config, ingest_all
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.load.pair import open_pair
 from apertura.load.results import OpenCampaign, open_campaign
 from apertura.load.scene import expected_scene, settled_scene
 from apertura.steps import echo, scene
@@ -106,3 +107,13 @@ def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(t
         echo.echo(campaign, "f01", pair)
     scene.scene(campaign)
     assert settled_scene(campaign).grid == expected
+
+
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_prefix_ends_where_the_plan_expects_it(tiny, pair):
+    """Automatic bounds may end there: path offsets and the sidelink's length count before the echo is formed."""
+    campaign = Campaign.load(tiny)
+    expected_m = open_pair(campaign, "f01", pair).path_limit_m
+    ingest_all(campaign)
+    echo.echo(campaign, "f01", pair)
+    assert open_pair(campaign, "f01", pair).path_limit_m == pytest.approx(expected_m, abs=0.05)
