@@ -22,7 +22,7 @@ def flags_of(campaign):
     return {name: set(report["flags"]) for name, report in reports_of(campaign).items()}
 
 
-def sample(folder, spoil=lambda root: None):
+def sample(folder, spoil=lambda _: None):
     if not SHARED.is_dir():
         pytest.skip("../shared/data is absent")
     root = copy_writable(SHARED / "campaign-sample", folder / "campaign")

@@ -108,13 +108,10 @@ def associate(
     for node, time_ns in (("transmitter", tx_time_ns), ("receiver", rx_time_ns)):
         _require_ascending(time_ns, node, where)
     tags = np.asarray(tx_time_ns, np.int64), np.asarray(rx_time_ns, np.int64)
-    frames = (tx_frame, rx_frame)
+    frames, conflicts = (tx_frame, rx_frame), 0
     by_frame = pairs_by_frame(tags, frames, interval_ns, frame_modulus)
-    conflicts = 0
     if by_frame is None:
-        pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
-        if pairs[0].size:
-            pairs = nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns)
+        pairs = _pairs_by_tags(tags, interval_ns)
     else:
         pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
     if pairs[0].size == 0:
@@ -197,6 +194,11 @@ def _nothing_in_common(tags: Pairs, repetition_interval_s: float, where: str) ->
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
         remedy="Check that both recordings are of the same flight, and their core:datetime.",
     )
+
+
+def _pairs_by_tags(tags: Pairs, interval_ns: float) -> Pairs:
+    pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
+    return nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns) if pairs[0].size else pairs
 
 
 def _agreed_pairs(

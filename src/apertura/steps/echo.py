@@ -12,6 +12,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association
 from apertura.echo.association_edges import tag_jitter_s
 from apertura.echo.demodulate import remove_path
+from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.ingest import read_phase_history
 from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
@@ -64,21 +65,8 @@ def _echo(
     measured, sidelink_m = _transfer(
         (tx, rx), pulses.rx_index[paired], at, codes, waveform=waveform, processing=processing
     )
-    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
-    attrs = {
-        "frame": "ecef",
-        "pair": f"{tx.name}-{rx.name}",
-        **measured.report,
-        "stated_offset_m": offset_m,
-        "positions": placed.report,
-        "time_tags": _time_tags(tx, pulses),
-        "flags": {**pulses.flags, **placed.flags, **measured.flags},
-        "pulses": _counted(len(tx.raw.time), pulses, placed, measured),
-    }
-    if calibration:
-        attrs["flags"] |= calibration["flags"]
-        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
     at = at[measured.kept]
+    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
     beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
     frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
     return xr.Dataset(
@@ -92,8 +80,35 @@ def _echo(
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
             **_axes((tx, rx), at),
         },
-        attrs=attrs,
+        attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
+        | {"stated_offset_m": offset_m},
     )
+
+
+def _attributes(
+    nodes: tuple[Acquisition, Acquisition],
+    pulses: Association,
+    placed: Placed,
+    measured: Transfer,
+    *,
+    at: Times,
+    calibration: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Return what was found on the way to the pulses used, those sent `at`: edges crossed, pulses left out."""
+    missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
+    attrs = {
+        "frame": "ecef",
+        "pair": "-".join(node.name for node in nodes),
+        **measured.report,
+        "positions": placed.report,
+        "time_tags": _time_tags(nodes[0], pulses),
+        "flags": {**pulses.flags, **placed.flags, **measured.flags, **missing},
+        "pulses": _counted(len(nodes[0].raw.time), pulses, placed, measured),
+    }
+    if calibration:
+        attrs["flags"] |= calibration["flags"]
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    return attrs
 
 
 def _transfer(
