@@ -122,7 +122,8 @@ def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
             "numerical_error": "that of the worst pair",
         },
         "numerical_error_db": worst["numerical_error_db"],
-        "numerical_error_std_db": worst["numerical_error_std_db"],
+        "numerical_error_confidence": worst["numerical_error_confidence"],
+        "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
         "redone": [one for quality in qualities for one in quality["redone"]],
     }
@@ -131,7 +132,7 @@ def _worst(images: Sequence[xr.Dataset]) -> dict[str, Any]:
 def _quality_tags(quality: Mapping[str, Any], flags: Mapping[str, str]) -> dict[str, str]:
     return {
         "APERTURA_ERROR_DB": f"{quality['numerical_error_db']:.2f}",
-        "APERTURA_ERROR_STD_DB": f"{quality['numerical_error_std_db']:.2f}",
+        "APERTURA_ERROR_CONFIDENCE": f"{quality['numerical_error_confidence']:.2f}",
         "APERTURA_PEAK_ERROR_DB": f"{quality['peak_error_db']:.2f}",
         "APERTURA_FLAGS": canonical_json(flags),
         "APERTURA_MODELS": canonical_json(quality["models"]),
