@@ -80,6 +80,7 @@ def _echo(
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
             **_axes((tx, rx), index),
         },
         attrs=attrs,
@@ -96,7 +97,8 @@ def _transfer(
 ) -> tuple[Transfer, NDArray[np.float64]]:
     """Return what the pulses of a pair measured, and the sidelink's length (m) in those kept; 0 without one."""
     if tx.name == rx.name:
-        measured = transfer_by_code(rx.captures("radar", pulses.rx_index), codes, rx.numerology)
+        radar, sent_ns = rx.captures("radar", pulses.rx_index), rx.raw.time.values[pulses.rx_index].astype(np.int64)
+        measured = transfer_by_code(radar, codes, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
         return measured, np.zeros(len(measured.transfer))
     ends = tx.antenna("sidelink", pulses.tx_index), rx.antenna("sidelink", pulses.rx_index)
     length_m = np.linalg.norm(ends[0] - ends[1], axis=1)
