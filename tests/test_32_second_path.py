@@ -53,6 +53,12 @@ def test_an_unresolved_echo_that_changes_over_the_flight_is_known_as_one(echo, f
     assert bool(said) is flagged
 
 
+@pytest.mark.parametrize(("turns", "flagged"), [(0.0, True), (2.0, False)])
+def test_a_resolved_arrival_that_stays_may_be_either_and_one_that_turns_is_an_echo(turns, flagged):
+    assert ("what corrects the one" in line(echo=0.15, cells=6.0, turns=turns)) is flagged
+    assert line(echo=0.08, cells=6.0, turns=turns) == ""
+
+
 @pytest.mark.parametrize("snr_db", [-10.0, 0.0, 30.0])
 def test_a_clean_sidelink_raises_nothing_at_any_snr(snr_db):
     assert not any(line(snr_db=snr_db, seed=seed) for seed in range(10))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from apertura.echo.sidelink_state import ECHO_DB, SidelinkState
+from apertura.echo.sidelink_state import ECHO_DB, GATE_CELLS, SidelinkState
 
 
 def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
@@ -25,6 +25,12 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
         )
         harm = _harm(10 ** (state.near_db / 20), 1, cell_m)
         return {"sidelink_ripple_or_echo": f"{seen}, as an echo does: {harm}"}
+    if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_stays:
+        line = (
+            f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "
+            "the flight: an echo, or the transmitter's ripple; what corrects the one makes ghosts as strong of the other"
+        )
+        return {"sidelink_ripple_or_echo": line}
     swing = 10 ** (state.ripple_db / 20)
     amplitude = (swing - 1) / (swing + 1)
     if amplitude <= 10 ** (ECHO_DB / 20):

@@ -37,6 +37,8 @@ class SidelinkState:
         which none would have been seen.
     echo_cells
         Delay of that arrival after the direct path, in cells of 1/B; 0 if none was seen.
+    echo_stays
+        Whether its phase against the direct path is the same in most pulses: then it may be the transmitter's, too.
     ripple_db
         Peak-to-peak ripple of the band that repeats in every pulse and fits into the gate, as of one sinusoid.
     ripple_cells
@@ -59,6 +61,7 @@ class SidelinkState:
     snr_db: float
     echo_db: float
     echo_cells: int
+    echo_stays: bool
     ripple_db: float
     ripple_cells: int
     fine_ripple_db: float
@@ -109,6 +112,7 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
         snr_db=_db(snr),
         echo_db=echo_db,
         echo_cells=echo_cells,
+        echo_stays=bool(np.abs(average.mean[echo_cells]) ** 2 > (average.power[echo_cells] - average.noise) / 2),
         ripple_db=ripple_db,
         ripple_cells=ripple_cells,
         fine_ripple_db=fine_ripple_db,
@@ -202,7 +206,7 @@ def _measure_without_code(sidelink: Complexes, path: LineOfSight, where: str) ->
         "one, monostatic images of the transmitter are wrong"
     )
     flags = {"wrong_code": line}
-    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
+    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, False, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
 
 
 def _flags(state: SidelinkState) -> dict[str, str]:
