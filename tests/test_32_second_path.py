@@ -55,7 +55,7 @@ def test_an_unresolved_echo_that_changes_over_the_flight_is_known_as_one(echo, f
 
 @pytest.mark.parametrize(("turns", "flagged"), [(0.0, True), (2.0, False)])
 def test_a_resolved_arrival_that_stays_may_be_either_and_one_that_turns_is_an_echo(turns, flagged):
-    assert ("what corrects the one" in line(echo=0.15, cells=6.0, turns=turns)) is flagged
+    assert ("what corrects one" in line(echo=0.15, cells=6.0, turns=turns)) is flagged
     assert line(echo=0.08, cells=6.0, turns=turns) == ""
 
 

@@ -28,7 +28,7 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
     if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_stays:
         line = (
             f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "
-            "the flight: an echo, or the transmitter's ripple; what corrects the one makes ghosts as strong of the other"
+            "the flight: an echo, or the transmitter's ripple; what corrects one makes ghosts as strong of the other"
         )
         return {"sidelink_ripple_or_echo": line}
     swing = 10 ** (state.ripple_db / 20)
