@@ -10,13 +10,8 @@ from numpy.typing import NDArray
 from apertura.echo.association_edges import association_flags, is_outlier
 from apertura.echo.frame_counter import pairs_by_frame
 from apertura.echo.framing import ABSENT
-from apertura.echo.time_tags import Floats, Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
+from apertura.echo.time_tags import Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
 from apertura.errors import CampaignError
-
-EXPLAINED_M = 0.05
-"""Movement of a sidelink that errors of the logged positions alone may explain."""
-
-_MEDIAN_PULSES = 15  # of the running median that tells movement from jitter, an odd number
 
 
 @dataclass(frozen=True)
@@ -131,50 +126,6 @@ def associate(
     )
     flags = association_flags(association, tags, repetition_interval_s, conflicts=conflicts, speed_m_s=speed_m_s)
     return replace(association, flags=flags)
-
-
-def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) -> str | None:
-    """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
-
-    A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
-    `EXPLAINED_M` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
-    positions of other pulses.
-
-    Parameters
-    ----------
-    sidelink_path_m, predicted_path_m
-        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
-        between its antennas.
-
-    Notes
-    -----
-    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence
-    either way: the prediction itself must move for a wrong pair to show.
-
-    Examples
-    --------
-    >>> distance = 5 + np.sin(np.arange(200) / 20)
-    >>> detect_wrong_association(distance + 3.0, distance) is None
-    True
-    >>> detect_wrong_association(np.roll(distance, 9), distance)
-    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
-    """
-    pulse = np.flatnonzero(np.isfinite(sidelink_path_m) & np.isfinite(predicted_path_m))
-    if pulse.size < 2 * _MEDIAN_PULSES:
-        return None
-    residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
-    padded = np.pad(residual, _MEDIAN_PULSES // 2, mode="edge")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, _MEDIAN_PULSES), axis=1)
-    smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
-    jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
-    noise = 1.2533 * jitter / np.sqrt(_MEDIAN_PULSES)  # standard deviation of a median of so many Gaussian samples
-    worst = int(np.argmax(np.abs(smooth)))
-    if abs(smooth[worst]) <= max(EXPLAINED_M, 5 * noise):
-        return None
-    return (
-        f"sidelink leaves its geometry by {abs(smooth[worst]):.2f} m at pulse {pulse[worst]} (noise {noise:.3f} m): "
-        "pulses or positions are wrongly associated"
-    )
 
 
 def _require_ascending(tags: Integers, node: str, where: str) -> None:

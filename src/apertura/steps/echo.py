@@ -78,6 +78,7 @@ def _echo(
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
             **_axes((tx, rx), at),
         },
         attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
@@ -126,7 +127,8 @@ def _transfer(
     """
     tx, rx = nodes
     if tx.name == rx.name:
-        measured = transfer_by_code(rx.captures("radar", captures), codes, rx.numerology)
+        radar, sent_ns = rx.captures("radar", captures), at.astype("datetime64[ns]").astype(np.int64)
+        measured = transfer_by_code(radar, codes, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
         return measured, np.zeros(len(measured.transfer))
     length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
     measured = transfer_by_sidelink(
