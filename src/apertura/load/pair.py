@@ -19,6 +19,7 @@ from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import Flown
+from apertura.load.segments import inside_segments
 from apertura.settings import OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
@@ -83,6 +84,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     last = min(track.time.values[-1] for track in tracks.values())
     recorded = open_recording(campaign.recording_files(flight, tx)).captures.time
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
+    times = times[inside_segments(campaign, flight, pair, times)]
     places, axes = [], {}
     for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
         track, settings = tracks[node], campaign.settings.nodes[node]
