@@ -16,14 +16,23 @@ STABILITY = Path("results/study/stability")
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
     "parameters": "parameters:parameter_claims",
+    "effects": "effects:effect_claims",
     "resolution": "resolution:simulated_table",
     "uav_resolution": "resolution:uav_table",
     "coherence": "coherence:coherence_claims",
+    "fusion": "fusion:fusion_claims",
     **{f"loss_{error}": _LOSS for error in ("carrier_phase", "timing", "cfo", "sfo", "localization")},
+    "positions": "positions:position_claims",
     "corrected": "corrected:corrected_claims",
     "clock": "corrected:clock_claims",
+    "swarm": "swarm:swarm_claims",
 }
 """Files of rows that make up claims.csv, in its order → what computes them; `loss_…` gives its error as argument."""
+
+PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
+"""Part → the experiments whose campaigns it reads, from a folder that it is given."""
+
+CAMPAIGNS = "campaigns"
 
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
 
@@ -36,7 +45,8 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     _require("part", part, PAPER_PARTS)
     path = folder / "parts" / f"{part}.csv"
     claims = pkgutil.resolve_name(f"apertura.study.paper.{PAPER_PARTS[part]}")
-    write_table(path, claims(part.removeprefix("loss_")) if PAPER_PARTS[part] == _LOSS else claims())
+    given = [part.removeprefix("loss_")] if PAPER_PARTS[part] == _LOSS else []
+    write_table(path, claims(*given, *([folder / CAMPAIGNS] if part in PAPER_READS else [])))
     typer.echo(path)
 
 
