@@ -39,7 +39,7 @@ def paper_lab(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
     targets = (
         Line((0.0, 0.0, 0.0), (0.0, 0.0, 1.5), 30, 1.0),
         Line((0.9, 1.6, 0.0), (0.9, 1.6, 1.5), 30, 0.5),
-        Clutter((-3.0, -2.5, 3.0, 3.0), 3e-3, 30.0),
+        Clutter((-3.0, -2.5, 3.0, 3.0), 5e-4, 6.0),
     )
     wired = SimulatedNode(
         {"sidelink": (0.0, -0.6, 0.0)}, {"radar": 0.911, "sidelink": CABLE_M}, impairments=_own_clock(10.0, 40.0)
@@ -54,7 +54,7 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
     targets = (
         PointTarget((0.0, 0.0, 0.0)),
         PointTarget((1.0, 2.2, 0.0), 0.25),
-        Clutter((-4.0, -4.0, 4.0, 6.0), 1e-3, 15.0),
+        Clutter((-4.0, -4.0, 4.0, 6.0), 1e-3, 4.0),
     )
     secondary = SimulatedNode({}, {"radar": 0.911, "sidelink": 0.402}, impairments=_own_clock(0.0, 30.0))
     nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0)), "uav2": secondary}

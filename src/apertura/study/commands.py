@@ -34,6 +34,14 @@ PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
 
 CAMPAIGNS = "campaigns"
 
+PAPER_FIGURES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("no_errors", "sfo", "cfo", "carrier_phase", "timing", "localization", "scene"), ()),
+    **dict.fromkeys(("lab_profile", "lab_phase"), ("lab",)),
+    **dict.fromkeys(("static_profile", "static_phase"), ("static",)),
+    **dict.fromkeys(("uav_geometry", "uav_images", "uav_cuts"), ("uav",)),
+}
+"""The paper's figures with data, in its order → the experiments whose campaigns they show."""
+
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
 
 
@@ -68,12 +76,19 @@ def paper_claims(folder: Folder = PAPER) -> None:
 
 
 @app.command()
-def paper_figure(error: str, folder: Folder = PAPER) -> None:
-    """Draw range-compressed data beside the image of one error, ERROR.png."""
-    from apertura.study.paper.figures import SHOWN, draw_error
+def paper_figure(name: str, folder: Folder = PAPER) -> None:
+    """Draw one figure of the paper, NAME.png."""
+    _require("figure", name, PAPER_FIGURES)
+    path = folder / f"{name}.png"
+    if PAPER_FIGURES[name]:
+        from apertura.study.paper.experiment_figures import DRAWN
 
-    _require("error", error, SHOWN)
-    typer.echo(draw_error(error, folder / f"{error}.png"))
+        DRAWN[name](folder / CAMPAIGNS, path)
+    else:
+        from apertura.study.paper.figures import draw_scene, draw_simulated
+
+        draw_scene(path) if name == "scene" else draw_simulated(name, path)
+    typer.echo(path)
 
 
 @app.command()

@@ -75,13 +75,13 @@ def compare(
     if expected is None:
         raise ValueError(f"{claim}: neither a value of the paper nor of a model to compare with")
     difference = computed - expected
-    texts = ["" if value is None else f"{value:.10g}" for value in (paper, independent_model)]
+    printed, modelled = ("" if value is None else f"{value:.10g}" for value in (paper, independent_model))
     shown = f"{computed:{style}}"
     if abs(difference) <= within * (abs(expected) if relative else 1):
-        return Claim(claim, *texts, shown, unit, AGREES, note)
+        return Claim(claim, printed, modelled, shown, unit, AGREES, note)
     by = f"{100 * difference / abs(expected):+.1f} %" if relative else f"{difference:+.3g} {unit}"
     verdict = EXPLAINED if reason else DISAGREES
-    return Claim(claim, *texts, shown, unit, verdict, _join(f"differs by {by}", reason, note))
+    return Claim(claim, printed, modelled, shown, unit, verdict, _join(f"differs by {by}", reason, note))
 
 
 def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, style: str = ".4g", note: str) -> Claim:

@@ -36,8 +36,8 @@ def coherence_claims(folder: Path) -> list[Claim]:
 
 
 def _uncorrected(name: str, experiment: Experiment) -> Claim:
-    factor = coherence_factor(terms_at(experiment.uncorrected(), experiment.places_m[0]))
-    pulses = experiment.specification.flights[0].pulses
+    terms = terms_at(experiment.uncorrected(), experiment.places_m[0])
+    factor, pulses = coherence_factor(terms), len(terms)
     low, high = (-np.log(1 - share) / pulses for share in (0.025, 0.975))  # of random phases MΓ is exponential
     chance = low <= factor <= high and low <= PRINTED_UNCORRECTED <= high
     note = (
@@ -73,10 +73,9 @@ def _corrected(name: str, experiment: Experiment) -> list[Claim]:
 
 def _printed(static: Experiment) -> list[Claim]:
     """Return the printed factors beside the static recording's, whose noise is a choice of the preset."""
-    factors = {
-        pair: coherence_factor(terms_at(history, static.places_m[0])) for pair, history in by_pair(static).items()
-    }
-    pulses = static.specification.flights[0].pulses
+    terms = {pair: terms_at(history, static.places_m[0]) for pair, history in by_pair(static).items()}
+    factors = {pair: coherence_factor(own) for pair, own in terms.items()}
+    pulses = len(terms["bistatic"])
     return [
         Claim(
             f"coherence factor after correction, printed {printed:g}",

@@ -1,6 +1,6 @@
 """What the UAV experiment's images add up to: phase, clutter, sidelobes and widths, in the products of the pipeline."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +52,15 @@ class Images:
 
     def brightest(self, name: str) -> tuple[int, int]:
         """Return row and column of the brightest pixel."""
-        row, column = np.unravel_index(int(np.abs(self.amplitude[name]).argmax()), self.amplitude[name].shape)
-        return int(row), int(column)
+        magnitude: Floats = np.abs(self.amplitude[name])
+        row, column = divmod(int(magnitude.argmax()), magnitude.shape[1])
+        return row, column
 
     def clutter(self) -> NDArray[np.bool_]:
         """Return (y, x) bool: the pixels farther than `REACH_M` from every target."""
-        rows, columns = np.indices(self.amplitude["mono"].shape)
-        away = np.hypot(rows[..., None] - self.pixel[:, 0], columns[..., None] - self.pixel[:, 1])
+        rows, columns = self.amplitude["mono"].shape
+        places = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), -1)
+        away = np.linalg.norm(places[:, :, None] - self.pixel, axis=-1)
         return np.asarray((away * self.spacing_m > REACH_M).all(axis=-1))
 
 
@@ -68,9 +70,10 @@ def open_images(experiment: Experiment) -> Images:
     pairs = dict(zip(cube.attrs["pairs"], cube.image.values[0], strict=True))
     amplitude = {"mono": pairs[MONOSTATIC], "bistatic": pairs[BISTATIC], "coherent": cube.coherent.values[0]}
     amplitude["noncoherent"] = Amplitude(cube.noncoherent.values[0])[:, :]
-    normed = {name: np.asarray(image / np.abs(image).max(), np.complex64) for name, image in amplitude.items()}
     pixel = grid.pixel_below(experiment.places_m)[:, :2]
-    return Images(normed, pixel, grid.spacing_m)
+    images = Images(amplitude, pixel, grid.spacing_m)
+    peaks = {name: abs(find_peak(image, *images.brightest(name)).value) for name, image in amplitude.items()}
+    return replace(images, amplitude={name: image / np.float32(peaks[name]) for name, image in amplitude.items()})
 
 
 def fusion_claims(folder: Path) -> list[Claim]:
@@ -98,7 +101,7 @@ def _phase(experiment: Experiment) -> Claim:
 
 def _widths(images: Images) -> list[Claim]:
     why = (
-        f"two parts of the track of {SEGMENT_M:g} m with {GAP_M:g} m between them, counted at midpoints, were not fitted; "
+        f"two parts of the track of {SEGMENT_M:g} m with {GAP_M:g} m between them, at midpoints, not fitted: "
         "the paper does not print which parts it used"
     )
     rows = []

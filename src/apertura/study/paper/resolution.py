@@ -95,8 +95,8 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
 def _printed_table(ground_cm: list[float], cross_cm: list[float]) -> list[Claim]:
     """Return the widths that the paper prints for its simulated scene, beside closed forms."""
     far = (
-        f"of the farthest target, the widest; the five measure {min(cross_cm):.1f} to {max(cross_cm):.1f} cm, and it is "
-        "not known here which of them the paper's 9 cm are"
+        f"of the farthest target, the widest; the five measure {min(cross_cm):.1f} to {max(cross_cm):.1f} cm; it "
+        "is not known here which of them the paper's 9 cm are"
     )
     return [
         compare("ground-range width, closed form, farthest target", ground_cm[-1], "cm", paper=35, within=WITHIN),
