@@ -19,7 +19,7 @@ from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import Flown
-from apertura.load.segments import inside_segments
+from apertura.load.segments import inside_segments, keep_segments
 from apertura.settings import OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
@@ -68,7 +68,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = read_phase_history(waveform.format, files, pair=pair)
+        echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))

@@ -16,7 +16,7 @@ from apertura.load.acquisition import open_acquisition
 from apertura.load.results import OpenCampaign, open_campaign
 from apertura.load.transmitted import read_codes
 from apertura.settings import OfdmWaveform
-from apertura.simulation import CampaignSpecification, Clutter, Line, PointTarget, preset
+from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
 from apertura.study.paper_scene import Complexes
 
 Floats = NDArray[np.float64]
@@ -57,10 +57,6 @@ class Experiment:
         measured = transfer_by_code(captures, codes, receiver.numerology)
         return replace(self.history(BISTATIC), transfer=measured.transfer)
 
-    def range_profiles(self, pair: str, slant_m: Floats) -> Complexes:
-        """Return (pulse, range) profiles of a pair's echo at halves of the total path, (range,) metres."""
-        return profiles_at(self.history(pair), slant_m)
-
 
 def open_experiment(folder: Path, name: str) -> Experiment:
     """Return the experiment `lab`, `static` or `uav` that lies in a folder of campaigns."""
@@ -75,11 +71,6 @@ def _places(specification: CampaignSpecification) -> Floats:
         if isinstance(target, PointTarget | Line)
     ]
     return specification.origin.ecef(np.array(middles, np.float64))
-
-
-def clutter_of(specification: CampaignSpecification) -> Clutter:
-    """Return the ground of an experiment."""
-    return next(target for target in specification.targets if isinstance(target, Clutter))
 
 
 def profiles_at(history: PhaseHistory, slant_m: Floats) -> Complexes:

@@ -53,7 +53,8 @@ def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
     _draw_data(left, scene, range_tables(history, _CORNERS_M), float(np.abs(clean.samples).max()))
     image = backproject(history, _GRID, certified_pixels=0).values
     picture = _draw_image(right, image, float(find_peaks(clean, targets)[1].max()))
-    figure.suptitle(f"{error.sweep.title} {size:g} {error.sweep.unit}" if size else "No errors")
+    words = f"{error.sweep.title}: {size:g} {error.sweep.unit}".replace("±:", "±")
+    figure.suptitle(words if size else "No errors")
     figure.colorbar(picture, ax=(left, right), label="dB re peak without error", extend="min", fraction=0.04)
     save_png(figure, path)
     return path
@@ -93,8 +94,8 @@ def draw_scene(path: Path) -> Path:
     """Draw where the simulated track and targets are, from above and along the track."""
     scene = ERRORS["timing"].scene(PULSES)
     track, targets = scene.geometry.radar_tx, scene.scatterers.position_m
-    figure = Figure(figsize=(11, 4.8), layout="compressed")
-    above, aside = figure.subplots(1, 2)
+    figure = Figure(figsize=(11, 4.2), layout="compressed")
+    above, aside = figure.subplots(1, 2, width_ratios=(1, 1.5))
     for axes, across, up in ((above, 0, 1), (aside, 1, 2)):
         axes.plot(
             track[:, across], track[:, up], "-", color="#0072B2", linewidth=3, marker="o", markevery=(0, len(track))
