@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.impairments import Impairments, Timing, UniformPhase
+from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
 from apertura.study.paper.claims import Claim, compare, require
 from apertura.study.paper.experiments import profiles_at
@@ -104,14 +105,9 @@ def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) ->
 
 
 def _one_target() -> PaperScene:
+    target = Scatterers(np.array([[0.0, TARGET_M, 0.0]]), np.ones(1, np.complex128))
     scene = reduced_scene(pulses=150, subcarriers=4096)
-    geometry = replace(scene.geometry, **{
-        name: getattr(scene.geometry, name)[:1] for name in ("radar_tx", "radar_rx", "sidelink_tx", "sidelink_rx")
-    })  # fmt: skip
-    across = geometry.radar_tx[0, 0]
-    return replace(
-        scene, scatterers=Scatterers(np.array([[across, TARGET_M, 0.0]]), np.ones(1, complex)), geometry=geometry
-    )
+    return replace(scene, scatterers=target, geometry=straight_pair(np.zeros(1), 10.0))
 
 
 def _profile(scene: PaperScene, disturbance: Disturbance) -> Profile:

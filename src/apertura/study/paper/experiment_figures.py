@@ -23,10 +23,7 @@ RANGE_DB = 40.0
 SPANS_M = {"lab": (2.0, 10.0), "static": (8.0, 22.0)}
 """Halves of total paths that are drawn."""
 
-NAMES = {
-    "lab": ("cylinder 1", "cylinder 2"),
-    "static": ("strong reflector", "weak reflector"),
-}
+NAMES = {"lab": ("cylinder 1", "cylinder 2"), "static": ("strong reflector", "weak reflector")}
 TITLES = ("(a) Monostatic", "(b) Bistatic, code alone", "(c) Bistatic, divided by the sidelink")
 
 
@@ -151,21 +148,14 @@ def draw_cuts(folder: Path, path: Path) -> Path:
     images = open_images(open_experiment(folder, "uav"))
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    kinds = (
-        ("(a) Cross-range", "East", 1.0, 0.0),
-        ("(b) Ground range", "North", 0.0, 1.0),
-    )
+    kinds = (("(a) Cross-range", "East", 1.0, 0.0), ("(b) Ground range", "North", 0.0, 1.0))
     for axes, (title, words, east, north) in zip(panels, kinds, strict=True):
         for name, colour, style in zip(PANELS, (BLUE, ORANGE, BLACK, GREEN), ("--", "-.", "-", ":"), strict=True):
             along_m, level_db = _cut_db(images, name, east, north)
             axes.plot(along_m, level_db, style, color=colour, label=PANELS[name][4:])
         axes.axhline(-3, color="0.6", linewidth=0.8)
         axes.annotate("−3 dB", (1.28, -2.8), fontsize=8, color="0.4")
-        axes.set(
-            xlabel=f"{words} of the coherent peak, m",
-            xlim=(-1.5, 1.5),
-            ylim=(-RANGE_DB, 2),
-        )
+        axes.set(xlabel=f"{words} of the coherent peak, m", xlim=(-1.5, 1.5), ylim=(-RANGE_DB, 2))
         axes.set_title(title, loc="left")
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("Magnitude, dB re peak of each image")

@@ -11,14 +11,7 @@ from apertura.quality.point_targets import Cut, cut_through, find_peak
 from apertura.simulation.experiments import GAP_M, SEGMENT_M
 from apertura.study.paper.claims import Claim, compare, require
 from apertura.study.paper.coherence import LARGEST_PHASE_RAD
-from apertura.study.paper.experiments import (
-    BISTATIC,
-    MONOSTATIC,
-    Experiment,
-    by_pair,
-    open_experiment,
-    terms_at,
-)
+from apertura.study.paper.experiments import BISTATIC, MONOSTATIC, Experiment, by_pair, open_experiment, terms_at
 
 Floats = NDArray[np.float64]
 EAST, NORTH = (1.0, 0.0), (0.0, 1.0)
@@ -154,7 +147,7 @@ def _sidelobes(images: Images) -> list[Claim]:
         f"mono {cuts['mono'].pslr_db:.1f} dB; the model is sin(πLu)/(πLu)·cos(πDu), D = L + gap, without clutter and "
         "for equal segments seen at right angles"
     )
-    name = "highest sidelobe across range of the coherent sum, from the gap between segments"
+    name = "highest cross-range sidelobe of the coherent sum, from the gap between segments"
     return [
         compare(name, cuts["coherent"].pslr_db, "dB", independent_model=expected_db, within=1.5, relative=False,
                 style=".1f", note=note)
