@@ -17,7 +17,7 @@ from apertura.study.point_response import phase_history
 Complexes = NDArray[np.complex64]
 TIMING_S, SMALL_TIMING_S = 1e-9, 0.5e-9
 TARGET_M = 15.0
-_SLANT_M = np.linspace(16.0, 20.0, 16001)
+_SLANT_M = np.linspace(17.5, 18.7, 4801)
 
 
 @dataclass(frozen=True)
