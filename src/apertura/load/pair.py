@@ -22,6 +22,7 @@ from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.positions import position_error
 from apertura.load.scene import Flown
+from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions
 from apertura.settings import Node, OfdmWaveform
 from apertura.store import manifest_of, open_stage
@@ -86,7 +87,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = read_phase_history(waveform.format, files, pair=pair)
+        echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
@@ -137,6 +138,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
     last = min(log.track.time.values[-1] for log in (tx, rx))
     recorded = open_recording(campaign.recording_files(flight, pair.split("-", maxsplit=1)[0])).captures.time
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
+    times = times[inside_segments(campaign, flight, pair, times)]
     beams = {"radar_tx": tx, "radar_rx": rx}
     axes = {antenna: beams[antenna].body_axes(times) for antenna in campaign.antennas(pair)}
     offset = rx.settings.path_offset_m

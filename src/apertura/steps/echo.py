@@ -17,6 +17,7 @@ from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidel
 from apertura.ingest import read_phase_history
 from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
 from apertura.load.positions import Placed, place
+from apertura.load.segments import keep_segments
 from apertura.load.transmitted import read_codes, symbol_samples
 from apertura.provenance import merged, sha256_file
 from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
@@ -40,10 +41,11 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         dataset = _echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
+    dataset = keep_segments(campaign, flight, pair, dataset)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
     if calibration:
         inputs = merged(inputs, calibration["inputs"])
-    relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(calibration)}
+    relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     save_stage(stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
