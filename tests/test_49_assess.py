@@ -8,6 +8,7 @@ from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 from apertura.campaign import Campaign
 from apertura.load.results import assessment_of
 from apertura.steps import assess, cube, echo, image, profile
+from apertura.steps.summary import print_summary
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 
@@ -56,6 +57,18 @@ def test_every_image_carries_its_budget(right):
     assert lines["heights"]["stated"].startswith("not stated; 1 m")
     assert 0.2 < lines["heights"]["shift_m"] < 0.8
     assert lines["arithmetic"]["loss_db"] > -0.001
+
+
+def test_the_summary_says_each_flag_once_and_whole(right, capsys, tmp_path):
+    root = copy_writable(right.root, tmp_path / "campaign")
+    for name in (*PAIRS, "fused"):
+        path = root / "results" / "f01" / name / "image.json"
+        report = json.loads(path.read_text())
+        path.write_text(json.dumps(report | {"flags": {"defocused": "a line [with brackets]"}}))
+    print_summary(Campaign.load(root))
+    said = capsys.readouterr().out
+    assert said.count("a line [with brackets]") == 1
+    assert "causes not stated" in " ".join(said.replace("│", " ").split())
 
 
 def flip_right_arm(document):

@@ -119,6 +119,14 @@ def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_C
 
 
 @app.command()
+def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = HERE) -> None:
+    """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
+    from apertura.steps.summary import print_summary
+
+    print_summary(_opened(campaign))
+
+
+@app.command()
 def verify(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
 ) -> None:
