@@ -40,7 +40,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         tx, rx = pair.split("-")
         nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
-        dataset = _echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
+        dataset = pair_echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
     dataset = keep_segments(campaign, flight, pair, dataset)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
     if calibration:
@@ -51,7 +51,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     return folder
 
 
-def _echo(
+def pair_echo(
     tx: Acquisition,
     rx: Acquisition,
     codes: NDArray[np.complex64],
@@ -59,6 +59,7 @@ def _echo(
     processing: Processing,
     calibration: dict[str, Any] | None,
 ) -> xr.Dataset:
+    """Return the echo of a pair from what its nodes recorded; path offsets are the calibration's, or the config's."""
     pulses = common_pulses(tx, rx, prf_hz=waveform.prf_hz)
     paired = np.flatnonzero(~pulses.outlier)
     placed = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])

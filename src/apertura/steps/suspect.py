@@ -1,18 +1,27 @@
 """What would make a bad image better: hypotheses tried on one bright place, the best of them named."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.focus.inputs import PhaseHistory
 from apertura.imaging.sharpness import gathered
 from apertura.imaging.stages import phase_history_of
-from apertura.load.acquisition import open_acquisition
+from apertura.load.acquisition import Acquisition, numerology_of, open_acquisition
 from apertura.load.scene import OpenScene, open_scene
 from apertura.load.suspects import Evidence, Suspicion, evidence_of, suspicions
+from apertura.load.transmitted import read_codes
 from apertura.scene.grid import SceneGrid
 from apertura.settings import OfdmWaveform
+from apertura.steps.calibration import calibrated
+from apertura.steps.echo import pair_echo
 from apertura.store import open_stage
 
 LEAST_GAIN_DB = 1.0
@@ -46,15 +55,15 @@ def hypotheses(
     if not isinstance(waveform, OfdmWaveform):
         return []
     nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in campaign.flight(flight).nodes}
-    found = []
-    for pair in campaign.flight(flight).pairs:
-        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
-        history = phase_history_of(echo, campaign.settings.processing.window)
-        found.append(evidence_of(nodes, pair, history, echo.time.values))
+    window = campaign.settings.processing.window
+    found = [
+        _evidence(nodes, pair, open_stage(campaign.stage("echo", flight, pair), "echo"), window)
+        for pair in campaign.flight(flight).pairs
+    ]
     scene = open_scene(campaign)
     now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
     named: list[tuple[float, Suspicion]] = []
-    for suspicion in suspicions(nodes, found):
+    for suspicion in chain(suspicions(nodes, found), _other_echoes(campaign, flight, nodes, found)):
         grid = _around(scene, _moved(scene.grid, brightest, found, suspicion.histories), cell_m)
         try:
             then = gathered(suspicion.histories, grid, scene.level.height_m + suspicion.height_m)
@@ -65,6 +74,43 @@ def hypotheses(
             named.append((gain_db, suspicion))
     named.sort(key=lambda one: -one[0])
     return [{"what": one.what, "kind": one.kind, "gain_db": round(gain_db, 2)} for gain_db, one in named[:_MOST_NAMED]]
+
+
+def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
+    return evidence_of(nodes, pair, phase_history_of(echo, window), echo.time.values)
+
+
+def _other_echoes(
+    campaign: Campaign, flight: str, nodes: Mapping[str, Acquisition], found: Sequence[Evidence]
+) -> Iterator[Suspicion]:
+    """Yield what only another reading of the samples shows: channels swapped, the other end of the band as carrier."""
+    waveform = campaign.settings.waveform
+    if not isinstance(waveform, OfdmWaveform):
+        return
+    calibration = {one.pair: calibrated(campaign, flight, one.pair) for one in found}
+
+    def formed(one: Evidence, nodes: Mapping[str, Acquisition], waveform: OfdmWaveform) -> PhaseHistory:
+        tx, rx = (nodes[name] for name in one.pair.split("-"))
+        codes = read_codes(campaign.root / waveform.codes, waveform.subcarriers)
+        echo = pair_echo(tx, rx, codes, waveform, campaign.settings.processing, calibration[one.pair])
+        return _evidence(nodes, one.pair, echo, campaign.settings.processing.window).history
+
+    other = "band_centre" if waveform.carrier_is == "band_start" else "band_start"
+    changed = waveform.model_copy(update={"carrier_is": other})
+    placed = {name: replace(node, numerology=numerology_of(changed)) for name, node in nodes.items()}
+    with suppress(CampaignError):
+        yield Suspicion(
+            f"waveform.carrier_is is {other}", "carrier_is", tuple(formed(one, placed, changed) for one in found)
+        )
+    for name, node in nodes.items():
+        names = node.raw.attrs["channels"]
+        swapped = {**nodes, name: replace(node, raw=node.raw.assign_attrs(channels=names[::-1]))}
+        with suppress(CampaignError):
+            if len(names) == 2:
+                histories = (
+                    formed(one, swapped, waveform) if one.pair.endswith(f"-{name}") else one.history for one in found
+                )
+                yield Suspicion(f"the channels of {name} are swapped", "channels", tuple(histories))
 
 
 def hypothesis_line(named: Sequence[dict[str, Any]]) -> str:
