@@ -1,0 +1,121 @@
+"""What an image's own measures cost: `python benchmarks/measures.py [--size 2048] [--pulses 4096] [--repeats 3]`.
+
+Five targets and noise are imaged as the workflow plans them, tile by tile into zarr; beside that time stand those of
+the certificate, the brightest target, the focus and the agreement with another image. Repeated, one after the other.
+"""
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+import argparse
+import contextlib
+import io
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import zarr
+from rich.console import Console
+from rich.table import Table
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.echo.compression import window_weights
+from apertura.focus.inputs import PhaseHistory
+from apertura.focus.tiles import compute_tiles
+from apertura.geometry.aperture import Aperture
+from apertura.imaging.certify import certified, measures
+from apertura.imaging.focus_check import focus_report
+from apertura.imaging.formation import Formation
+from apertura.imaging.job import imaging_job
+from apertura.imaging.range_profiles import range_compress
+from apertura.planning.planner import make_plan
+from apertura.quality.agreement import agreement
+from apertura.quality.bright_points import BrightPoint
+from apertura.scene.grid import SceneGrid
+from apertura.scene.ground_models import GroundModels
+from apertura.scene.terrain import FlatGround
+
+BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
+
+
+def formation(size: int, pulses: int, subcarriers: int) -> Formation:
+    """Return what forms the image: a straight flight beside the grid, 25 dB of SNR per pulse and subcarrier."""
+    generator, half = np.random.default_rng(1), size * SPACING_M / 2
+    along = np.linspace(-half / 4, half / 4, pulses)
+    track = np.stack([along, np.full(pulses, -half - 60.0), np.full(pulses, 60.0)], -1)
+    flown = Aperture(track, track)
+    frequency = CENTRE_HZ + BANDWIDTH_HZ * (np.arange(subcarriers) / subcarriers - 0.5)
+    places = np.array(
+        [[x, y, 0.0] for x, y in half * np.array([(0, 0), (-0.5, 0.2), (0.4, 0.5), (0.3, -0.6), (-0.6, -0.4)])]
+    )
+    transfer = np.zeros((pulses, subcarriers), np.complex64)
+    for path in flown.path(places).T:
+        transfer += np.exp(-2j * np.pi * np.outer(path / C, frequency)).astype(np.complex64)
+    for part in np.array_split(transfer, 32):
+        part.real += 0.05 * generator.standard_normal(part.shape, np.float32)
+        part.imag += 0.05 * generator.standard_normal(part.shape, np.float32)
+    weight = window_weights("hann", subcarriers)
+    history = PhaseHistory(transfer, frequency, weight, np.zeros(pulses), flown)
+    grid, ground = SceneGrid("local", -half, half, SPACING_M, (size, size)), FlatGround(0.0)
+    job = imaging_job(flown, frequency, weight, grid, GroundModels.of(ground, None, grid), history=history)
+    plan = make_plan(job, accuracy_db=-60.0)
+    return Formation(history, range_compress(history, grid, ground), grid, plan, TILE)
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Return CPU seconds and the result."""
+    begin = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        result = work()
+    return time.process_time() - begin, result
+
+
+def main() -> None:
+    """Time and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in (("size", 2048), ("pulses", 4096), ("subcarriers", 1024), ("repeats", 3)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    asked = parser.parse_args()
+    formed, rows = formation(asked.size, asked.pulses, asked.subcarriers), []
+    for _ in range(asked.repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            target = zarr.create_array(folder, shape=formed.grid.shape, chunks=(TILE, TILE), dtype="complex64")
+            rows.append(_round(formed, target))
+    seconds = np.array(rows)
+    table = Table(title=f"{formed.plan.setting.line}, load {os.getloadavg()[0]:.1f}")
+    for heading in ("work", "CPU seconds", "spread", "of imaging"):
+        table.add_column(heading)
+    names = ("image", "certificate", "brightest target", "focus", "agreement")
+    for name, column in zip(names, seconds.T, strict=True):
+        share = column.mean() / seconds[:, 0].mean()
+        table.add_row(name, f"{column.mean():.2f}", f"{np.ptp(column):.2f}", f"{100 * share:.0f} %")
+    new = seconds[:, 3:].sum(axis=1).mean() / seconds[:, 0].mean()
+    Console().print(table, f"focus and agreement: {100 * new:.0f} % of imaging")
+
+
+def _round(formed: Formation, target: Any) -> list[float]:
+    report: dict[str, Any] = {}
+
+    def focus() -> None:
+        report.update(focus_report(formed, target))
+
+    def agree() -> Any:
+        rows, columns = formed.grid.pixel_of(*([one[axis] for one in report["points"]] for axis in ("x_m", "y_m")))
+        points = [BrightPoint(float(r), float(c), 1.0) for r, c in zip(rows, columns, strict=True)]
+        return agreement((target, target), (points, points), spacing_m=SPACING_M, cell_m=report["cell_m"])
+
+    works = (
+        lambda: compute_tiles(formed.image, formed.windows, target, threads=1),
+        lambda: certified(formed, target, accuracy_db=-60.0, threads=1),
+        lambda: measures(formed, target),
+        focus,
+        agree,
+    )
+    return [timed(work)[0] for work in works]
+
+
+if __name__ == "__main__":
+    main()
