@@ -49,13 +49,15 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     axes = figure.subplots()
     for engine, colour, marker in zip(ENGINES, cycle(_COLOURS), cycle(_MARKERS), strict=False):
-        some = [point for point in points if point.engine == engine and not point.planned]
-        axes.plot(*_places(some), linestyle="none", color=colour, marker=marker, alpha=0.6, label=engine)
+        places = _places([point for point in points if point.engine == engine and not point.planned])
+        if places[0]:
+            axes.plot(*places, linestyle="none", color=colour, marker=marker, alpha=0.6, label=engine)
     front = [point for point in points if point.on_front]
     axes.plot(*_places(front), color="0.4", drawstyle="steps-post", zorder=0, label="Pareto front")
     for point in points:
         if point.error_db is None:
-            label = "the double sum, which errors are measured against"
+            chosen = "planner's choice: " if point.planned else ""
+            label = f"{chosen}the double sum, which errors are measured against"
             axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
         elif point.planned:
             thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
