@@ -72,7 +72,7 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
             | said
             | {
                 "image": image,
-                "coherence": round(report["brightest"]["coherence_factor"], 4),
+                "coherence": round(report["brightest"].get("coherence_factor", float("nan")), 4),
                 "shift_cells": _shift_cells(outcome, image, root, drawn.parameters["cell_m"]),
                 "flags": ",".join(flags),
                 "false": ",".join(flag for flag in flags if flag not in drawn.true_flags),
