@@ -27,6 +27,8 @@ _OUTLIER_SIGMA = 6.0
 LARGEST_UNPAIRED = 0.05
 """Share of the transmitter's pulses before or after the other recording that is worth a remark."""
 
+_FEW = 2  # pulses that a recorder may begin late or end early by
+
 
 def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
     """Return (pair,) bool: which tags leave the line by more than `OUTLIER_S` and six times the scatter of all.
@@ -128,7 +130,7 @@ def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str
     """Return one line on the transmitter's pulses before the first and after the last pair, if they are many."""
     tx, rx = tags
     early, late = int(association.tx_index[0]), tx.size - 1 - int(association.tx_index[-1])
-    if early + late <= LARGEST_UNPAIRED * tx.size:
+    if early + late <= max(LARGEST_UNPAIRED * tx.size, _FEW):
         return None
     line = f"{early} pulses before and {late} after the other recording, of {tx.size}"
     begin_s, end_s = (rx[0] - tx[0]) * 1e-9, (rx[-1] - tx[-1]) * 1e-9

@@ -169,6 +169,30 @@ class Aperture:
             widest = max(widest, float(np.ptp(cycles, axis=0).max()))
         return 1 / widest
 
+    def spectrum(
+        self, point_m: NDArray[np.float64], axes: NDArray[np.float64], *, frequency_hz: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how wide the spatial spectrum of a point is along some axes: its covariance, cycles² per m².
+
+        Parameters
+        ----------
+        point_m
+            (3,) float64, metres.
+        axes
+            (axis, 3) float64, unit vectors.
+        frequency_hz
+            (frequency,) float64, samples of the band, each counting alike.
+
+        Returns
+        -------
+        ndarray
+            (axis, axis) float64. The peak of a point whose noise power is ε of its own scatters by
+            ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
+        """
+        slope = self[self.sample(64)].path_gradient(point_m) @ axes.T
+        cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
+        return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
+
     @property
     def wobble_m(self) -> float:
         """RMS distance of the midpoints from their straight line, metres.

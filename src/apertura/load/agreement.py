@@ -1,10 +1,12 @@
 """How two finished images of a campaign agree, by the bright points that each found in itself."""
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from apertura.quality.agreement import Agreement, agreement
-from apertura.quality.bright_points import BrightPoint
+from apertura.quality.bright_points import BrightPoint, shows_point
 from apertura.scene.grid import SceneGrid
 
 if TYPE_CHECKING:
@@ -12,18 +14,37 @@ if TYPE_CHECKING:
 
 
 def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> Agreement | None:
-    """Return how a second stage `image` lies against a first; None where they share no bright point."""
+    """Return how a second stage `image` lies against a first; None where they share no bright point.
+
+    None as well where pixels are wider than a resolution cell: they do not tell where a point is.
+    """
+    if not comparable(first, second, grid):
+        return None
     return agreement(
         (first.image, second.image),
         (_points(first, grid), _points(second, grid)),
         spacing_m=grid.spacing_m,
-        cell_m=common_cell_m(first, second),
+        cell_m=max(_focus(image)["cell_m"] for image in (first, second)),
+        spectrum=np.mean([_focus(image)["spectrum_cycles2_m2"] for image in (first, second)], axis=0),
     )
 
 
-def common_cell_m(first: "xr.Dataset", second: "xr.Dataset") -> float:
-    """Return the coarser of two images' resolution cells, metres."""
-    return float(max(image.attrs["quality"]["focus"]["cell_m"] for image in (first, second)))
+def comparable(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
+    """Return whether the pixels of two images are fine enough to tell where their points are."""
+    return bool(grid.spacing_m <= min(_focus(image)["cell_m"] for image in (first, second)))
+
+
+def shows_points_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
+    """Return whether a second image has a bright pixel where a first has one of its bright points."""
+    reach = max(1, round(_focus(first)["cell_m"] / grid.spacing_m))
+    return any(
+        shows_point(second.image, round(point.row), round(point.column), reach=reach) for point in _points(first, grid)
+    )
+
+
+def _focus(image: "xr.Dataset") -> dict[str, Any]:
+    focus: dict[str, Any] = image.attrs["quality"]["focus"]
+    return focus
 
 
 def agreement_report(found: Agreement | None) -> dict[str, float] | None:
@@ -32,9 +53,9 @@ def agreement_report(found: Agreement | None) -> dict[str, float] | None:
 
 
 def _points(image: "xr.Dataset", grid: SceneGrid) -> list[BrightPoint]:
-    points = image.attrs["quality"]["focus"]["points"]
+    points = _focus(image)["points"]
     rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
     return [
-        BrightPoint(float(row), float(column), point["amplitude"])
+        BrightPoint(float(row), float(column), point["amplitude"], point["background"])
         for row, column, point in zip(rows, columns, points, strict=True)
     ]

@@ -6,21 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.quality.bright_points import BrightPoint, common_shift
+from apertura.quality.bright_points import BrightPoint, common_shift, shows_point
 from apertura.quality.measures import Raster
 from apertura.quality.point_targets import Patch
 
 REACH_M = 4.0
 """Shifts between two images up to this, or a dozen cells, are looked for."""
 
-SHIFTED_CELLS = 0.1
-"""Images further apart than this, in resolution cells, and than their uncertainty allows, are of different places."""
+SHIFTED = 0.18
+"""Images further apart than this, in units of eq. 6, and than their uncertainty allows, show different places: a tenth
+of the resolution cell."""
 
 OUT_OF_PHASE_RAD = 0.8
 """Two images so far apart in phase lose 0.7 dB when they are added."""
 
-_POINT_CELLS = 0.05  # neighbours pull each peak about so far
+_POINT = 0.09  # in units of eq. 6: neighbours pull each peak by about half a tenth of a cell
 _POINT_RAD = 0.05
+_NEAR_CELLS = 2.0  # one point further off than this may be another one
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Agreement:
         Bright points that both show.
     shift_east_m, shift_north_m, shift_std_m
         Median over the points, and its standard deviation along one axis, metres.
+    shift_units, shift_std_units
+        The same in units of eq. 6, in which a resolution cell is about 1.8 in every direction.
     phase_rad, phase_std_rad
         Mean over the points, and its standard deviation.
     coherence
@@ -45,6 +49,8 @@ class Agreement:
     shift_east_m: float
     shift_north_m: float
     shift_std_m: float
+    shift_units: float
+    shift_std_units: float
     phase_rad: float
     phase_std_rad: float
     coherence: float
@@ -56,9 +62,15 @@ class Agreement:
         """Distance between both images of a point."""
         return float(np.hypot(self.shift_east_m, self.shift_north_m))
 
-    def shifted(self, cell_m: float) -> bool:
-        """Return whether the images are of different places, as far as their points can tell."""
-        return self.shift_m > SHIFTED_CELLS * cell_m + 3 * self.shift_std_m
+    @property
+    def shifted(self) -> bool:
+        """Whether the images show different places, as far as their points can tell."""
+        return self.shift_units > SHIFTED + 3 * self.shift_std_units
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether they are so far apart that their phases at one place mean nothing: half a cell."""
+        return self.shifted and self.shift_units > 5 * SHIFTED
 
     @property
     def out_of_phase(self) -> bool:
@@ -72,6 +84,7 @@ def agreement(
     *,
     spacing_m: float,
     cell_m: float,
+    spectrum: NDArray[np.float64],
 ) -> Agreement | None:
     """Return how two images agree; None where they share no bright point.
 
@@ -84,7 +97,9 @@ def agreement(
     spacing_m
         Pixel spacing.
     cell_m
-        Resolution cell, to which places are told to a tenth.
+        Finest resolution cell: points of both this near to each other, after a common shift, are one.
+    spectrum
+        (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
 
     Notes
     -----
@@ -96,32 +111,49 @@ def agreement(
     >>> y, x = np.mgrid[:64, :64]
     >>> image = (np.sinc((y - 30) / 4) * np.sinc((x - 33) / 4)).astype(np.complex64)
     >>> point = [BrightPoint(30.0, 33.0, 1.0)]
-    >>> found = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4)
+    >>> wide = np.diag([0.5, 0.5])
+    >>> found = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4, spectrum=wide)
     >>> round(found.shift_m, 3), round(found.phase_rad, 3), found.out_of_phase
     (0.0, 1.571, True)
     """
     lists = [[(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in some] for some in points]
     reach = max(REACH_M, 12 * cell_m)
-    _, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
+    shift_m, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
+    if len(met) == 1 and np.hypot(*shift_m) > _NEAR_CELLS * cell_m and not _alone(images[1], points, spacing_m, cell_m):
+        met = common_shift(lists[0], lists[1], reach=_NEAR_CELLS * cell_m, gate=cell_m)[1]
     if not met:
         return None
     apart = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in met])
     values = np.array([_between(images, points[0][i], points[1][j]) for i, j in met])
     shift, count = np.median(apart, axis=0), len(met)
-    spread = 1.4826 * float(np.median(np.abs(apart - shift)))
+    unit = 2 * np.pi * np.linalg.cholesky(spectrum)  # metres to units of eq. 6
+    units = (apart - shift) @ unit
+    background = np.median([points[0][i].background + points[1][j].background for i, j in met]) / 2
+    std = np.hypot(1.2533 * 1.4826 * np.median(np.abs(units)), np.sqrt(background / 2 + _POINT**2)) / np.sqrt(count)
     phasor = _mean_phasor(values)
     ratio_db = 20 * np.log10([points[1][j].amplitude / points[0][i].amplitude for i, j in met])
     return Agreement(
         points=count,
         shift_east_m=float(shift[0]),
         shift_north_m=float(shift[1]),
-        shift_std_m=float(np.hypot(1.2533 * spread, _POINT_CELLS * cell_m) / np.sqrt(count)),
+        shift_std_m=float(std * np.sqrt(np.trace(np.linalg.inv(unit @ unit.T)) / 2)),
+        shift_units=float(np.linalg.norm(shift @ unit)),
+        shift_std_units=float(std),
         phase_rad=float(np.angle(phasor)),
         phase_std_rad=float(np.hypot(np.sqrt(2 * max(0.0, 1 - abs(phasor))), _POINT_RAD) / np.sqrt(count)),
         coherence=float(abs(phasor)),
         amplitude_db=float(np.mean(ratio_db)),
         amplitude_std_db=float(np.std(ratio_db)),
     )
+
+
+def _alone(
+    second: Raster, points: tuple[Sequence[BrightPoint], Sequence[BrightPoint]], spacing_m: float, cell_m: float
+) -> bool:
+    """Return whether a single point of each image can only be the same: there is no other, and none at its old place."""
+    reach = max(1, round(cell_m / spacing_m))
+    old = any(shows_point(second, round(point.row), round(point.column), reach=reach) for point in points[0])
+    return len(points[0]) == len(points[1]) == 1 and not old
 
 
 def _between(images: tuple[Raster, Raster], first: BrightPoint, second: BrightPoint) -> list[complex]:

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from apertura.contracts import Window
 from apertura.quality.measures import Raster
-from apertura.quality.point_targets import find_peak
+from apertura.quality.point_targets import PATCH_PX, find_peak
 
 MOST_POINTS = 16
 DEEPEST_DB = -12.0
 """Points further below the brightest may be its sidelobes."""
+
+
+_SHOWN = 10.0  # power of a point against speckle about it
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,14 @@ class BrightPoint:
         Fractional pixel.
     amplitude
         Magnitude there.
+    background
+        Power of what lies about it, against its own: the median over a patch, as of speckle.
     """
 
     row: float
     column: float
     amplitude: float
+    background: float = 0.0
 
 
 def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:
@@ -64,8 +70,34 @@ def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) ->
             break
         if all(np.hypot(one[1] - row, one[2] - column) >= apart_px for _, row, column in kept):
             kept.append(one)
-    peaks = [find_peak(image, row, column) for _, row, column in kept]
-    return [BrightPoint(peak.row, peak.column, float(abs(peak.value))) for peak in peaks]
+    return [_bright_point(image, row, column) for _, row, column in kept]
+
+
+def shows_point(image: Raster, row: int, column: int, *, reach: int) -> bool:
+    """Return whether an image has a pixel 10 dB above what lies about it within `reach` pixels of a place.
+
+    Examples
+    --------
+    >>> image = np.ones((64, 64), np.complex64)
+    >>> image[30, 31] = 5
+    >>> shows_point(image, 31, 31, reach=2), shows_point(image, 20, 31, reach=2)
+    (True, False)
+    """
+    here, about = (
+        np.abs(
+            np.nan_to_num(np.asarray(image[max(0, row - far) : row + far + 1, max(0, column - far) : column + far + 1]))
+        )
+        for far in (reach, PATCH_PX // 2)
+    )
+    return bool(here.size and here.max() ** 2 > _SHOWN * np.median(about.astype(np.float64) ** 2) / np.log(2))
+
+
+def _bright_point(image: Raster, row: int, column: int) -> BrightPoint:
+    peak = find_peak(image, row, column)
+    about = tuple(slice(max(0, at - PATCH_PX // 2), at + PATCH_PX // 2) for at in (row, column))
+    power = np.abs(np.nan_to_num(np.asarray(image[about[0], about[1]]))).astype(np.float64) ** 2
+    background = float(np.median(power)) / np.log(2) / abs(peak.value) ** 2
+    return BrightPoint(peak.row, peak.column, float(abs(peak.value)), float(background))
 
 
 def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> list[tuple[float, int, int]]:

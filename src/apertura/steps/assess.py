@@ -10,7 +10,7 @@ import xarray as xr
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.fusion.choice import choose_fusion
-from apertura.load.agreement import agreement_of, agreement_report, common_cell_m
+from apertura.load.agreement import agreement_of, agreement_report, comparable, shows_points_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
 from apertura.quality.agreement import Agreement
@@ -31,15 +31,21 @@ def assess(campaign: Campaign, flight: str) -> Path:
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
     reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
     found = {pair: agreement_of(images[reference], images[pair], grid) for pair in pairs if pair != reference}
-    cells = {pair: common_cell_m(images[reference], images[pair]) for pair in found}
-    unconfirmed = {pair for pair, one in found.items() if one is None and _sure(quality[reference]["focus"])}
+    unconfirmed = {
+        pair
+        for pair, one in found.items()
+        if one is None
+        and _sure(quality[reference]["focus"])
+        and comparable(images[reference], images[pair], grid)
+        and not shows_points_of(images[reference], images[pair], grid)
+    }
     fusion = choose_fusion(
         reference,
         found,
-        unfit=_unfit(found, cells, unconfirmed, reference),
+        unfit=_unfit(found, unconfirmed, reference),
         align=campaign.settings.processing.fusion.align_phase,
     )
-    flags = _flags(found, cells, reference, unconfirmed)
+    flags = _flags(found, reference, unconfirmed)
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
     named = _suspected(campaign, flight, images, flags, reference)
@@ -57,25 +63,23 @@ def assess(campaign: Campaign, flight: str) -> Path:
 
 
 def _flags(
-    found: Mapping[str, Agreement | None], cells: Mapping[str, float], reference: str, unconfirmed: Collection[str]
+    found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str]
 ) -> dict[str, dict[str, str]]:
     """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell."""
     lines: dict[str, dict[str, list[str]]] = {pair: {} for pair in (reference, *found)}
     for pair, one in found.items():
-        raised = _disagreement(one, cells[pair], (reference, pair), sure=pair in unconfirmed)
+        raised = _disagreement(one, (reference, pair), sure=pair in unconfirmed)
         for side, (name, line) in product((pair, reference), raised.items()):
             lines[side].setdefault(name, []).append(line)
     return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
 
 
-def _unfit(
-    found: Mapping[str, Agreement | None], cells: Mapping[str, float], unconfirmed: Collection[str], reference: str
-) -> dict[str, str]:
+def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], reference: str) -> dict[str, str]:
     """Return pairs that show other places than the reference, whose phases there mean nothing → why."""
     apart = {
         pair: f"its bright points lie {100 * one.shift_m:.0f} cm from those of {reference}"
         for pair, one in found.items()
-        if one is not None and one.shifted(cells[pair]) and one.shift_m > cells[pair] / 2
+        if one is not None and one.elsewhere
     }
     return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 
@@ -110,14 +114,14 @@ def _sure(focus: Mapping[str, Any]) -> bool:
     return any(point["snr_db"] > _SURE_SNR_DB for point in focus["points"])
 
 
-def _disagreement(one: Agreement | None, cell_m: float, pairs: tuple[str, str], *, sure: bool) -> dict[str, str]:
+def _disagreement(one: Agreement | None, pairs: tuple[str, str], *, sure: bool) -> dict[str, str]:
     """Return flags of the reference and another pair: which of them is wrong, their images alone cannot tell."""
     reference, pair = pairs
     if one is None:
         line = f"{pair} shows none of the bright points of {reference}: its echo is too weak, or one of them is wrong"
         return {"pair_unconfirmed": line} if sure else {}
     raised = {}
-    if one.shifted(cell_m):
+    if one.shifted:
         raised["pairs_apart"] = (
             f"{one.points} bright points of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from "
             f"where {reference} has them, {100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm "

@@ -9,7 +9,7 @@ import xarray as xr
 
 from apertura.campaign import Campaign
 from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
-from apertura.load.agreement import agreement_of, agreement_report, common_cell_m
+from apertura.load.agreement import agreement_of, agreement_report
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.scene.grid import SceneGrid
@@ -66,7 +66,7 @@ def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> d
     for name, other in others:
         found = agreement_of(image, other, grid)
         between[name] = agreement_report(found)
-        if found is not None and found.shifted(common_cell_m(image, other)):
+        if found is not None and found.shifted:
             flags[name] = {
                 "flights_apart": f"{found.points} bright points of flight {name} lie {100 * found.shift_m:.1f} ± "
                 f"{100 * found.shift_std_m:.1f} cm from where flight {first} has them, {100 * found.shift_east_m:+.1f} "
