@@ -60,7 +60,7 @@ def draw_right(number: int, *, seed: int = 0) -> Drawn:
     specification = CampaignSpecification(f"right{number}", origin, waveform, targets, nodes, (flight,), grid)
     _weak_echoes(waveform, snr_db, scene, true)
     missed = max(node.impairments.missed_fraction for node in nodes.values())
-    if missed > 0.03:
+    if missed > 0:
         true["pulses_missing"] = f"a node misses {100 * missed:.0f} % of its triggers"
     parameters = _parameters(waveform, geometry, bandwidth_hz) | {
         "snr_db": round(snr_db, 1), "receivers": receivers, "scene": scene, "origin_height_m": origin.height_m,

@@ -150,7 +150,7 @@ def agreement(
 def _alone(
     second: Raster, points: tuple[Sequence[BrightPoint], Sequence[BrightPoint]], spacing_m: float, cell_m: float
 ) -> bool:
-    """Return whether a single point of each image can only be the same: there is no other, and none at its old place."""
+    """Return whether a single point of each image can only be the same: no other, and none at its old place."""
     reach = max(1, round(cell_m / spacing_m))
     old = any(shows_point(second, round(point.row), round(point.column), reach=reach) for point in points[0])
     return len(points[0]) == len(points[1]) == 1 and not old
