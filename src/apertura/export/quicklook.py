@@ -119,7 +119,7 @@ def _focus_words(tags: Mapping[str, str]) -> list[str]:
     if "APERTURA_FOCUS" not in tags:
         return []
     focus = json.loads(tags["APERTURA_FOCUS"])
-    loss = f" ({-focus['loss_db']:.1f} dB lost)" if "loss_db" in focus else ""
+    loss = f" ({abs(focus['loss_db']):.1f} dB lost)" if "loss_db" in focus else ""
     return [f"focus: {focus['verdict']}{loss}"]
 
 

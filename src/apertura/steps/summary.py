@@ -54,10 +54,10 @@ def _table(reports: dict[tuple[str, str], dict[str, Any]]) -> "Table":
         table.add_column(heading, overflow="fold")
     for (flight, name), report in reports.items():
         focus, pulses, coherence = (report.get(key) or {} for key in ("focus", "pulses", "coherence"))
-        lost = f", {-focus['loss_db']:.1f} dB lost" if "loss_db" in focus else ""
+        lost = f", {abs(focus['loss_db']):.1f} dB lost" if "loss_db" in focus else ""
         unstated = sum(line["stated"].startswith("not stated") for line in report.get("budget", ()))
         silent = f", {unstated} causes not stated" if unstated else ""
-        expected = f"{-focus['expected_db']:.1f} dB{silent}" if "expected_db" in focus else ""
+        expected = f"{abs(focus['expected_db']):.1f} dB{silent}" if "expected_db" in focus else ""
         mean = coherence.get("mean")
         table.add_row(
             flight,
