@@ -6,3 +6,7 @@ module apertura:
 
 
 use rule * from apertura
+
+
+onsuccess:
+    shell("apertura summary")

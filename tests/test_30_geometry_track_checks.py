@@ -5,7 +5,8 @@ import pytest
 
 from apertura.geometry.phase_centres import position_spline
 from apertura.geometry.track_checks import check_track
-from apertura.geometry.track_faults import find_frozen, find_spikes, find_steps, misfits, rounded_time_m, scatter_m
+from apertura.geometry.track_faults import find_spikes, find_steps, misfits, scatter_m
+from apertura.geometry.track_writing import find_frozen, rounded_time_m
 
 X_BAND_M = 0.0316 / 16
 
@@ -44,10 +45,10 @@ def checked(time_s, place, *, poor=None, tolerated_m=X_BAND_M):
 @pytest.mark.parametrize("kind", ["hover", "straight", "circle", "legs"])
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0, 50.0, 100.0])
 def test_a_good_log_has_no_fault_and_no_hole(kind, rate_hz):
-    """Whatever its noise, its grain and its jitter; and 100 Hz logs of slow flights repeat coarse positions by right."""
+    """Whatever its noise, its grain and its jitter; at 100 Hz coarse positions repeat by right."""
     for seed, noise_m in enumerate((0.0, 0.001, 0.01, 0.03)):
         for grain_m, unequal in ((0.0, 0.0), (1e-4, 0.2), (0.01, 0.0), (0.01, 0.2)):
-            given = dict(rate_hz=rate_hz, noise_m=noise_m, grain_m=grain_m, unequal=unequal, seed=seed)
+            given = {"rate_hz": rate_hz, "noise_m": noise_m, "grain_m": grain_m, "unequal": unequal, "seed": seed}
             result = checked(*logged(kind, **given))
             assert result.kept.all(), given
             assert result.holes == (), given

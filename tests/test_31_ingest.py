@@ -49,6 +49,41 @@ def test_gps_weeks_and_calendar_dates_are_the_same_times(tmp_path):
     np.testing.assert_array_equal(dates.time.values, weeks.time.values)
 
 
+def test_a_solution_says_of_what_kind_it_is_and_how_good(tmp_path):
+    columns = "ns   sdn(m)   sde(m)   sdu(m)  sdne(m)"
+    lines = [
+        f"2025/05/14 09:30:1{n}.0 48.0 9.0 600.0 {q} 18 0.01 0.02 {up} 0.0" for n, q, up in ((6, 1, 0.03), (7, 2, 0.6))
+    ]
+    (tmp_path / "a.pos").write_text(HEADER.replace("Q\n", f"Q {columns}\n").format("UTC") + "\n".join(lines) + "\n")
+    track = check(read_track(tmp_path / "a.pos", node="a"), "track")
+    assert track.fix.values.tolist() == [1, 2]
+    np.testing.assert_array_equal(track.position_std.values, [[0.01, 0.02, 0.03], [0.01, 0.02, 0.6]])  # north, east, up
+    short = pos(tmp_path / "b.pos", "UTC", *(line[:45] for line in lines))
+    assert short.fix.values.tolist() == [1, 2]
+    assert "position_std" not in short
+
+
+CSV = "time_utc,latitude_deg,longitude_deg,height_m,quality,std_north_m,std_east_m,std_up_m\n"
+
+
+def csv_log(path, *cells):
+    rows = [f"2025-05-14T09:30:1{n}Z,48,9,600,{cell}" for n, cell in enumerate(cells)]
+    path.write_text(CSV + "\n".join(rows) + "\n")
+    return check(read_track(path, node="a"), "track")
+
+
+def test_a_csv_log_says_how_good_it_is(tmp_path):
+    track = csv_log(tmp_path / "a.csv", "fix,0.01,0.02,0.03", "Float,1,1,1", ",,,", "5,2,2,2")
+    assert track.fix.values.tolist() == [1, 2, 0, 5]
+    np.testing.assert_array_equal(track.position_std.values[[0, 2]], [[0.01, 0.02, 0.03], [np.nan] * 3])
+    numbers = csv_log(tmp_path / "b.csv", "1,1,1,1", ",1,1,1", "2,1,1,1")  # which pandas reads as 1.0, NaN, 2.0
+    assert numbers.fix.values.tolist() == [1, 0, 2]
+    with pytest.raises(
+        CampaignError, match=r"quality 'fixed'; expected .*quality \(fix, float, sbas, dgps, single, ppp"
+    ):
+        csv_log(tmp_path / "c.csv", "fixed,1,1,1", "1,1,1,1")
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

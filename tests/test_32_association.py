@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.echo.association import associate, detect_wrong_association
+from apertura.echo.association import associate
+from apertura.echo.baseline import EXPLAINED_M, baseline_residual, best_baseline, detect_wrong_association
 from apertura.errors import CampaignError
 
 NS = 1_000_000_000
@@ -205,7 +206,7 @@ def sidelink_of_a_flight(rng, wrong_from, lag, jitter_m=0.03):
 @pytest.mark.parametrize(("lag", "detected"), [(0, False), (1, False), (20, True), (-20, True)])
 def test_pulses_with_somebody_elses_positions_show_in_the_sidelink(lag, detected):
     measured, predicted = sidelink_of_a_flight(np.random.default_rng(14), 130, lag)
-    message = detect_wrong_association(measured, predicted)
+    message = detect_wrong_association(baseline_residual(measured, predicted))
     assert (message is not None) == detected
 
 
@@ -213,7 +214,57 @@ def test_one_wild_sidelink_measurement_is_no_wrong_association():
     measured, predicted = sidelink_of_a_flight(np.random.default_rng(15), 400, 0)
     measured[[77, 200]] += 9.0
     measured[300:320] = np.nan
-    assert detect_wrong_association(measured, predicted) is None
+    assert detect_wrong_association(baseline_residual(measured, predicted)) is None
+
+
+def test_no_right_association_of_500_with_jittery_tags_is_suspected():
+    """Jitter of the trigger from 1 mm to 3 m, Gaussian and uniform, over 30 to 800 pulses: at most one false alarm."""
+    alarms = 0
+    for seed in range(500):
+        rng = np.random.default_rng(seed)
+        time, jitter_m = np.arange(rng.integers(30, 800)) * 0.05, 10 ** rng.uniform(-3, 0.5)
+        distance = np.hypot(4.7, rng.uniform(0.2, 2) * (time - time.mean())) + 0.2 * np.sin(time * rng.uniform(0.5, 2))
+        jitter = rng.normal(0, jitter_m, time.size) if seed % 2 else rng.uniform(-jitter_m, jitter_m, time.size)
+        residual = baseline_residual(distance + 12 + 1e-3 * time + jitter, distance)
+        alarms += detect_wrong_association(residual) is not None
+    assert alarms <= 1
+
+
+@pytest.mark.parametrize(("size_m", "found"), [(0.8, False), (1.25, True)])
+def test_a_slow_movement_is_found_just_above_what_positions_may_explain(size_m, found):
+    """Jitter of 0.15 m hides 16 cm and more from a median of 15 pulses; a longer one sees them."""
+    rng = np.random.default_rng(3)
+    time = np.arange(1600) / 20
+    moved = size_m * EXPLAINED_M * np.cos(2 * np.pi * time / 40)
+    residual = baseline_residual(5 + moved + rng.normal(0, 0.005, time.size), np.full(time.size, 5.0))
+    assert residual.jitter_m == pytest.approx(0.005, rel=0.1)
+    assert (detect_wrong_association(residual) is not None) == found
+    hidden = baseline_residual(5 + 4 * moved + rng.normal(0, 0.15, time.size), np.full(time.size, 5.0))
+    assert hidden.excess > 1
+    assert hidden.noise_m < 0.03
+
+
+def test_of_several_baselines_the_one_that_is_measured_is_named_and_none_if_the_first_is_right():
+    rng, time = np.random.default_rng(4), np.arange(800) / 20
+    shifted = {
+        f"{late:+d} s": np.hypot(4.7, time + late - 20) + 0.3 * np.sin((time + late) / 3) for late in range(-20, 21)
+    }
+    measured = shifted["-18 s"] + 7 + rng.normal(0, 0.05, time.size)
+    name, residual_m = best_baseline(measured, {"as stated": shifted["+0 s"], **shifted})
+    assert name == "-18 s"
+    assert residual_m < 0.05
+    assert (
+        best_baseline(shifted["+0 s"] + rng.normal(0, 0.05, time.size), {"as stated": shifted["+0 s"], **shifted})
+        is None
+    )
+    assert best_baseline(measured[:20], {name: one[:20] for name, one in shifted.items()}) is None
+
+
+def test_pulses_at_both_ends_are_not_counted_more_than_once():
+    """One wild pulse at the very end of a flight is no movement."""
+    measured = 5 + np.random.default_rng(5).normal(0, 0.02, 60)
+    measured[[0, -1]] += 1.0
+    assert detect_wrong_association(baseline_residual(measured, np.full(60, 5.0))) is None
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

@@ -127,8 +127,23 @@ def test_a_clock_is_corrected_only_when_the_asked_accuracy_needs_it(ppm, accurac
 
 
 def test_a_clock_that_noise_only_suggests_is_left_alone():
-    assert not decision(2.0, std_hz=3000.0).correct
-    assert decision(2.0, std_hz=1000.0).correct
+    """2400 Hz: left alone below three standard deviations, and both are stated."""
+    assert not decision(2.0, std_hz=820.0).correct
+    assert decision(2.0, std_hz=820.0).reason.startswith("clock 2.00 ± 0.68 ppm fast")
+    assert decision(2.0, std_hz=820.0).reason.endswith("left alone: below 3 σ")
+    assert decision(2.0, std_hz=780.0).correct
+    assert ClockOffset(2400.0, 0.0, 2.0, 820.0, 0.1, one_clock=True).ppm(NUMEROLOGY) == pytest.approx(
+        (2.0, 0.6833), abs=1e-3
+    )
+
+
+def test_a_true_clock_under_a_weak_sidelink_is_left_alone_whatever_it_seems_to_be():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        offset = estimate_clock(record(0.7e-6, cfo_hz=60.0, sfo_hz=5.0, pulses=48, snr_db=-14, rng=rng), NUMEROLOGY)
+        ppm, std_ppm = offset.ppm(NUMEROLOGY)
+        assert abs(ppm - 0.05) < 5 * std_ppm
+        assert not decide_clock(offset, NUMEROLOGY, accuracy_db=-60).correct
 
 
 @pytest.mark.parametrize(("std_hz", "flagged"), [(250.0, False), (1000.0, True)])

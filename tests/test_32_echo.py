@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal.windows import hann
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
@@ -124,6 +125,15 @@ def test_the_hann_window_widens_the_cell_and_lowers_the_sidelobes():
         levels[window] = 20 * np.log10(profile[beyond:300].max() / profile[0])
     assert levels["none"] == pytest.approx(-13.3, abs=0.2)
     assert levels["hann"] == pytest.approx(-31.5, abs=0.3)
+
+
+@pytest.mark.parametrize("count", [3, 64, 1023, 1024])
+def test_the_hann_window_is_the_symmetric_one(count):
+    """A profile of another program, or a closed formula, is compared with this definition and no other."""
+    expected = hann(count, sym=True)
+    np.testing.assert_allclose(window_weights("hann", count), expected / expected.sum(), atol=1e-15)
+    periodic = hann(count, sym=False)
+    assert np.abs(window_weights("hann", count) - periodic / periodic.sum()).max() > 1e-9
 
 
 EPOCHS = np.datetime64("2025-05-14T09:30", "ns") + np.arange(20) * np.timedelta64(100, "ms")

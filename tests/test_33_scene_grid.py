@@ -9,7 +9,7 @@ from scenes import UTM_GRID
 
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
-from apertura.geometry.geodesy import ecef_from_projected, projected_from_ecef
+from apertura.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
 from apertura.scene.auto_grid import auto_bounds, utm_crs
 from apertura.scene.grid import SceneGrid
 from apertura.scene.pixel_positions import block
@@ -123,3 +123,54 @@ def test_automatic_bounds_hold_ground_on_both_sides_of_the_track():
         np.sqrt(75), abs=1
     )
     assert utm_crs(ecef_from_projected("EPSG:32755", *map(np.array, (5e5, 6.1e6, 0.0)))) == "EPSG:32755"
+
+
+def test_a_flight_at_the_edge_of_a_utm_zone_gets_automatic_bounds_that_its_zone_takes():
+    """Three metres east of 12° E: zone 33, bounds that reach over the edge."""
+    edge_m, north_m, _ = projected_from_ecef("EPSG:32633", ecef_from_geodetic(48.0, 12.0, 600.0))
+    east_m, height_m = np.full((2, 41), [[edge_m + 3], [610.0]])
+    track = ecef_from_projected("EPSG:32633", east_m, north_m + np.linspace(-20, 20, 41), height_m)
+    crs = utm_crs(track[20])
+    bounds = auto_bounds(Aperture(track, track), crs=crs, height_m=600.0, path_limit_m=np.inf)
+    assert crs == "EPSG:32633"
+    assert bounds[0] < edge_m < bounds[2]
+    assert SceneGrid.from_bounds(crs, bounds, spacing_m=1.0).bounds_m == bounds
+
+
+@pytest.mark.parametrize("zone", ["EPSG:32632", "EPSG:32633"])
+def test_bounds_across_an_edge_of_zones_are_taken_by_both(zone):
+    x, y, _ = projected_from_ecef(zone, ecef_from_geodetic(48.0, 12.0, 600.0)).round()
+    grid = SceneGrid.from_bounds(zone, (x - 50, y - 50, x + 50, y + 50), spacing_m=1.0)
+    place = projected_from_ecef(zone, grid.positions_at([50.0], [50.0], 600.0))[0]
+    np.testing.assert_allclose(place, (*grid.map_at(50.0, 50.0), 600.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("crs", "latitude", "longitude"),
+    [
+        ("EPSG:3460", -17.0, 179.9),
+        ("EPSG:3460", -17.0, -179.5),
+        ("EPSG:3851", -41.0, 174.8),
+        ("EPSG:3832", 20.0, 150.0),
+    ],
+)
+def test_a_crs_in_use_across_the_180th_meridian_is_taken(crs, latitude, longitude):
+    x, y, _ = projected_from_ecef(crs, ecef_from_geodetic(latitude, longitude, 10.0)).round()
+    assert SceneGrid.from_bounds(crs, (x, y, x + 10, y + 10), spacing_m=1.0).shape == (10, 10)
+
+
+@pytest.mark.parametrize(("longitude", "taken"), [(3.1, True), (2.9, False), (14.9, True), (15.1, False)])
+def test_utm_is_taken_to_three_degrees_beyond_its_zone(longitude, taken):
+    x, y, _ = projected_from_ecef("EPSG:32632", ecef_from_geodetic(48.0, longitude, 10.0)).round()
+    bounds = (x, y, x + 10, y + 10)
+    if taken:
+        SceneGrid.from_bounds("EPSG:32632", bounds, spacing_m=1.0)
+    else:
+        with pytest.raises(CampaignError, match=r"within 3 degrees of the area of use of WGS 84 / UTM zone 32N"):
+            SceneGrid.from_bounds("EPSG:32632", bounds, spacing_m=1.0)
+
+
+def test_coordinates_that_a_projection_does_not_lead_back_from_are_refused():
+    """Beyond the end of Mercator's map: longitude 181 would be -179 again."""
+    with pytest.raises(CampaignError, match="reach longitude"):
+        SceneGrid.from_bounds("EPSG:3857", (20037500.0, 0.0, 20037520.0, 10.0), spacing_m=1.0)

@@ -7,8 +7,9 @@ from apertura.geometry.aperture import Aperture
 from apertura.quality.agreement import agreement
 from apertura.quality.bright_points import BrightPoint, bright_points, common_shift
 from apertura.quality.budget import BudgetLine, NodePositions, accuracy_for, expected, position_line
-from apertura.quality.focus import judge, point_focus
+from apertura.quality.focus import judge, judge_parts, point_focus
 from apertura.quality.path_errors import Effect, PointPaths
+from apertura.quality.sub_apertures import compare_parts
 
 PULSES, WAVELENGTH_M = 600, 0.214
 
@@ -173,3 +174,24 @@ def test_the_shift_is_the_one_that_most_brightness_agrees_on():
     shift, met = common_shift(here, there, reach=4.0, gate=0.3)
     assert shift == pytest.approx((2.5, -1.5))
     assert met == [(number, number) for number in range(6)]
+
+
+def test_parts_that_drift_apart_are_seen():
+    generator = np.random.default_rng(7)
+    y, x = np.mgrid[:64, :64]
+
+    def patches(step_px):
+        """Four patches, each with a point of its own, that moves from part to part."""
+        found = np.zeros((4, 2, 8, 64, 64), np.complex64)
+        for patch, (row, column) in enumerate(generator.uniform(28, 36, (4, 2))):
+            for part in range(8):
+                lobe = np.sinc((x - column - step_px * part) / 12) * np.sinc((y - row) / 3)
+                found[patch, :, part] = lobe + 0.01 * complex_noise(generator, (2, 64, 64))
+        return compare_parts(found, spacing_m=0.1, generator=generator)
+
+    still, moving = patches(0.0), patches(2.0)
+    assert still.drift_m < 0.02
+    assert moving.drift_m == pytest.approx(0.2 * np.sqrt((8**2 - 1) / 12), rel=0.15)
+    assert judge_parts(still, cell_m=0.3).verdict == "cannot tell"
+    assert judge_parts(moving, cell_m=0.3).verdict == "defocused"
+    assert still.snr_db > 10

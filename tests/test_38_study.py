@@ -14,12 +14,14 @@ from apertura.simulation.synthesis import samples
 from apertura.study import commands
 from apertura.study.dft_window import demodulated, window_samples
 from apertura.study.paper import formulas
-from apertura.study.paper.claims import Claim, compare, require
-from apertura.study.paper.coherence import coherence_claims
+from apertura.study.paper.claims import AGREES, DISAGREES, EXPLAINED, UNTESTABLE, Claim, compare, require
 from apertura.study.paper.corrected import clock_claims, corrected_claims
+from apertura.study.paper.effects import effect_claims
 from apertura.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
 from apertura.study.paper.parameters import parameter_claims
+from apertura.study.paper.positions import position_claims
 from apertura.study.paper.resolution import simulated_table, uav_table
+from apertura.study.paper.swarm import swarm_claims, trigger_claims
 from apertura.study.paper_scene import UNDISTURBED, Disturbance, receive_pair, receive_undisturbed, reduced_scene
 from apertura.study.point_response import (
     amplitude_db,
@@ -54,7 +56,8 @@ def test_what_follows_from_parameters_is_what_the_paper_says():
     assert rows["timing of the samples 2δR/c, δR = 2 cm"].computed == "133.4"
     disagree = {"OFDM symbol T against 1/Δf", "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"}
     disagree |= {"SFO limit in ppm of f_s", "CFO of a clock off by 10 ppb", "SFO of a clock off by 10 ppb"}
-    assert {name for name, row in rows.items() if not row.verdict.startswith("agrees")} == disagree
+    assert {name for name, row in rows.items() if row.verdict != AGREES} == disagree
+    assert rows["effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"].verdict == UNTESTABLE
 
 
 def test_what_the_paper_prints_stands_as_printed_even_where_it_is_wrong():
@@ -67,7 +70,7 @@ def test_what_the_paper_prints_stands_as_printed_even_where_it_is_wrong():
         "CFO of a clock off by 10 ppb": ("41", "12"),
         "SFO of a clock off by 10 ppb": ("12", "40.96"),
     }
-    assert all(rows[name].verdict.startswith("differs") for name in printed)
+    assert [rows[name].verdict for name in printed] == [DISAGREES, EXPLAINED, EXPLAINED]
 
 
 def test_contradictions_of_the_paper_are_noted_where_they_stand():
@@ -77,8 +80,8 @@ def test_contradictions_of_the_paper_are_noted_where_they_stand():
         "CFO of a clock off by 10 ppb",
         "UAV flight: cross-range width as printed",
     ):
-        assert "contradicts itself" in rows[name].verdict
-    assert rows["UAV flight: cross-range width as printed"].verdict.startswith("differs")
+        assert "contradicts itself" in rows[name].note
+    assert rows["UAV flight: cross-range width as printed"].verdict == DISAGREES
 
 
 def test_limits_are_where_orthogonality_ends():
@@ -92,31 +95,66 @@ def test_limits_are_where_orthogonality_ends():
 def test_coherence_follows_from_snr_and_back():
     for coherence in (0.3, 0.986, 0.9999):
         snr = formulas.snr_of_coherence_factor(coherence, 200)
-        assert (snr + 1 / 200) / (snr + 1) == pytest.approx(coherence, rel=1e-12)  # 1/M without an echo
+        assert formulas.coherence_of_snr(snr, 200) == pytest.approx(coherence, rel=1e-12)
+    assert formulas.coherence_of_snr(0.0, 200) == 1 / 200  # without an echo
 
 
 def test_five_targets_are_as_wide_as_the_independent_model_says():
-    claims = simulated_table(pulses=150)
-    assert len(claims) == 10
-    assert not any(claim.paper for claim in claims)
-    assert [claim.claim for claim in claims if not claim.verdict.startswith("agrees")] == []
+    printed, modelled = [], []
+    for claim in simulated_table(pulses=150):
+        (printed if claim.paper else modelled).append(claim)
+    assert len(modelled) == 10
+    assert [claim.claim for claim in modelled if claim.verdict != AGREES] == []
+    assert [(claim.paper, claim.verdict) for claim in printed] == [("35", AGREES), ("73", AGREES), ("9", EXPLAINED)]
 
 
-def test_uav_flight_is_as_wide_as_the_paper_says_and_fusion_with_the_chosen_segments():
+def test_uav_flight_is_as_wide_as_the_paper_says_and_fusion_with_the_fitted_segments():
     rows = by_claim(uav_table(pulses=60))
-    for name, width_cm in (("cross-range width, fused", 11), ("ground-range width, fused", 49)):
-        row = rows[f"UAV flight: {name}"]
+    for name, width_cm in (("cross-range", 11), ("ground-range", 49)):
+        row = rows[f"UAV flight: {name} width, fused, fitted segments"]
         assert float(row.computed) == pytest.approx(width_cm, rel=0.05)
-        assert row.verdict.startswith("consistency check: recovered")
-    assert rows["UAV flight: ground-range width, Hann, mono"].verdict.startswith("agrees")
+        assert row.verdict == EXPLAINED  # agreeing proves nothing where three values were chosen for it
+        assert "by construction" in row.note
+    assert rows["UAV flight: ground-range width, Hann, mono"].verdict == AGREES
 
 
-def test_coherence_is_one_over_m_without_correction_and_that_of_the_noise_with_it():
-    uncorrected, *corrected = coherence_claims(draws=12)
-    assert uncorrected.verdict.startswith("agrees")
-    assert float(uncorrected.computed) == pytest.approx(1 / 200, abs=0.005)
-    assert [claim.paper for claim in corrected] == ["0.986", "0.9999", "0.9995"]
-    assert all(claim.verdict.startswith("consistency check: recovered") for claim in corrected)
+def test_timing_shifts_and_turns_a_profile_and_a_carrier_phase_leaves_its_magnitude():
+    shift, phase, small, magnitude = effect_claims()
+    assert float(shift.computed) == pytest.approx(0.4096, rel=0.01)
+    assert float(phase.computed) == pytest.approx(0.2, abs=0.005)  # 1.2 turns
+    assert float(small.computed) < 0.25
+    assert float(magnitude.computed) < -90
+    assert {claim.verdict for claim in (shift, phase, small, magnitude)} == {AGREES}
+
+
+def test_errors_along_the_sidelink_cancel_only_where_both_nodes_share_them():
+    both, one = position_claims(draws=1)[-2:]
+    assert (both.verdict, one.verdict) == (AGREES, DISAGREES)
+    assert float(one.computed) == pytest.approx(1 - 2.35 / np.hypot(2.35, np.hypot(15, 10)), abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_tenth_of_a_wavelength_is_enough_as_the_largest_error_and_too_much_as_a_deviation():
+    wavelength, deviation, largest, equal, *_ = position_claims()
+    assert (wavelength.verdict, deviation.verdict, largest.verdict, equal.verdict) == (
+        AGREES,
+        DISAGREES,
+        AGREES,
+        AGREES,
+    )
+    assert float(deviation.computed) < -4
+
+
+@pytest.mark.slow
+def test_receivers_of_a_swarm_add_up_in_phase_and_gain_ten_lg_n():
+    efficiency, gain, *_ = swarm_claims()
+    assert float(efficiency.computed) > 0.99
+    assert float(gain.computed) == pytest.approx(6.02, abs=0.5)
+
+
+def test_the_trigger_finds_every_pulse_where_it_is():
+    found, error = trigger_claims(pulses=4)
+    assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +182,8 @@ def test_localization_costs_what_the_independent_model_says(monkeypatch):
     monkeypatch.setitem(ERRORS, "localization", replace(error, independent_model_db={1: -1.24}, pulses=300))
     (claim,) = loss_claims("localization", draws=6)
     assert (claim.paper, claim.independent_model) == ("", "-1.24")
-    assert claim.verdict.startswith("agrees within 1 dB; mean of 6 draws, spread")
+    assert claim.verdict == AGREES
+    assert claim.note.startswith("to within 1 dB; mean of 6 draws, spread")
 
 
 @pytest.mark.slow
@@ -152,9 +191,9 @@ def test_localization_costs_what_the_independent_model_says(monkeypatch):
 def test_every_row_of_the_loss_table_is_met(name):
     claims = loss_claims(name)
     assert len(claims) == len(ERRORS[name].independent_model_db)
-    assert [(c.claim, c.verdict) for c in claims if not c.verdict.startswith("agrees")] == []
+    assert [(c.claim, c.verdict) for c in claims if c.verdict != AGREES] == []
     deep = [claim for claim in claims if float(claim.independent_model) < DESTROYED_DB]
-    assert all("destroyed" in claim.verdict for claim in deep)
+    assert all("destroyed" in claim.note for claim in deep)
 
 
 @pytest.mark.slow
@@ -162,14 +201,14 @@ def test_phase_and_timing_inside_the_prefix_cost_nothing_after_any_correction():
     claims = corrected_claims()
     assert len(claims) == 4
     assert all(float(claim.computed) < 0.01 for claim in claims)
-    assert all(claim.verdict.startswith("meets this project's requirement (below 0.01 dB)") for claim in claims)
+    assert all(claim.verdict == AGREES for claim in claims)
 
 
 @pytest.mark.slow
-def test_correcting_an_8_ppm_clock_in_the_samples_lowers_the_floor_by_20_db():
+def test_an_8_ppm_clock_corrected_in_noisy_samples_leaves_the_floor_of_a_perfect_one():
     (claim,) = clock_claims(pulses=20)
-    assert float(claim.computed) > 20
-    assert "consistency check" in claim.verdict
+    assert float(claim.computed) < 0.5
+    assert "8.000 ppm" in claim.note or "7.99" in claim.note or "8.00" in claim.note
 
 
 def test_fewer_pulses_and_subcarriers_do_not_change_a_loss():
@@ -241,33 +280,35 @@ def test_peaks_widths_and_coherence_agree_with_their_definitions():
 
 def test_a_loss_table_row_says_destroyed_only_where_both_are(monkeypatch):
     row = compare("x", -5.0, "dB", independent_model=-20.0, within=0.5, relative=False)
-    assert row.verdict == "differs by +15 dB"
+    assert (row.verdict, row.note) == (DISAGREES, "differs by +15 dB")
     error = ERRORS["carrier_phase"]
     expected_db = {1.0: -30.0, 0.9: 0.0}
     monkeypatch.setitem(ERRORS, "carrier_phase", replace(error, independent_model_db=expected_db, pulses=300))
     claim, other = loss_claims("carrier_phase", draws=1)
-    assert other.verdict.startswith("differs")
-    assert claim.verdict.startswith("agrees: destroyed")
+    assert (claim.verdict, other.verdict) == (AGREES, DISAGREES)
+    assert claim.note.startswith("destroyed")
+    assert other.note.startswith("differs")
 
 
-def test_a_row_says_whose_value_it_is_compared_with():
+def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
     ours = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, note="n")
-    assert (ours.paper, ours.independent_model, ours.verdict) == (
-        "",
-        "",
-        "misses this project's requirement (below 0.01 dB); n",
-    )
-    for both in ({}, {"paper": 1.0, "independent_model": 1.0}):
-        with pytest.raises(ValueError, match="exactly one"):
-            compare("x", 1.0, "1", within=0.1, **both)
+    assert ours == Claim("x", "", "", "0.02", "dB", DISAGREES, "required here: below 0.01 dB; n")
+    both = compare("x", 1.0, "1", paper=2.0, independent_model=1.0, within=0.1)
+    assert (both.paper, both.independent_model, both.verdict) == ("2", "1", DISAGREES)  # the paper's comes first
+    assert both.note == "differs by -50.0 %"
+    known = compare("x", 1.0, "1", paper=2.0, within=0.1, reason="swapped", note="n")
+    assert (known.verdict, known.note) == (EXPLAINED, "differs by -50.0 %; swapped; n")
+    assert compare("x", 2.0, "1", paper=2.0, within=0.1, reason="swapped").note == ""
+    with pytest.raises(ValueError, match="neither"):
+        compare("x", 1.0, "1", within=0.1)
 
 
 def test_claims_survive_their_file(tmp_path):
-    rows = [Claim("a, b", "1", "", "2", "dB", 'differs; says "so"'), Claim("c", "", "", "3", "1", "computed")]
+    rows = [Claim("a, b", "1", "", "2", "dB", DISAGREES, 'says "so"'), Claim("c", "", "", "3", "1", AGREES, "")]
     path = tmp_path / "deep" / "claims.csv"
     write_table(path, rows)
     assert read_table(path, Claim) == rows
-    assert path.read_text().splitlines()[0] == "claim,paper,independent_model,computed,unit,verdict"
+    assert path.read_text().splitlines()[0] == "claim,paper,independent_model,computed,unit,verdict,note"
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -395,7 +436,7 @@ def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
     ("arguments", "named"),
     [
         (("paper-part", "loss_x"), "loss_timing"),
-        (("paper-figure", "x"), "carrier_phase"),
+        (("paper-figure", "x"), "uav_cuts"),
         (("stability-sweep", "x", "divide"), "missed_triggers"),
         (("stability-sweep", "timing", "x"), "two_parameter"),
         (("stability-chart", "x"), "missed_triggers"),

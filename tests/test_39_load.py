@@ -6,10 +6,15 @@ import shutil
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, copy_writable
+from folders import complaint, copy_writable, edit_config, ingest_all
 
+from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.load.pair import open_pair
 from apertura.load.results import OpenCampaign, open_campaign
+from apertura.load.scene import expected_scene, settled_scene
+from apertura.steps import echo, scene
+from apertura.steps.plan import first_flight
 from apertura.steps.verify import verify
 
 PAIR = ("f01", "uav1-uav2")
@@ -90,3 +95,25 @@ def test_a_stage_that_is_asked_for_without_its_place_says_what_is_missing(opened
     assert "campaign.stage('echo'): given f01; expected a flight and a pair" in message
     assert "given nothing more; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
     assert "given f01; expected the stage alone" in complaint(lambda: opened.stage("cube", "f01"))
+
+
+def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(tiny):
+    """Automatic bounds hold what all pairs of the first image flight see, not what the planned pair does."""
+    edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto", spacing_m="auto"))
+    campaign = Campaign.load(tiny)
+    expected = expected_scene(campaign, lambda: first_flight(campaign)).grid
+    ingest_all(campaign)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        echo.echo(campaign, "f01", pair)
+    scene.scene(campaign)
+    assert settled_scene(campaign).grid == expected
+
+
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_prefix_ends_where_the_plan_expects_it(tiny, pair):
+    """Automatic bounds may end there: path offsets and the sidelink's length count before the echo is formed."""
+    campaign = Campaign.load(tiny)
+    expected_m = open_pair(campaign, "f01", pair).path_limit_m
+    ingest_all(campaign)
+    echo.echo(campaign, "f01", pair)
+    assert open_pair(campaign, "f01", pair).path_limit_m == pytest.approx(expected_m, abs=0.05)

@@ -48,6 +48,19 @@ def test_an_aperture_sampled_below_the_scenes_doppler_band_is_flagged(spread, fl
     assert ("pulses_sparse" in plan(aperture=monostatic(apart)).flags) == flagged
 
 
+def test_missed_pulses_and_gaps_do_not_undersample_an_aperture():
+    """A fifth missed at random and a gap of a tenth, of an aperture sampled seven times as finely as needed."""
+    points = ground_points().reshape(-1, 3)
+    whole, _ = monostatic(straight_track(3000)).phase_rates(points, wavelength_m=C / 1.4e9)
+    kept = np.random.default_rng(1).random(3000) > 0.2
+    kept[1200:1500] = False
+    left = monostatic(straight_track(3000)[kept])
+    spread, widest = left.phase_rates(points, wavelength_m=C / 1.4e9)
+    assert spread == pytest.approx(whole, rel=0.05)
+    assert widest > 100 * whole
+    assert "pulses_sparse" not in plan(aperture=left).flags
+
+
 def test_an_override_that_is_predicted_to_miss_is_flagged():
     missed = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
     assert "dB, -60 dB asked: tiles that miss it are formed again" in missed.flags["prediction_misses"]

@@ -8,6 +8,7 @@ import pytest
 from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all
 
 from apertura.campaign import Campaign
+from apertura.load.pair import open_pair
 from apertura.steps import echo, ingest, profile, scene
 
 
@@ -316,3 +317,33 @@ def test_a_wrong_line_of_flights_is_named(tiny, line, expected):
     message = complaint(lambda: Campaign.load(tiny))
     assert "flights.tsv: line 3" in message
     assert expected in message
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("f09\tuav1-uav1\t2025-05-14T09:30:00\t2025-05-14T09:30:01", "flight 'f09' is not in"),
+        ("f01\tuav2-uav1\t2025-05-14T09:30:00\t2025-05-14T09:30:01", "no pair 'uav2-uav1'"),
+        ("f01\tuav1-uav1\t2025-05-14T09:30:01\t2025-05-14T09:30:01Z", "is not before end"),
+        ("f01\tuav1-uav1\tnoon\t2025-05-14T09:30:01", "start 'noon' is no time"),
+        ("f01\tuav1-uav1\t2025-05-14T09:30:01", "end '' is no time"),
+    ],
+)
+def test_a_wrong_line_of_segments_is_named(tiny, line, expected):
+    (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\n{line}\n")
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "segments.tsv: line 2" in message
+    assert expected in message
+
+
+def test_segments_without_a_pulse_are_named_with_the_times_there_are(tiny):
+    line = "f01\tuav1-uav1\t2025-05-14T10:30:00\t2025-05-14T10:30:01"
+    (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\n{line}\n")
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    for work in (echo.echo, open_pair):
+        message = complaint(lambda work=work: work(campaign, "f01", "uav1-uav1"))
+        assert "no pulse of flight f01, pair uav1-uav1 inside 2025-05-14T10:30:00" in message
+        assert "segments.tsv" in message
+        assert "between 2025-05-14T09:30:00" in message
+    assert nothing_half_written(tiny)

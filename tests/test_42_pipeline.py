@@ -154,7 +154,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     scene = open_scene(finished_tiny)
     exact = reference.form(spectra, scene.terrain.positions_at(scene.grid, rows, columns))
     measured = numerical_error(formed[rows, columns], exact).rms_db
-    assert said["numerical_error_db"] == pytest.approx(measured, abs=3)
+    assert said["numerical_error_estimate_db"] == pytest.approx(measured, abs=3)
 
 
 def test_two_runs_give_the_same_bytes(tiny, finished_tiny):

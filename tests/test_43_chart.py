@@ -33,13 +33,17 @@ def charted(finished_tiny, tmp_path_factory):
     return paths, list(csv.DictReader(paths[0].open(encoding="utf-8")))
 
 
+def error_db(row):
+    return float(row["error_db"] or "-inf")
+
+
 def test_the_front_holds_what_nothing_faster_beats(charted):
     rows = charted[1]
     seconds = [float(row["seconds"]) for row in rows]
     assert {row["on_front"] for row in rows} == {"True", "False"}
     assert seconds == sorted(seconds)
     for number, row in enumerate(rows):
-        beaten = any(float(faster["error_db"]) <= float(row["error_db"]) for faster in rows[:number])
+        beaten = any(error_db(faster) <= error_db(row) for faster in rows[:number])
         assert (row["on_front"] == "True") == (not beaten)
 
 
@@ -50,12 +54,11 @@ def test_the_planners_choice_and_the_reference_are_there_however_short_the_time(
     assert float(planned[0]["error_db"]) <= -60
     plan = expected_plan(Campaign.load(charted[0][0].parents[2]), "f01", "uav1-uav2")
     assert planned[0]["setting"] == plan.setting.line  # the image's own
-    exact = next(row for row in rows if row["engine"] == "reference")
-    assert float(exact["error_db"]) < -130
+    assert [row["engine"] for row in rows if row["error_db"] == ""] == ["reference"]  # not measured against itself
 
 
 def test_measured_errors_are_no_worse_than_predicted(charted):
-    """Predictions hold for white echoes; these are of a few targets."""
+    """Predictions hold for white echoes; these are of a few targets, and bounds lie above what they bound."""
     for row in charted[1]:
         if row["engine"] != "reference":
             assert float(row["error_db"]) <= float(row["predicted_error_db"]) + 9
@@ -106,7 +109,7 @@ def part():
     picked = np.random.default_rng(1).integers(0, (LEAST_ROWS, 160), (50, 2))
     exact = reference.form(history, pixels[tuple(picked.T)])
     profiles = range_compress(history, TARGET_GRID, FlatGround(0.0))
-    return Part(history, profiles, pixels, picked, exact, 160 * 160, 0.1)
+    return Part(history, profiles, pixels, picked, np.full(50, 50 / (LEAST_ROWS * 160)), exact, 160 * 160, 0.1)
 
 
 def measured_by_toy(part, seconds):

@@ -4,6 +4,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -160,7 +161,7 @@ def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
         (root / "results" / "terrain.manifest.json").unlink()
     campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
     seen, profiles = open_pair(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
-    hill = expected_scene(campaign, seen.flown)
+    hill = expected_scene(campaign, partial(getattr, seen, "flown"))
     level = replace(hill, terrain=hill.level)
     assert job_of(campaign, seen, hill).signal.samples == profiles.sizes["range"]
     assert job_of(campaign, seen, level).signal.samples != profiles.sizes["range"]
@@ -228,7 +229,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
     for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
         campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
         seen = open_pair(campaign, *PAIR)
-        expected = expected_scene(campaign, seen.flown)
+        expected = expected_scene(campaign, partial(getattr, seen, "flown"))
         assert expected.level.height_m == pytest.approx(620.0, abs=0.1)
         assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
     campaign = edit_scene(tiny, bounds_m="auto")

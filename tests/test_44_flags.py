@@ -8,7 +8,7 @@ from folders import complaint, edit_config, ingest_all, quality_of
 
 from apertura.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag
+from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
 from apertura.steps import echo, image, profile, scene
 from apertura.store import open_stage
 
@@ -35,6 +35,32 @@ def test_an_undisturbed_flight_raises_no_flag(tmp_path):
     assert dataset.attrs["sidelink"]["method"] == "divide"
     assert dataset.attrs["sidelink"]["lock_rate"] == 1.0
     assert dataset.attrs["clock"]["corrected"] is False
+
+
+def test_an_echo_stage_says_what_its_sidelink_its_clock_and_its_code_are(tmp_path):
+    campaign = flown(tmp_path)
+    own, secondary = (echo_of(campaign, pair) for pair in ("uav1-uav1", "uav1-uav2"))
+    assert set(secondary.attrs["sidelink"]) >= {"method", "snr_db", "echo_db", "ripple_db", "lock_rate"}
+    assert secondary.attrs["sidelink"]["snr_db"] == pytest.approx(30, abs=0.5)
+    assert secondary.attrs["sidelink"]["delay_residual_m"] < 5 * secondary.attrs["sidelink"]["delay_noise_m"]
+    assert abs(secondary.attrs["clock"]["ppm"]) < 5 * secondary.attrs["clock"]["std_ppm"]
+    assert own.attrs["code"]["carried"] is secondary.attrs["code"]["carried"] is True
+    assert own.attrs["own_phase"]["second_difference_rad"] < 0.5
+    assert "sidelink_delay" not in own
+    assert secondary.sidelink_delay.attrs["units"] == "m"
+    # a trigger within 40 ns of 12 ns, whatever the path: 12 m of scatter
+    assert 5 < float(secondary.sidelink_delay.std()) < 9
+
+
+def test_a_node_that_sends_with_a_random_phase_is_flagged_in_its_own_image(tmp_path):
+    flags = echo_of(flown(tmp_path, "uav1", carrier_phase=UniformPhase()), "uav1-uav1").attrs["flags"]
+    assert set(flags) == {"phase_unstable"}
+
+
+@pytest.mark.parametrize(("peak_to_peak_db", "flagged"), [(1.5, False), (2.5, True)])
+def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagged):
+    flags = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(peak_to_peak_db, 5e-9))).attrs["flags"]
+    assert ("sidelink_ripple_or_echo" in flags) is flagged
 
 
 @pytest.mark.parametrize(("backoff_db", "flagged"), [(4.0, True), (14.0, False)])
@@ -111,7 +137,10 @@ def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
     codes = np.load(campaign.root / "raw" / "codes.npy")
     assert "code_unconfirmed" not in echo_of(campaign, "uav1-uav1").attrs["flags"]
     np.save(campaign.root / "raw" / "codes.npy", np.random.default_rng(3).permutation(codes))
-    assert "code_unconfirmed" in echo_of(campaign, "uav1-uav1").attrs["flags"]
+    own, secondary = (echo_of(campaign, pair).attrs for pair in ("uav1-uav1", "uav1-uav2"))
+    assert "code_unconfirmed" in own["flags"]
+    assert own["code"]["carried"] is secondary["code"]["carried"] is False
+    assert "right without one" in secondary["flags"]["wrong_code"]
 
 
 @pytest.mark.parametrize(("offset_s", "flagged"), [(22e-3, True), (4e-3, False)])

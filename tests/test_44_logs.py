@@ -13,7 +13,7 @@ from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
 from apertura.simulation.trajectory import Wobble
-from apertura.steps import echo
+from apertura.steps import echo, ingest
 from apertura.store import open_stage
 
 
@@ -26,16 +26,10 @@ def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):
 
 
 def echo_of(campaign, pair="a-b"):
-    ingest_all_of(campaign)
-    echo.echo(Campaign.load(campaign.root), "f01", pair)
-    return open_stage(campaign.stage("echo", "f01", pair), "echo")
-
-
-def ingest_all_of(campaign):
-    from apertura.steps import ingest
-
     for node in ("a", "b"):
         ingest.ingest(campaign, "f01", node)
+    echo.echo(Campaign.load(campaign.root), "f01", pair)
+    return open_stage(campaign.stage("echo", "f01", pair), "echo")
 
 
 def flags_of(dataset):
@@ -130,6 +124,7 @@ def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_p
     attrs = echo_of(campaign).attrs
     assert "longest 1.50 s at 09:30:0" in attrs["flags"]["track_gap"]
     assert attrs["pulses"]["reasons"]["track_gap"] in (28, 29, 30)
+    assert attrs["pulses"]["used"] == 40 - attrs["pulses"]["reasons"]["track_gap"]
 
 
 def test_a_single_outlier_is_mended_and_counted(tmp_path):
@@ -142,9 +137,40 @@ def test_a_single_outlier_is_mended_and_counted(tmp_path):
 
     edit_track(campaign.root, "a", epochs(spiked))
     dataset = echo_of(campaign)
-    assert "1 epochs or steps, worst 0.500 m at 09:30:0" in dataset.attrs["flags"]["track_outlier"]
+    assert "1 found, worst 0.500 m at 09:30:0" in dataset.attrs["flags"]["track_outlier"]
     assert dataset.attrs["pulses"]["used"] == 40
     np.testing.assert_allclose(dataset.tx_position.values, clean, atol=1e-4)
+
+
+def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_path):
+    campaign = small_campaign(tmp_path)
+    clean = echo_of(campaign).rx_position.values
+
+    def repeated(table):
+        return rows([*table[n][:2], *table[n - n % 2][2:]] for n in range(len(table)))
+
+    edit_track(campaign.root, "b", epochs(repeated))
+    dataset = echo_of(campaign)
+    assert dataset.attrs["flags"]["track_frozen"].startswith("b: 0 of 40 pulses left out: epochs that repeat")
+    np.testing.assert_allclose(dataset.rx_position.values, clean, atol=1e-3)
+
+
+@pytest.mark.parametrize(("grain_s", "flagged"), [(0.1, False), (0.2, True)])
+def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positions(tmp_path, grain_s, flagged):
+    """Epochs every 0.3 s at 5 m/s: 5 m/s · 0.2 s/√12 = 0.29 m."""
+    campaign = small_campaign(tmp_path)
+
+    def rounded(table):
+        for cells in table:
+            hours, minutes, seconds = cells[1].split(":")
+            total_s = 3600 * int(hours) + 60 * int(minutes) + round(float(seconds) / grain_s) * grain_s
+            cells[1] = f"{int(total_s // 3600):02d}:{int(total_s % 3600 // 60):02d}:{total_s % 60:06.3f}"
+        return rows(table)
+
+    edit_track(campaign.root, "a", epochs(lambda table: rounded(table[::3])))
+    flags = flags_of(echo_of(campaign))
+    assert ("track_times" in flags) is flagged
+    assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])

@@ -65,7 +65,7 @@ def test_a_raster_says_where_it_comes_from(finished_tiny, name):
 def test_a_raster_says_how_exact_it_is(finished_tiny, name):
     tags = tags_of(finished_tiny, name)
     report = json.loads((finished_tiny.results / name).with_name("image.json").read_text())
-    for tag, key in (("ERROR_DB", "numerical_error_db"), ("ERROR_STD_DB", "numerical_error_std_db")):
+    for tag, key in (("ERROR_DB", "numerical_error_db"), ("ERROR_CONFIDENCE", "numerical_error_confidence")):
         assert float(tags[f"APERTURA_{tag}"]) == report[key]
     assert -160 < float(tags["APERTURA_ERROR_DB"]) < -60
     assert -160 < float(tags["APERTURA_PEAK_ERROR_DB"]) < -50

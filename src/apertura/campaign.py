@@ -6,7 +6,19 @@ from typing import Any
 
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS
-from apertura.settings import CONFIG, FLIGHTS, Antenna, Flight, OfdmWaveform, Settings, read_flights, read_settings
+from apertura.settings import (
+    CONFIG,
+    FLIGHTS,
+    SEGMENTS,
+    Antenna,
+    Flight,
+    OfdmWaveform,
+    Segment,
+    Settings,
+    read_flights,
+    read_segments,
+    read_settings,
+)
 
 
 @dataclass(frozen=True)
@@ -24,13 +36,15 @@ class Campaign:
     root: Path
     settings: Settings
     flights: tuple[Flight, ...]
+    segments: tuple[Segment, ...] = ()
 
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
         root = Path(root)
         settings = read_settings(root / CONFIG)
-        return cls(root, settings, tuple(read_flights(root / FLIGHTS, nodes=settings.nodes)))
+        flights = tuple(read_flights(root / FLIGHTS, nodes=settings.nodes))
+        return cls(root, settings, flights, tuple(read_segments(root / SEGMENTS, flights=flights)))
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
@@ -107,6 +121,11 @@ class Campaign:
             if antenna.pattern
         }
 
+    def segments_of(self, flight: str, pair: str) -> list[tuple[str, str]]:
+        """Return start and end (UTC) of the parts of the track that image a pair; none: all of it."""
+        own = (segment for segment in self.segments if (segment.flight, segment.pair) == (flight, pair))
+        return sorted((segment.start, segment.end) for segment in own)
+
     def check_files(self) -> None:
         """Raise CampaignError unless every file that flights.tsv or the config promises is there."""
         for flight in self.flights:
@@ -133,18 +152,20 @@ class Campaign:
                 remedy="Copy the file there.",
             )
 
-    def relevant(self, stage: str, pair: str = "") -> dict[str, Any]:
+    def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
         settings = self.settings.model_dump(mode="json")
         processing, nodes = settings["processing"], {name: settings["nodes"][name] for name in pair.split("-") if name}
         for node in nodes.values():
             del node["antennas"]  # echo asks only whether there are beams, image what they are
         beams = self.antennas(pair) if pair else {}
+        segments = [list(segment) for segment in self.segments_of(flight, pair)]
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
                 "waveform": settings["waveform"],
                 "nodes": nodes,
                 **({"beams": sorted(beams)} if beams else {}),
+                **({"segments": segments} if segments else {}),
                 **{key: processing[key] for key in ("sidelink", "accuracy_db")},
             },
             "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},

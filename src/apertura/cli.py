@@ -119,6 +119,14 @@ def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_C
 
 
 @app.command()
+def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = HERE) -> None:
+    """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
+    from apertura.steps.summary import print_summary
+
+    print_summary(_opened(campaign))
+
+
+@app.command()
 def verify(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
 ) -> None:
@@ -145,7 +153,10 @@ def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> N
 @app.command()
 def simulate(
     paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
-    preset: Annotated[str | None, typer.Option(help="demo (the default), paper, swarm or continuous")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="demo (the default), paper, swarm, continuous, paper-lab, paper-static, paper-uav"),
+    ] = None,
     seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
     print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
 ) -> None:

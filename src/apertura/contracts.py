@@ -92,6 +92,14 @@ STAGES: Mapping[str, Stage] = {
         },
         _FRAME,
         {
+            "sidelink_delay": Variable(
+                ("pulse",),
+                "float64",
+                "m",
+                "measured delay of the sidelink times c, any constant in it; NaN without lock",
+            ),
+        }
+        | {
             f"{leg}_axes": Variable(
                 ("pulse", "axis", "body"), "float64", "1", f"forward, right, down of the {node}'s body, in `frame`"
             )

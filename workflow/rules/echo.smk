@@ -13,7 +13,7 @@ rule echo:
     resources:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
     params:
-        settings=lambda wildcards: campaign.relevant("echo", wildcards.pair),
+        settings=lambda wildcards: campaign.relevant("echo", wildcards.pair, flight=wildcards.flight),
         code=code_sha256("apertura.steps.echo"),
     message:
         "{wildcards.flight}: calibrating {wildcards.pair}"

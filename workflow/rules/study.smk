@@ -1,15 +1,16 @@
 # The studies need no campaign: `snakemake --snakefile workflow/rules/study.smk --cores 2 paper stability`.
 from apertura.provenance import code_sha256
 from apertura.study.atlas.causes import CAUSES
-from apertura.study.commands import PAPER_PARTS
+from apertura.study.commands import PAPER_FIGURES, PAPER_PARTS, PAPER_READS
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
-ERRORS = [part.removeprefix("loss_") for part in PAPER_PARTS if part.startswith("loss_")]
+CAMPAIGN = "results/study/paper/campaigns/{experiment}"
 
 
 wildcard_constraints:
     part="|".join(PAPER_PARTS),
-    error="|".join(ERRORS),
+    figure="|".join(PAPER_FIGURES),
+    experiment="lab|static|uav",
     impairment="|".join(SWEEPS),
     method="|".join(CHOICES),
     cause="|".join(CAUSES),
@@ -23,7 +24,7 @@ localrules:
 rule paper:
     input:
         "results/study/paper/claims.csv",
-        expand("results/study/paper/{error}.png", error=ERRORS),
+        expand("results/study/paper/{figure}.png", figure=PAPER_FIGURES),
 
 
 rule stability:
@@ -34,7 +35,31 @@ rule stability:
         expand("results/study/atlas/{cause}.png", cause=CAUSES),
 
 
+rule paper_campaign:
+    output:
+        f"{CAMPAIGN}.done",
+    log:
+        "results/logs/study/paper.{experiment}.log",
+    benchmark:
+        "results/benchmarks/study/paper.{experiment}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+    params:
+        folder=CAMPAIGN,
+        code=code_sha256("apertura.simulation.presets", "apertura.steps.echo", "apertura.steps.cube"),
+    message:
+        "the paper's experiment {wildcards.experiment}, through the ordinary pipeline"
+    shell:
+        "(rm -rf {params.folder} && apertura simulate {params.folder} --preset paper-{wildcards.experiment}"
+        " && apertura run {params.folder} --cores {threads} && touch {output}) > {log} 2>&1"
+
+
 rule paper_part:
+    input:
+        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_READS.get(wildcards.part, ())),
     output:
         "results/study/paper/parts/{part}.csv",
     log:
@@ -47,7 +72,7 @@ rule paper_part:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.study.commands"),
+        code=lambda wildcards: code_sha256("apertura.study.paper." + PAPER_PARTS[wildcards.part].split(":")[0]),
     message:
         "claims of the paper: {wildcards.part}"
     shell:
@@ -77,23 +102,25 @@ rule paper_claims:
 
 
 rule paper_figure:
+    input:
+        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_FIGURES[wildcards.figure]),
     output:
-        "results/study/paper/{error}.png",
+        "results/study/paper/{figure}.png",
     log:
-        "results/logs/study/paper.{error}.png.log",
+        "results/logs/study/paper.{figure}.png.log",
     benchmark:
-        "results/benchmarks/study/paper.{error}.png.tsv"
+        "results/benchmarks/study/paper.{figure}.png.tsv"
     conda:
         "../../environment.yml"
     threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.study.paper.figures"),
+        code=code_sha256("apertura.study.paper.figures", "apertura.study.paper.experiment_figures"),
     message:
-        "drawing what {wildcards.error} does"
+        "drawing the paper's figure {wildcards.figure}"
     shell:
-        "apertura study paper-figure {wildcards.error} > {log} 2>&1"
+        "apertura study paper-figure {wildcards.figure} > {log} 2>&1"
 
 
 rule stability_sweep:

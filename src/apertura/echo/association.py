@@ -10,13 +10,8 @@ from numpy.typing import NDArray
 from apertura.echo.association_edges import association_flags, is_outlier
 from apertura.echo.frame_counter import pairs_by_frame
 from apertura.echo.framing import ABSENT
-from apertura.echo.time_tags import Floats, Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
+from apertura.echo.time_tags import Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
 from apertura.errors import CampaignError
-
-EXPLAINED_M = 0.05
-"""Movement of a sidelink that errors of the logged positions alone may explain."""
-
-_MEDIAN_PULSES = 15  # of the running median that tells movement from jitter, an odd number
 
 
 @dataclass(frozen=True)
@@ -108,13 +103,10 @@ def associate(
     for node, time_ns in (("transmitter", tx_time_ns), ("receiver", rx_time_ns)):
         _require_ascending(time_ns, node, where)
     tags = np.asarray(tx_time_ns, np.int64), np.asarray(rx_time_ns, np.int64)
-    frames = (tx_frame, rx_frame)
+    frames, conflicts = (tx_frame, rx_frame), 0
     by_frame = pairs_by_frame(tags, frames, interval_ns, frame_modulus)
-    conflicts = 0
     if by_frame is None:
-        pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
-        if pairs[0].size:
-            pairs = nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns)
+        pairs = _pairs_by_tags(tags, interval_ns)
     else:
         pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
     if pairs[0].size == 0:
@@ -136,50 +128,6 @@ def associate(
     return replace(association, flags=flags)
 
 
-def detect_wrong_association(sidelink_path_m: Floats, predicted_path_m: Floats) -> str | None:
-    """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
-
-    A constant and a linear drift belong to the clocks and are taken out. What then still moves by more than
-    `EXPLAINED_M` and by more than five times its own noise cannot come from trigger jitter: the pulses carry
-    positions of other pulses.
-
-    Parameters
-    ----------
-    sidelink_path_m, predicted_path_m
-        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
-        between its antennas.
-
-    Notes
-    -----
-    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence
-    either way: the prediction itself must move for a wrong pair to show.
-
-    Examples
-    --------
-    >>> distance = 5 + np.sin(np.arange(200) / 20)
-    >>> detect_wrong_association(distance + 3.0, distance) is None
-    True
-    >>> detect_wrong_association(np.roll(distance, 9), distance)
-    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
-    """
-    pulse = np.flatnonzero(np.isfinite(sidelink_path_m) & np.isfinite(predicted_path_m))
-    if pulse.size < 2 * _MEDIAN_PULSES:
-        return None
-    residual = sidelink_path_m[pulse] - predicted_path_m[pulse]
-    padded = np.pad(residual, _MEDIAN_PULSES // 2, mode="edge")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, _MEDIAN_PULSES), axis=1)
-    smooth = smooth - np.polyval(np.polyfit(pulse, smooth, 1), pulse)
-    jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / np.sqrt(2)
-    noise = 1.2533 * jitter / np.sqrt(_MEDIAN_PULSES)  # standard deviation of a median of so many Gaussian samples
-    worst = int(np.argmax(np.abs(smooth)))
-    if abs(smooth[worst]) <= max(EXPLAINED_M, 5 * noise):
-        return None
-    return (
-        f"sidelink leaves its geometry by {abs(smooth[worst]):.2f} m at pulse {pulse[worst]} (noise {noise:.3f} m): "
-        "pulses or positions are wrongly associated"
-    )
-
-
 def _require_ascending(tags: Integers, node: str, where: str) -> None:
     back = np.flatnonzero(np.diff(tags) <= 0)
     if back.size or tags.size == 0:
@@ -197,6 +145,11 @@ def _nothing_in_common(tags: Pairs, repetition_interval_s: float, where: str) ->
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
         remedy="Check that both recordings are of the same flight, and their core:datetime.",
     )
+
+
+def _pairs_by_tags(tags: Pairs, interval_ns: float) -> Pairs:
+    pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
+    return nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns) if pairs[0].size else pairs
 
 
 def _agreed_pairs(

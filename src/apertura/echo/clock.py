@@ -13,6 +13,9 @@ from scipy import fft
 from apertura.echo.demodulate import Numerology
 from apertura.echo.resampling import Complexes, Floats
 
+SIGMAS = 3.0
+"""A clock that is not this many standard deviations off is one that noise suggests; it is left alone."""
+
 AMBIGUOUS_SHARE = 0.4
 """Offsets beyond this share of Δf could as well be of the other sign: half of Δf is where they wrap."""
 
@@ -45,6 +48,11 @@ class ClockOffset:
     cfo_std_hz: float
     sfo_std_ppm: float
     one_clock: bool
+
+    def ppm(self, numerology: Numerology) -> tuple[float, float | None]:
+        """Return how fast the oscillator runs and the standard deviation of that, ppm; None where unknown."""
+        std_ppm = self.cfo_std_hz / numerology.carrier_hz * 1e6
+        return self.cfo_hz / numerology.carrier_hz * 1e6, std_ppm if np.isfinite(std_ppm) else None
 
     def cfo_of_pulses_hz(self, pulses: int) -> Floats:
         """Return (pulse,) float64, the carrier offset in each pulse of the flight, hertz."""
@@ -119,17 +127,22 @@ def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: fl
     >>> for ppm in (0.5, 8.0):
     ...     clock = ClockOffset(1200 * ppm, 0.0, ppm, cfo_std_hz=1.0, sfo_std_ppm=0.1, one_clock=True)
     ...     print(decide_clock(clock, numerology, accuracy_db=-60).reason)
-    clock 0.50 ppm fast (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB asked: left alone
-    clock 8.00 ppm fast (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB asked: samples corrected
+    clock 0.50 ± 0.00 ppm fast (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB asked: left alone
+    clock 8.00 ± 0.00 ppm fast (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB asked: samples corrected
     """
     floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, numerology)
-    sfo_std_ppm = offset.cfo_std_hz / numerology.carrier_hz * 1e6 if offset.one_clock else offset.sfo_std_ppm
-    unknown = not np.isfinite(offset.cfo_std_hz)
-    left_db = 0.0 if unknown else interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
-    correct = floor_db > max(accuracy_db, left_db)
-    what = "samples corrected" if correct else "left alone"
+    ppm, std_ppm = offset.ppm(numerology)
+    left_db = 0.0
+    if std_ppm is not None:
+        sfo_std_ppm = std_ppm if offset.one_clock else offset.sfo_std_ppm
+        left_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
+    significant = abs(offset.cfo_hz) > SIGMAS * offset.cfo_std_hz or (
+        not offset.one_clock and abs(offset.sfo_ppm) > SIGMAS * offset.sfo_std_ppm
+    )
+    correct = floor_db > accuracy_db and significant
+    what = "samples corrected" if correct else "left alone" if significant else f"left alone: below {SIGMAS:g} σ"
     reason = (
-        f"clock {offset.cfo_hz / numerology.carrier_hz * 1e6:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
+        f"clock {ppm:.2f} ± {0 if std_ppm is None else std_ppm:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
         f"SFO {offset.sfo_ppm:.2f} ppm): floor {floor_db:.1f} dB, {accuracy_db:g} dB asked: {what}"
     )
     flags = {}

@@ -17,7 +17,7 @@ _ROOM = 2.0
 _LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
-"""Name → weights of that many subcarriers."""
+"""Name → weights of that many subcarriers; Hann's is the symmetric one (docs/theory.md, eq. 4)."""
 
 
 def window_weights(name: str, count: int) -> NDArray[np.float64]:

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 from scipy.special import gammainccinv
 
-from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_line_of_sight, phasor
+from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_line_of_sight
+from apertura.echo.sidelink_average import SidelinkAverage, average_pulses
 from apertura.errors import CampaignError
 
 GATE_CELLS = 16
@@ -38,10 +37,16 @@ class SidelinkState:
         which none would have been seen.
     echo_cells
         Delay of that arrival after the direct path, in cells of 1/B; 0 if none was seen.
+    echo_stays
+        Whether its phase against the direct path is the same in most pulses: then it may be the transmitter's, too.
     ripple_db
         Peak-to-peak ripple of the band that repeats in every pulse and fits into the gate, as of one sinusoid.
+    ripple_cells
+        How far from the direct path the strongest arrival behind `ripple_db` lies, in cells of 1/B; 0 without.
     fine_ripple_db
         The same for ripple too fine for the gate.
+    near_db
+        What changes from pulse to pulse within two cells of the direct path, relative to it; -300 where it is noise.
     null_share
         Share of the subcarriers below `NULL_DB`.
     locked
@@ -56,8 +61,11 @@ class SidelinkState:
     snr_db: float
     echo_db: float
     echo_cells: int
+    echo_stays: bool
     ripple_db: float
+    ripple_cells: int
     fine_ripple_db: float
+    near_db: float
     null_share: float
     locked: NDArray[np.bool_]
     path: LineOfSight
@@ -91,11 +99,11 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     path = fit_line_of_sight(sidelink)
     if not path.locked.any():
         return _measure_without_code(sidelink, path, where)
-    average = _average(sidelink, path)
+    average = average_pulses(sidelink, path)
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
     echo_db, echo_cells = _strongest_echo(average)
     # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
-    ripple_db, fine_ripple_db = _ripple(
+    ripple_db, ripple_cells, fine_ripple_db = _ripple(
         average, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB)
     )
     flat = average.spectrum - average.noise * sidelink.shape[1]
@@ -104,8 +112,11 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
         snr_db=_db(snr),
         echo_db=echo_db,
         echo_cells=echo_cells,
+        echo_stays=bool(np.abs(average.mean[echo_cells]) ** 2 > (average.power[echo_cells] - average.noise) / 2),
         ripple_db=ripple_db,
+        ripple_cells=ripple_cells,
         fine_ripple_db=fine_ripple_db,
+        near_db=_changing_near(average),
         # a null is seen only where the noise lies well below it
         null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
         locked=path.locked,
@@ -115,42 +126,7 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     return replace(state, flags=_flags(state))
 
 
-class _Average(NamedTuple):
-    """The locked pulses of a flight, aligned to a direct path of delay 0 and amplitude 1."""
-
-    pulses: int
-    noise: float  # mean power of the noise in a delay cell of one pulse
-    power: Floats  # (cell,) mean power
-    mean: NDArray[np.complex128]  # (cell,) mean
-    spectrum: Floats  # (subcarrier,) mean power
-    second_cell: int  # typical strongest arrival of a pulse beside the direct path
-    second_power: float
-
-
-def _average(sidelink: Complexes, path: LineOfSight) -> _Average:
-    locked, subcarriers = np.flatnonzero(path.locked), sidelink.shape[1]
-    power, spectrum, mean = np.zeros(subcarriers), np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
-    cells, levels = [], []
-    for first in range(0, locked.size, 64):
-        some = locked[first : first + 64]
-        direct = path.select(some)
-        aligned = sidelink[some] * phasor(direct, subcarriers).conj() / direct.amplitude[:, None]
-        profile = fft.ifft(aligned, axis=1)
-        profile_power = np.abs(profile) ** 2
-        power += profile_power.sum(0)
-        mean += profile.sum(0)
-        spectrum += (np.abs(aligned) ** 2).sum(0)
-        cells.append(profile_power[:, 2:-1].argmax(1) + 2)
-        levels.append(profile_power[:, 2:-1].max(1))
-    level = np.concatenate(levels)
-    typical = int(np.argsort(level)[level.size // 2])
-    noise = float(np.mean(path.noise_power[locked] / path.amplitude[locked] ** 2)) / subcarriers
-    count = locked.size
-    second_cell = int(np.concatenate(cells)[typical])
-    return _Average(count, noise, power / count, mean / count, spectrum / count, second_cell, float(level[typical]))
-
-
-def _strongest_echo(average: _Average) -> tuple[float, int]:
+def _strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
     """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
 
     Ripple makes echoes on both sides of the direct path, a reflection on one; only the excess of one side counts.
@@ -172,8 +148,10 @@ def _strongest_echo(average: _Average) -> tuple[float, int]:
     return _db(level), cell if cell < average.power.size / 2 else cell - average.power.size
 
 
-def _ripple(average: _Average, *, one_sided: bool) -> tuple[float, float]:
-    """Return peak-to-peak ripple (dB) inside and outside the gate, from echoes that all pulses have in common.
+def _ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, float]:
+    """Return ripple (peak to peak, dB) inside the gate, its strongest cell, and ripple outside.
+
+    It is told by echoes that all pulses have in common:
 
     cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
     inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
@@ -187,7 +165,17 @@ def _ripple(average: _Average, *, one_sided: bool) -> tuple[float, float]:
     inside = cells <= GATE_CELLS
     amplitudes = (single if one_sided else paired)[inside], paired[~inside]
     coarse, fine = (min(float(np.sqrt((amplitude**2).sum())), 0.95) for amplitude in amplitudes)
-    return _peak_to_peak_db(coarse), _peak_to_peak_db(fine)
+    strongest = int(cells[inside][amplitudes[0].argmax()]) if coarse else 0
+    return _peak_to_peak_db(coarse), strongest, _peak_to_peak_db(fine)
+
+
+def _changing_near(average: SidelinkAverage) -> float:
+    """Return what changes from pulse to pulse within two cells of the direct path, dB; -300 where it is noise."""
+    near = [1, 2, -1, -2]
+    excess = average.power[near] - np.abs(average.mean[near]) ** 2 - average.noise
+    seen = 5 * average.noise * np.sqrt(len(near) / average.pulses)
+    total = float(excess.sum())
+    return _db(total) if total > seen and average.pulses > 1 else -300.0
 
 
 def _peak_to_peak_db(amplitude: float) -> float:
@@ -213,8 +201,12 @@ def _measure_without_code(sidelink: Complexes, path: LineOfSight, where: str) ->
     locked[1:] |= common.locked
     locked[:-1] |= common.locked
     snr_db = _db(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
-    line = f"the sidelink ({snr_db:.0f} dB) does not carry the given code: monostatic images will not focus"
-    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, 0.0, 0.0, 0.0, locked, path, {"wrong_code": line})
+    line = (
+        f"the sidelink ({snr_db:.0f} dB) does not carry the given code: this image is divided by it and right without "
+        "one, monostatic images of the transmitter are wrong"
+    )
+    flags = {"wrong_code": line}
+    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, False, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
 
 
 def _flags(state: SidelinkState) -> dict[str, str]:

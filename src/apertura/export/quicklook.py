@@ -110,7 +110,17 @@ def _footer(tags: Mapping[str, str]) -> str:
         ("APERTURA_ERROR_DB", "numerical error {} dB"),
         ("APERTURA_CODE_SHA256", "code {:.12}"),
     )
-    return " · ".join(words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags)
+    told = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]
+    return " · ".join([*told[:1], *_focus_words(tags), *told[1:]])
+
+
+def _focus_words(tags: Mapping[str, str]) -> list[str]:
+    """Return the verdict on the focus, and the loss measured."""
+    if "APERTURA_FOCUS" not in tags:
+        return []
+    focus = json.loads(tags["APERTURA_FOCUS"])
+    loss = f" ({-focus['loss_db']:.1f} dB lost)" if "loss_db" in focus else ""
+    return [f"focus: {focus['verdict']}{loss}"]
 
 
 def shrink(image: Raster, most: int) -> tuple[NDArray[np.float64], int]:

@@ -1,6 +1,6 @@
 """Which images of a flight are added with their phases: those that were seen to be in phase, or made so."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -50,7 +50,7 @@ class Fusion:
 
 
 def choose_fusion(
-    reference: str, found: Mapping[str, Phase | None], *, unconfirmed: Collection[str], align: bool
+    reference: str, found: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
 ) -> Fusion:
     """Return which pairs add coherently to the reference.
 
@@ -60,20 +60,20 @@ def choose_fusion(
         The pair that others are measured against.
     found
         Every other pair → its phase against the reference at bright points; None where they share none.
-    unconfirmed
-        Pairs that should show bright points of the reference and do not.
+    unfit
+        Pairs that show other places than the reference → why.
     align
         Whether a constant phase is taken off.
 
     Examples
     --------
-    >>> choose_fusion("a-a", {"a-b": None}, unconfirmed=(), align=False).phases_rad
+    >>> choose_fusion("a-a", {"a-b": None}, unfit={}, align=False).phases_rad
     {'a-a': 0.0, 'a-b': 0.0}
     """
     phases, left_out, why = {reference: 0.0}, {}, {reference: "the others are measured against it"}
     for pair, phase in found.items():
-        if pair in unconfirmed:
-            left_out[pair] = f"shows none of the bright points of {reference}"
+        if pair in unfit:
+            left_out[pair] = unfit[pair]
         elif phase is None:
             phases[pair], why[pair] = 0.0, f"phase not measured: no bright point in common with {reference}"
         else:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from apertura.constants import SPEED_OF_LIGHT_M_S
 
 _PULSES_AT_ONCE = 256
+_STEPS_IN_A_ROW = 63
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ class Aperture:
         return gradient
 
     def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
-        """Return the widest spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
+        """Return the spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
 
         Parameters
         ----------
@@ -125,7 +126,8 @@ class Aperture:
 
         Notes
         -----
-        Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities.
+        Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities. It is the largest median
+        of 63 steps in a row, so that missed pulses and gaps are not taken for undersampling.
 
         Examples
         --------
@@ -135,12 +137,15 @@ class Aperture:
         >>> 0.3 < spread < 0.4, widest < spread
         (True, True)
         """
-        spread = widest = 0.0
-        for first in range(0, len(self) - 1, _PULSES_AT_ONCE):
+        if len(self) < 2:
+            return 0.0, 0.0
+        spread, widest = np.zeros(len(self) - 1), 0.0
+        for first in range(0, len(spread), _PULSES_AT_ONCE):
             rate = np.diff(self[first : first + _PULSES_AT_ONCE + 1].path(points_m), axis=0)
-            spread = max(spread, float(np.ptp(rate, axis=1).max()))
+            spread[first : first + len(rate)] = np.ptp(rate, axis=1)
             widest = max(widest, float(np.abs(rate - rate[:, [len(points_m) // 2]]).max()))
-        return spread / wavelength_m, widest / wavelength_m
+        in_a_row = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
+        return float(np.median(in_a_row, axis=1).max()) / wavelength_m, widest / wavelength_m
 
     def resolution_cell_m(self, ground_m: NDArray[np.float64], *, band_hz: tuple[float, float]) -> float:
         """Return the finest resolution cell of the scene along rows or columns, metres.

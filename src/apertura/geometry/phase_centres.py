@@ -151,8 +151,8 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
             f"and ends {max(late, 0):.3f} s before the last",
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
-            remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, by which both "
-            "nodes are placed, or give the whole log.",
+            remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "
+            "both nodes are placed, or give the whole log.",
         )
 
 

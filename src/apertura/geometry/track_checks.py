@@ -8,15 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.geometry.phase_centres import position_spline
-from apertura.geometry.track_faults import (
-    Floats,
-    find_frozen,
-    find_spikes,
-    find_steps,
-    misfits,
-    rounded_time_m,
-    scatter_m,
-)
+from apertura.geometry.track_faults import Floats, find_spikes, find_steps, misfits, scatter_m
+from apertura.geometry.track_writing import find_frozen, rounded_time_m
 
 LONG_GAP = 3.5
 """Intervals between epochs, in the log's own median, from which on a gap is asked what it costs."""
@@ -93,7 +86,7 @@ def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool
     place = position_m - position_m.mean(axis=0)
     cause, size = _judged(time_s, place, poor_fix)
     steps = [
-        Hole(*time_s[[part[step.first - 1], part[step.last + 1]]].tolist(), "track_outlier", step.size_m)
+        Hole(float(time_s[part[step.first - 1]]), float(time_s[part[step.last + 1]]), "track_outlier", step.size_m)
         for part in _parts(time_s, cause)
         for step in find_steps(time_s[part], place[part])
     ]

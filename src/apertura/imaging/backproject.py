@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import illuminate
@@ -19,7 +20,7 @@ from apertura.imaging.range_profiles import range_compress
 from apertura.imaging.stages import inputs_of
 from apertura.planning.memory import memory_limit
 from apertura.planning.planner import make_plan
-from apertura.quality.measures import NumericalError, numerical_error
+from apertura.quality.error_bound import CONFIDENCE, ErrorBound, error_bound
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
 from apertura.scene.terrain import FlatGround, Terrain
@@ -51,7 +52,7 @@ def backproject(
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
-        Numerical error asked: RMS on random pixels relative to the exact sum, dB, -120 to -10.
+        Numerical error asked: RMS over all pixels relative to the exact sum, dB, -120 to -10.
     terrain
         Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
         default.
@@ -74,8 +75,9 @@ def backproject(
         (y, x) complex64, carrier kept, 1 is the amplitude of an echo seen by every pulse; a dask array on whatever
         scheduler the caller has. Attributes: units; the plan: `setting`, `predicted_error_db`, and as JSON `models`
         (choice → value and reason) and `flags` (limit crossed → what was found); the certificate: `numerical_error_db`,
-        `numerical_error_std_db`, against the double sum over pulses and subcarriers, or from profiles alone against
-        their band-limited interpolation in float64.
+        an upper bound at `numerical_error_confidence` for the whole image, and `numerical_error_estimate_db`, against
+        the double sum over pulses and subcarriers, or from profiles alone against their band-limited interpolation in
+        float64.
 
     Raises
     ------
@@ -123,12 +125,14 @@ def backproject(
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
         attributes = {
-            "numerical_error_db": round(error.rms_db, 2),
-            "numerical_error_std_db": round(error.std_db, 2),
+            "numerical_error_db": round(error.bound_db, 2),
+            "numerical_error_confidence": CONFIDENCE,
+            "numerical_error_estimate_db": round(error.estimate_db, 2),
             "certified_pixels": certified_pixels,
         }
-        if error.rms_db > accuracy_db:
-            flags["accuracy_missed"] = f"{error.rms_db:.1f} dB measured, {accuracy_db:g} dB asked"
+        if error.bound_db > accuracy_db:
+            sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
+            flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
     attributes |= {
         "units": "1",
         "long_name": "focused scene, carrier kept",
@@ -152,17 +156,22 @@ def _ground(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
     return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
 
 
-def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, NumericalError]:
-    """Return the image by the first setting of the plan that meets the accuracy on random pixels, or by the last."""
+def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
+    """Return the image by the first setting of the plan that meets the accuracy for sure, or by the last."""
     pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
     exact = formation.exact(pixels)
-    error = numerical_error(formation.values(pixels), exact)
+    error = _error(formation, pixels, exact)
     for setting in formation.plan.fallbacks:
-        if error.rms_db <= accuracy_db:
+        if error.bound_db <= accuracy_db:
             break
         formation = replace(formation, plan=formation.plan.fallen_back(setting))
-        error = numerical_error(formation.values(pixels), exact)
+        error = _error(formation, pixels, exact)
     return formation, error
+
+
+def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
+    values, power = formation.values(pixels)
+    return error_bound(values, exact, np.ones(len(pixels)), power=power)
 
 
 def _job(

@@ -1,19 +1,24 @@
 """How well an image is focused, measured on itself: bright points, and how much of a usual pixel is noise."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.imaging.echo_place import echo_elsewhere
 from apertura.imaging.formation import Formation
+from apertura.imaging.parts import PART_PX, part_images
 from apertura.quality.bright_points import BrightPoint, bright_points
-from apertura.quality.focus import Focus, PointFocus, even_odd_snr_db, judge, point_focus
+from apertura.quality.focus import Focus, PointFocus, judge, judge_parts, point_focus
+from apertura.quality.sub_apertures import SubApertures, compare_parts
 
 APART_CELLS = 6.0
 """Bright points stand so many resolution cells apart."""
 
-_USUAL_PIXELS = 48
+_PATCHES = 4
+_PLACES_PER_CELL = 2.5
 _CELL_POINTS = 5
 
 
@@ -45,11 +50,17 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     points = bright_points(target, formation.windows, apart_px=apart_px)
     terms = formation.contributions([point.row for point in points], [point.column for point in points])
     measured = [_focus_of(column) for column in terms.T]
+    parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
+    elsewhere = None
+    if verdict.points == 0 and formation.history is not None:
+        verdict = judge_parts(parts, cell_m=cell_m)
+        elsewhere = echo_elsewhere(formation.history, grid, formation.plan.terrain)
     return {
         **_verdict_report(verdict),
+        **({"elsewhere": elsewhere} if elsewhere else {}),
         "cell_m": round(cell_m, 4),
-        "even_odd_snr_db": round(_usual_snr_db(formation), 2),
+        "parts": {name: round(value, 4) if np.isfinite(value) else None for name, value in asdict(parts).items()},
         "points": [
             _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus
         ],
@@ -57,10 +68,11 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
-    """Return the flag `defocused` where the bright points say so."""
+    """Return the flags `defocused` where the bright points say so, and `echo_elsewhere`."""
+    flags = {"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {}
     if report["verdict"] != "defocused":
-        return {}
-    return {
+        return flags
+    return flags | {
         "defocused": f"{report['why']}; {-expected_db:.1f} dB expected of the errors that are stated: "
         "positions, lever arms, heights or times are worse than that"
     }
@@ -70,10 +82,22 @@ def _focus_of(terms: NDArray[np.complex128]) -> PointFocus | None:
     return point_focus(terms[terms != 0])
 
 
-def _usual_snr_db(formation: Formation) -> float:
-    """Return the SNR of a usual pixel: the median over some random ones, by even and odd pulses."""
-    rows, columns = np.random.default_rng(0).integers(0, formation.grid.shape, (_USUAL_PIXELS, 2)).T
-    return float(np.median([even_odd_snr_db(column) for column in formation.contributions(rows, columns).T]))
+def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:
+    """Return what images of parts of the aperture say about the brightest places."""
+    spacing_m = cell_m / _PLACES_PER_CELL
+    places = [_places(formation, point, spacing_m / formation.grid.spacing_m) for point in points[:_PATCHES]]
+    images = part_images(formation.profiles, places, beams=formation.beams)
+    return compare_parts(images, spacing_m=spacing_m, generator=np.random.default_rng(0))
+
+
+def _places(formation: Formation, point: BrightPoint, step_px: float) -> NDArray[np.float64]:
+    along = (np.arange(PART_PX) - PART_PX / 2) * step_px
+    rows, columns = np.meshgrid(
+        np.clip(point.row + along, 0, formation.grid.shape[0] - 1),
+        np.clip(point.column + along, 0, formation.grid.shape[1] - 1),
+        indexing="ij",
+    )
+    return formation.positions_at(rows, columns)
 
 
 def _verdict_report(verdict: Focus) -> dict[str, Any]:
@@ -91,4 +115,6 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "interference": round(focus.interference, 5),
         "pulses": focus.pulses,
         "snr_db": round(focus.snr_db, 2),
+        "coherence": round(focus.coherence, 5),
+        "coherence_allowed": round(focus.coherence_allowed, 5),
     }

@@ -79,19 +79,23 @@ class Formation:
             total = reference.form(self.history, places, beams=self.beams)
         return np.asarray(total / len(self.profiles))
 
-    def values(self, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
-        """Return the planned image at (pixel, 2) rows and columns, (pixel,) complex64, forming just their patches."""
+    def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+        """Return the planned image at (pixel, 2) rows and columns, forming just the patch of each.
+
+        (pixel,) complex64, and mean |I|² over those patches, (pixel,) float64.
+        """
         setting, side = self.plan.setting, PATCH_PX
         engine, inputs = load_engine(setting.engine), self._inputs(setting)
         if isinstance(inputs, Profiles):
             inputs = self.plan.inputs(inputs)
         tables, values = engine.prepare(inputs, **setting.options), np.empty(len(pixels), np.complex64)
+        power = np.empty(len(pixels))
         for index, (row, column) in enumerate(pixels):
             top, left = row // side * side, column // side * side
             places = self.plan.terrain.positions(self.grid[top : top + side, left : left + side])
-            patch = engine.form(tables, places, beams=self.beams, **setting.form_options)
-            values[index] = patch[row - top, column - left] / len(self.profiles)
-        return values
+            patch = engine.form(tables, places, beams=self.beams, **setting.form_options) / len(self.profiles)
+            values[index], power[index] = patch[row - top, column - left], (np.abs(patch) ** 2).mean()
+        return values, power
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
         """Return what each pulse adds at fractional pixels, (pulse, pixel) complex128; 0 where it does not see one.

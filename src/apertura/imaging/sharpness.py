@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.echo.compression import range_step
-from apertura.focus.engines import ENGINES, load_engine
-from apertura.focus.engines.engine import Engine
 from apertura.focus.inputs import PhaseHistory
+from apertura.imaging.parts import table_engine
 from apertura.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround
@@ -54,7 +53,7 @@ def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float
     >>> round(gathered([history], SceneGrid("local", -3.2, 3.2, 0.1, (64, 64)), 0.0), 1)
     1.0
     """
-    engine, ground = _table_engine(), FlatGround(height_m)
+    engine, ground = table_engine(), FlatGround(height_m)
     places = ground.positions(grid)
     power, total = np.zeros(grid.shape), np.zeros(grid.shape, np.complex128)
     for history in histories:
@@ -63,12 +62,6 @@ def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float
         power += np.abs(image) ** 2
         total += image
     return float((power / len(histories) + np.abs(total / len(histories)) ** 2).max() / 2)
-
-
-def _table_engine() -> Engine:
-    """Return the first engine that reads profiles and runs here."""
-    engines = (load_engine(name) for name in ENGINES)
-    return next(engine for engine in engines if engine.READS == "profiles" and engine.available())
 
 
 def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:

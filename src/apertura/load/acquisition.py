@@ -111,7 +111,7 @@ class Acquisition:
         return float(np.median(step_m / np.diff(self.log_seconds(self.track.time.values))))
 
     def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
-        """Return the ECEF position of an antenna at given times, (time, 3) float64 metres, by sound epochs of the log."""
+        """Return where an antenna was, by the sound epochs of the log, (time, 3) float64 metres, ECEF."""
         return phase_centres(
             *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
         )

@@ -66,7 +66,19 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
         lasting_s = campaign.settings.waveform.cyclic_prefix_s + campaign.settings.waveform.symbol_s / 2
         effect = paths.of_offset(lasting_s * paths.rate_m_s)
         lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
-    return lines
+    return [*lines, *_between_epochs(paths, pair)]
+
+
+def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
+    """Return what the spline between the epochs of the logs errs by: noise that lasts an epoch."""
+    stated = pair.report.get("positions", {})
+    errors = [stated.get(leg, {}).get("interpolation_m") for leg in ("tx", "rx")[: len(pair.positions)]]
+    if any(error is None for error in errors):
+        return []
+    slopes = paths.by_node(same=len(errors) == 1, sidelink=not pair.monostatic)
+    parts = [(np.linalg.norm(slope, axis=1) * error, 0.0) for slope, error in zip(slopes, errors, strict=True)]
+    words = " and ".join(f"{1e3 * error:.2g} mm" for error in errors)
+    return [BudgetLine("between epochs", f"{words} rms", paths.of_noise(*parts))]
 
 
 def arithmetic_line(error_db: float) -> BudgetLine:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,11 @@ from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.load.antennas import beams_of, body_axes
+from apertura.load.positions import position_error
 from apertura.load.scene import Flown
+from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions
-from apertura.settings import OfdmWaveform
+from apertura.settings import Node, OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
 
@@ -84,7 +87,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = read_phase_history(waveform.format, files, pair=pair)
+        echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
     history = phase_history_of(echo, campaign.settings.processing.window)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
@@ -104,40 +107,66 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     )
 
 
+@dataclass(frozen=True)
+class _Log:
+    """A node's log as it lies in raw/, and what the config says of the node."""
+
+    track: xr.Dataset
+    settings: Node
+    file: Path
+
+    def antenna(self, name: str, at: NDArray[np.datetime64]) -> NDArray[np.float64]:
+        arm = getattr(self.settings.lever_arms_m, name)
+        return phase_centres(*self._epochs, at=at, lever_arm_m=arm, **self._stated)
+
+    def body_axes(self, at: NDArray[np.datetime64]) -> NDArray[np.float64]:
+        return attitude_axes(*self._epochs, at=at, **self._stated)
+
+    @property
+    def _epochs(self) -> tuple[NDArray[np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
+        return self.track.time.values, self.track.position.values, self.track.attitude.values
+
+    @property
+    def _stated(self) -> dict[str, Any]:
+        return {"attitude_from": self.settings.attitude, "where": self.file}
+
+
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
     """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
-    tx, rx = pair.split("-")
-    logs = {node: campaign.track_file(flight, node) for node in (tx, rx)}
-    tracks = {node: read_track(log, node=node) for node, log in logs.items()}
-    first = max(track.time.values[0] for track in tracks.values())
-    last = min(track.time.values[-1] for track in tracks.values())
-    recorded = open_recording(campaign.recording_files(flight, tx)).captures.time
+    tx, rx = (_log(campaign, flight, node) for node in pair.split("-"))
+    first = max(log.track.time.values[0] for log in (tx, rx))
+    last = min(log.track.time.values[-1] for log in (tx, rx))
+    recorded = open_recording(campaign.recording_files(flight, pair.split("-", maxsplit=1)[0])).captures.time
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
-    places, axes = [], {}
-    for node, antenna in ((tx, "radar_tx"), (rx, "radar_rx")):
-        track, settings = tracks[node], campaign.settings.nodes[node]
-        log = (track.time.values, track.position.values, track.attitude.values)
-        arm = getattr(settings.lever_arms_m, antenna)
-        stated: dict[str, Any] = {"at": times, "attitude_from": settings.attitude, "where": logs[node]}
-        places.append(phase_centres(*log, lever_arm_m=arm, **stated))
-        if antenna in campaign.antennas(pair):
-            axes[antenna] = attitude_axes(*log, **stated)
+    times = times[inside_segments(campaign, flight, pair, times)]
+    beams = {"radar_tx": tx, "radar_rx": rx}
+    axes = {antenna: beams[antenna].body_axes(times) for antenna in campaign.antennas(pair)}
+    offset = rx.settings.path_offset_m
+    beyond_m = offset.radar
+    if tx.file != rx.file:
+        length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
+        beyond_m -= offset.sidelink + float(length_m.min())
     numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
     frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
     weight = window_weights(campaign.settings.processing.window, len(frequency))
-    limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s
-    aperture = Aperture(places[0], places[1])
+    limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m
+    known = {log.file: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     return OpenPair(
         flight,
         pair,
-        aperture,
+        Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times)),
         frequency,
         weight,
         limit_m,
         time_s=_seconds(times),
-        positions=tuple(NodePositions(None) for _ in _legs(pair)),
+        positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
     )
+
+
+def _log(campaign: Campaign, flight: str, node: str) -> _Log:
+    file = campaign.track_file(flight, node)
+    return _Log(read_track(file, node=node), campaign.settings.nodes[node], file)
 
 
 def _pulse_times(

@@ -107,7 +107,7 @@ def _flags(node: Acquisition, at: Times, barred: dict[str, NDArray[np.bool_]]) -
         faults = [fault for fault in checked.faults.get(name, ()) if begin <= fault[0] <= end]
         if not (out or faults):
             continue
-        worst = f"; {len(faults)} epochs or steps, worst {_worst(node, faults)}" if faults else ""
+        worst = f"; {len(faults)} found, worst {_worst(node, faults)}" if faults else ""
         longest = _longest(node, checked, name) if out else ""
         asked = what.format(asked=node.settings.worst_fix)
         lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {asked}{longest}{worst}"

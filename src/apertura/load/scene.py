@@ -1,7 +1,7 @@
 """A campaign's grid and the ground under it, opened together: from the results, or as they will be."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,12 @@ class Flown:
     aperture: Aperture
     frequency_hz: NDArray[np.float64]
     path_limit_m: float
+
+    @classmethod
+    def together(cls, pairs: Sequence["Flown"]) -> "Flown":
+        """Return what all pairs of a flight flew: a campaign has one grid, whichever pair is imaged."""
+        tx_m, rx_m = (np.concatenate([flown.aperture.legs[leg] for flown in pairs]) for leg in (0, 1))
+        return cls(Aperture(tx_m, rx_m), pairs[0].frequency_hz, min(flown.path_limit_m for flown in pairs))
 
 
 @dataclass(frozen=True)
@@ -116,13 +122,16 @@ def open_scene(campaign: Campaign) -> OpenScene:
     return replace(scene, terrain=heights, parents=(stage,))
 
 
-def expected_scene(campaign: Campaign, flown: Flown) -> OpenScene:
-    """Return the scene as `open_scene`, or what it will be; voids of a DEM are refused here as they will be."""
+def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
+    """Return the scene as `open_scene`, or what it will be; voids of a DEM are refused here as they will be.
+
+    `flown` gives what the first image flight flew; asked only where something is `auto`.
+    """
     asked = campaign.settings.scene
     if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
         scene = settled_scene(campaign)
     else:
-        grid, ground, chosen = settled(campaign, lambda: flown)
+        grid, ground, chosen = settled(campaign, flown)
         level = ground.level(grid)
         scene = OpenScene(grid, level, level, (), ground.inputs, chosen)
     if asked.dem is None:

@@ -138,12 +138,21 @@ def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[Evidence])
         for second in names[i + 1 :]:
             swapped = {
                 **nodes,
-                first: replace(nodes[first], track=nodes[second].track),
-                second: replace(nodes[second], track=nodes[first].track),
+                first: _placed(nodes[first], nodes[second]),
+                second: _placed(nodes[second], nodes[first]),
             }
             histories = _flown(swapped, found)
             if histories:
                 yield Suspicion(f"the tracks of {first} and {second} are swapped", "tracks swapped", histories)
+
+
+def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
+    """Return a node at the positions of another, turned as its own log says."""
+    at = node.log_seconds(other.track.time.values)
+    own = node.log_seconds(node.track.time.values)
+    turned = np.unwrap(node.track.attitude.values, axis=0)
+    attitude = np.stack([np.interp(at, own, angle) for angle in turned.T], axis=-1)
+    return replace(node, track=other.track.assign(attitude=(("epoch", "axis"), attitude)))
 
 
 def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:

@@ -7,6 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.quality.measures import coherence_factor
+from apertura.quality.sub_apertures import SubApertures
+
 LEAST_BLOCKS = 32
 """Parts of the aperture that a point must dominate."""
 
@@ -18,6 +21,7 @@ DEFOCUSED_DB = -1.0
 
 _TREND = 5  # degree of the polynomial that patterns, range and aspect draw into log-amplitude
 _PADDING = 8
+_SURE = 5.0
 
 
 @dataclass(frozen=True)
@@ -34,12 +38,16 @@ class PointFocus:
         Of a block; phase errors faster than that are not seen.
     snr_db
         Of the point in the image, from its even and its odd pulses; NaN with fewer than four.
+    coherence, coherence_allowed
+        |Σ s|²/(M Σ|s|²) of what the M pulses add, and what their noise alone would leave of it.
     """
 
     loss_db: float
     interference: float
     pulses: int
     snr_db: float
+    coherence: float = 1.0
+    coherence_allowed: float = 1.0
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
@@ -76,7 +84,10 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
             if unrest <= MOST_INTERFERENCE:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
                 loss = (best / amplitude.sum()) ** 2 * (1 + unrest * (1 - 2.5 * unrest) / 2) ** 2
-                return PointFocus(10 * float(np.log10(min(1.0, loss))), unrest, pulses, even_odd_snr_db(contributions))
+                snr_db = _snr_db(contributions)
+                allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
+                loss_db = 10 * float(np.log10(min(1.0, loss)))
+                return PointFocus(loss_db, unrest, pulses, snr_db, coherence_factor(contributions), allowed)
         pulses *= 2
     return None
 
@@ -87,7 +98,7 @@ def _unrest(log_amplitude: NDArray[np.float64]) -> float:
     return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))
 
 
-def even_odd_snr_db(contributions: NDArray[np.complex128]) -> float:
+def _snr_db(contributions: NDArray[np.complex128]) -> float:
     """Return the SNR of a pixel from neighbouring pulses, which differ by noise alone."""
     count = len(contributions) // 2
     if count < 2:
@@ -140,7 +151,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     """
     seen = [(amplitude, focus) for amplitude, focus in points if focus is not None]
     if not seen:
-        return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point dominates its range cell")
+        return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in seen])
     own = np.array([_std_db(focus) for _, focus in seen])
     weights = np.array([amplitude**2 for amplitude, _ in seen])
@@ -150,6 +161,33 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     bad = loss < DEFOCUSED_DB - 2 * std
     line = f"{len(seen)} bright points lost {-loss:.1f} ± {std:.1f} dB of their peak to phase errors"
     return Focus("defocused" if bad else "focused", loss, std, len(seen), line)
+
+
+def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
+    """Return what images of parts of the aperture say where no bright point says anything.
+
+    Parameters
+    ----------
+    parts
+        Of several patches.
+    cell_m
+        Resolution cell: parts that show a patch further apart cannot add up to a sharp image.
+
+    Examples
+    --------
+    >>> judge_parts(SubApertures(20.0, 0.9, 0.05, 7.0, 7.1), cell_m=0.3).verdict
+    'defocused'
+    >>> judge_parts(SubApertures(20.0, 0.9, 0.5, 7.0, 7.1), cell_m=0.3).verdict
+    'cannot tell'
+    """
+    nothing = float("nan"), float("nan"), 0
+    line = "no bright point dominates its range cell"
+    if parts.drift_m - _SURE * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
+        drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
+        return Focus("defocused", *nothing, f"{line}, and parts of the aperture show the scene {drift} apart")
+    if np.isfinite(parts.entropy):
+        line += f"; entropy {parts.entropy:.2f}, with random phases {parts.entropy_by_chance:.2f}"
+    return Focus("cannot tell", *nothing, line)
 
 
 def _std_db(focus: PointFocus) -> float:

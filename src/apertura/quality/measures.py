@@ -27,13 +27,10 @@ class NumericalError:
         RMS of the difference over RMS of the reference at those pixels, dB.
     peak_db
         Largest difference over the image's peak, dB.
-    std_db
-        Standard deviation of `rms_db` by the choice of pixels (jackknife): large where few of them hold most power.
     """
 
     rms_db: float
     peak_db: float
-    std_db: float = 0.0
 
 
 def numerical_error(
@@ -50,7 +47,7 @@ def numerical_error(
 
     Notes
     -----
-    Source: docs/theory.md, "Image" (numerical_error_db, peak_error_db); Efron (1982), The jackknife.
+    Source: docs/theory.md, "Image" (numerical_error_db, peak_error_db).
 
     Examples
     --------
@@ -66,16 +63,7 @@ def numerical_error(
     return NumericalError(
         _ratio_db(np.sqrt((difference**2).mean()), np.sqrt((np.abs(reference) ** 2).mean())),
         _ratio_db(difference.max(), top),
-        _jackknife_db(difference**2, np.abs(reference) ** 2),
     )
-
-
-def _jackknife_db(errors: NDArray[np.float64], powers: NDArray[np.float64]) -> float:
-    """Return the standard deviation of 10·lg(Σ errors / Σ powers), from what leaving each pixel out would change."""
-    tiny = np.finfo(np.float64).tiny
-    left = (errors.sum() - errors) / np.maximum(powers.sum() - powers, tiny)
-    level_db = 10 * np.log10(np.maximum(left, tiny))
-    return float(np.sqrt((len(errors) - 1) * level_db.var())) if left.min() > tiny else 0.0
 
 
 def _ratio_db(amplitude: float, against: float) -> float:

@@ -18,17 +18,20 @@ CELLS_PER_PIXEL = 3.0
 
 
 def utm_crs(position: NDArray[np.float64]) -> str:
-    """Return the EPSG code of the WGS 84 UTM zone at an ECEF position.
+    """Return the EPSG code of the WGS 84 UTM zone at an ECEF position; near the poles, of the polar stereographic map.
 
     Examples
     --------
     >>> from apertura.geometry.geodesy import ecef_from_geodetic
     >>> utm_crs(ecef_from_geodetic(*map(np.array, (48.4, 9.95, 600.0))))
     'EPSG:32632'
+    >>> utm_crs(ecef_from_geodetic(*map(np.array, (-85.0, 9.95, 600.0))))
+    'EPSG:5042'
     """
     latitude, longitude, _ = geodetic_from_ecef(position)
     zones = query_utm_crs_info("WGS 84", AreaOfInterest(longitude, latitude, longitude, latitude))
-    return f"EPSG:{zones[0].code}"
+    polar = "5041" if latitude > 0 else "5042"
+    return f"EPSG:{zones[0].code if zones else polar}"
 
 
 def auto_bounds(

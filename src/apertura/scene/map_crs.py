@@ -1,16 +1,24 @@
-"""What a scene's CRS must be: known to PROJ, projected in metres, and in use where the scene lies."""
+"""What a scene's CRS must be: known to PROJ, projected in metres, and usable where the scene lies."""
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
 
 from apertura.errors import CampaignError
+
+MARGIN_DEG = 3.0
+"""How far beyond its area of use a projection may be used: half a UTM zone, where distances grow by half a per cent."""
+
+RETURN_M = 1e-3
+"""Places that do not come back to their coordinates this closely are beyond a projection."""
 
 _WHERE = "scene"
 
 
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
-    """Raise CampaignError unless `crs` is projected in metres and its area of use holds the bounds.
+    """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
 
     Parameters
     ----------
@@ -43,22 +51,42 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
             expected="a projected CRS in metres, such as a UTM zone",
             remedy="Choose another scene.crs.",
         )
-    _check_area_of_use(system, bounds_m)
+    _check_usable(system, bounds_m)
 
 
-def _check_area_of_use(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
+def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
+    """Refuse corners from which the projection does not lead back, or that lie far from its area of use."""
     area = system.area_of_use
-    if area is None:
-        return
     inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     xmin, ymin, xmax, ymax = bounds_m
-    longitude, latitude = inverse.transform([xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax])
-    for lon, lat in zip(longitude, latitude, strict=True):
-        if not (np.isfinite(lon) and area.west <= lon <= area.east and area.south <= lat <= area.north):
-            raise CampaignError(
-                f"bounds_m {list(bounds_m)} reach longitude {lon:.4f}, latitude {lat:.4f}",
-                where=_WHERE,
-                expected=f"inside the area of use of {system.name}: longitude {area.west} to {area.east}, "
-                f"latitude {area.south} to {area.north}",
-                remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
-            )
+    corners = np.array([[xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax]])
+    longitudes, latitudes = inverse.transform(corners[0], corners[1])
+    returned = np.array(inverse.transform(longitudes, latitudes, direction=TransformDirection.INVERSE))
+    usable = (np.abs(returned - corners) < RETURN_M).all(axis=0)  # False of what is not finite
+    if area is not None:
+        usable &= _near(area.bounds, longitudes, latitudes)
+    if usable.all():
+        return
+    first = int(np.argmin(usable))
+    near = ""
+    if area is not None:
+        near = (
+            f"within {MARGIN_DEG:g} degrees of the area of use of {system.name}: "
+            f"longitude {area.west} to {area.east}, latitude {area.south} to {area.north}"
+        )
+    raise CampaignError(
+        f"bounds_m {list(bounds_m)} reach longitude {longitudes[first]:.4f}, latitude {latitudes[first]:.4f}",
+        where=_WHERE,
+        expected=near or f"places that {system.name} can show",
+        remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
+    )
+
+
+def _near(
+    area_deg: tuple[float, float, float, float], longitude: NDArray[np.float64], latitude: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which places lie within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
+    west, south, east, north = area_deg
+    width = (east - west) % 360 or 360.0
+    inside = (longitude - west + MARGIN_DEG) % 360 <= width + 2 * MARGIN_DEG
+    return np.asarray(inside & (latitude >= south - MARGIN_DEG) & (latitude <= north + MARGIN_DEG))

@@ -9,11 +9,13 @@ from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffs
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
 from apertura.settings.section import Name, Section
+from apertura.settings.segments import SEGMENTS, Segment, read_segments
 from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Waveform
 
 __all__ = [
     "CONFIG",
     "FLIGHTS",
+    "SEGMENTS",
     "Antenna",
     "Antennas",
     "Calibration",
@@ -27,10 +29,12 @@ __all__ = [
     "Processing",
     "Scene",
     "Section",
+    "Segment",
     "Settings",
     "Waveform",
     "located",
     "read_flights",
+    "read_segments",
     "read_settings",
     "validated",
 ]

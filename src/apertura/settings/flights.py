@@ -1,6 +1,5 @@
 """config/flights.tsv: one line per flight."""
 
-import csv
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 from apertura.errors import CampaignError
 from apertura.settings.config import CONFIG
 from apertura.settings.section import Name
+from apertura.settings.table import table_rows
 
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
@@ -46,40 +46,23 @@ def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
     CampaignError
         Naming file and line.
     """
-    if not path.is_file():
-        raise CampaignError(
-            "no such file",
-            where=path,
-            expected=f"a tab-separated table {_COLUMNS}",
-            remedy="Write one line per flight.",
-        )
-    with path.open(encoding="utf-8", newline="") as lines:
-        table = csv.DictReader(lines, delimiter="\t")
-        if table.fieldnames is None or [name.strip() for name in table.fieldnames] != _COLUMNS:
+    seen: set[str] = set()
+    for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per flight."):
+        flight = _flight(cells, nodes, where=where)
+        if flight.name in seen:
             raise CampaignError(
-                f"columns {table.fieldnames}",
-                where=path,
-                expected=f"{_COLUMNS}, tab-separated",
-                remedy="Correct it.",
+                f"flight {flight.name} a second time",
+                where=where,
+                expected="each flight once",
+                remedy="Join the lines or rename one flight.",
             )
-        seen: set[str] = set()
-        for number, row in enumerate(table, start=2):
-            flight = _flight(row, nodes, where=f"{path}: line {number}")
-            if flight.name in seen:
-                raise CampaignError(
-                    f"flight {flight.name} a second time",
-                    where=f"{path}: line {number}",
-                    expected="each flight once",
-                    remedy="Join the lines or rename one flight.",
-                )
-            seen.add(flight.name)
-            yield flight
+        seen.add(flight.name)
+        yield flight
     if not seen:
         raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
 
 
-def _flight(row: dict[str, str | None], known: Collection[str], *, where: str) -> Flight:
-    cells = {key: (value or "").strip() for key, value in row.items() if key in _COLUMNS}
+def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Flight:
     nodes = tuple(name.strip() for name in cells["nodes"].split(",") if name.strip())
     problem = None
     try:

@@ -65,7 +65,7 @@ def simulate(
     directory
         The folder to make; it must not exist, or be empty.
     specification
-        A specification, the path of one in YAML, or a preset: `demo`, `paper`, `swarm`, `continuous`.
+        A specification, the path of one in YAML, or a preset, a key of `PRESETS`: `demo`, `paper`, `paper-uav`, …
     targets
         What stands in the scene instead, east, north and up (m) of the specification's origin.
     tracks

@@ -88,7 +88,20 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     ]
     table = "\n".join(("flight\tkind\ttransmitter\tnodes", *rows)) + "\n"
     (root / "config" / "flights.tsv").write_text(table, encoding="utf-8")
+    _write_segments(root, specification)
     np.save(root / "raw" / "codes.npy", campaign.waveform.codes.astype(np.complex64))
+
+
+def _write_segments(root: Path, specification: CampaignSpecification) -> None:
+    rows = [
+        (flight.name, pair, *(np.datetime_as_string(_utc(flight, np.array(ends)), unit="us")))
+        for flight in specification.flights
+        for pair, segments in flight.segments.items()
+        for ends in segments
+    ]
+    if rows:
+        table = "".join("\t".join(row) + "\n" for row in (("flight", "pair", "start", "end"), *rows))
+        (root / "config" / "segments.tsv").write_text(table, encoding="utf-8")
 
 
 def _node_section(node: SimulatedNode) -> dict[str, Any]:

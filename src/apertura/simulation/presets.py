@@ -6,10 +6,17 @@ from dataclasses import replace
 import numpy as np
 
 from apertura.simulation.continuous import Framing
+from apertura.simulation.experiments import (
+    EXPERIMENT_ORIGIN,
+    PAPER_WAVEFORM,
+    paper_lab,
+    paper_static,
+    paper_uav,
+)
 from apertura.simulation.impairments import Impairments, Leakage, TimeTag, Timing, UniformPhase
 from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import Geometry, straight_pair
-from apertura.simulation.scene import Origin, PointTarget, Scatterers
+from apertura.simulation.scene import PointTarget, Scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
@@ -19,7 +26,7 @@ from apertura.simulation.specification import (
 )
 from apertura.simulation.trajectory import Straight, Wobble
 
-DEMO_ORIGIN = Origin(48.42255, 9.95509, 620.0)  # flat ground by the Danube
+DEMO_ORIGIN = EXPERIMENT_ORIGIN  # flat ground by the Danube
 _DEMO_WAVEFORM = WaveformSpecification(1024, 1.2e9, 400e3, 3.125e-6, 0.78125e-6, 1.024e9, 20.0)
 _DEMO_TARGETS = (
     PointTarget((0.0, 0.0, 0.0)),
@@ -33,7 +40,6 @@ _PRIMARY = SimulatedNode(
     {"radar": 1.374, "sidelink": 0.655},
     impairments=Impairments(radar_snr_db=25.0, missed_fraction=0.02),
 )
-_PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")
 _PAPER_TARGETS = ((0.0, 5.0), (-4.0, 10.0), (0.0, 15.0), (4.0, 20.0), (0.0, 25.0))
 """Cross-range and ground range, m."""
 
@@ -90,7 +96,7 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
 
     Of the paper's 3000 pulses in 30 s, 600, every 5 cm, are still unambiguous and make 38 MB.
     """
-    waveform = replace(_PAPER_WAVEFORM, prf_hz=pulses / 30)
+    waveform = replace(PAPER_WAVEFORM, prf_hz=pulses / 30)
     track = Straight((-0.5 * (pulses - 1) / waveform.prf_hz, -15.0, 10.0), (1.0, 0.0, 0.0))
     return CampaignSpecification(
         "paper",
@@ -104,7 +110,8 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
 
 
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
-    made.__name__: made for made in (demo, paper, swarm, continuous)
+    made.__name__.replace("_", "-"): made
+    for made in (demo, paper, swarm, continuous, paper_lab, paper_static, paper_uav)
 }
 
 
@@ -148,7 +155,7 @@ def paper_waveform(*, prf_hz: float = 100.0) -> TransmitWaveform:
     >>> len(wave.codes) * wave.subcarrier_spacing_hz
     409600000.0
     """
-    return replace(_PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
+    return replace(PAPER_WAVEFORM, prf_hz=prf_hz).drawn(np.random.default_rng(0))  # of which this code draws nothing
 
 
 def paper_scene(*, pulses: int = 3000, rx_ahead_m: float = 0.0) -> tuple[Scatterers, Geometry]:

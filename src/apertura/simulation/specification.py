@@ -107,6 +107,10 @@ class SimulatedFlight:
     first_frame: int = Field(default=0, ge=0, description="number of the first frame")
     continuous: bool = Field(default=False, description="recorders run through instead of being triggered")
     targets: tuple[Target, ...] | None = Field(default=None, description="what stands there in this flight only")
+    segments: Mapping[str, tuple[tuple[float, float], ...]] = Field(
+        default_factory=dict,
+        description="pair → start and end of what images it, s after the first pulse; missing: all",
+    )
 
     @model_validator(mode="after")
     def _transmitter_flies(self) -> Self:

@@ -1,7 +1,6 @@
 """Rule `assess`: what the images of one flight say of each other, and which of them may be added up."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,14 @@ import xarray as xr
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.fusion.choice import choose_fusion
+from apertura.load.agreement import agreement_of, agreement_report, common_cell_m
 from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
-from apertura.quality.agreement import Agreement, agreement
-from apertura.quality.bright_points import BrightPoint
-from apertura.scene.grid import SceneGrid
+from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage
 
-_LOOKS_WRONG = frozenset({"defocused", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
 """Flags that a wrong geometry raises, and for which a remedy is looked for."""
 
 _SURE_SNR_DB = 20.0
@@ -32,11 +30,14 @@ def assess(campaign: Campaign, flight: str) -> Path:
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
     reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
-    found = {pair: _agreement(images, reference, pair, grid) for pair in pairs if pair != reference}
-    cells = {pair: max(quality[name]["focus"]["cell_m"] for name in (reference, pair)) for pair in found}
+    found = {pair: agreement_of(images[reference], images[pair], grid) for pair in pairs if pair != reference}
+    cells = {pair: common_cell_m(images[reference], images[pair]) for pair in found}
     unconfirmed = {pair for pair, one in found.items() if one is None and _sure(quality[reference]["focus"])}
     fusion = choose_fusion(
-        reference, found, unconfirmed=unconfirmed, align=campaign.settings.processing.fusion.align_phase
+        reference,
+        found,
+        unfit=_unfit(found, cells, unconfirmed, reference),
+        align=campaign.settings.processing.fusion.align_phase,
     )
     flags = _flags(found, cells, reference, unconfirmed)
     for pair, name, line in _wrong_codes(quality):
@@ -46,7 +47,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "flight": flight,
         "reference": reference,
         "hypotheses": named,
-        "pairs": {pair: {"agreement": _report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
+        "pairs": {pair: {"agreement": agreement_report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
         "fusion": fusion.report,
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
@@ -65,6 +66,18 @@ def _flags(
         for side, (name, line) in product((pair, reference), raised.items()):
             lines[side].setdefault(name, []).append(line)
     return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
+
+
+def _unfit(
+    found: Mapping[str, Agreement | None], cells: Mapping[str, float], unconfirmed: Collection[str], reference: str
+) -> dict[str, str]:
+    """Return pairs that show other places than the reference, whose phases there mean nothing → why."""
+    apart = {
+        pair: f"its bright points lie {100 * one.shift_m:.0f} cm from those of {reference}"
+        for pair, one in found.items()
+        if one is not None and one.shifted(cells[pair]) and one.shift_m > cells[pair] / 2
+    }
+    return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 
 
 def _suspected(
@@ -91,27 +104,6 @@ def _suspected(
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     """Return how little a pair's focus is to be trusted."""
     return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
-
-
-def _points(quality: Mapping[str, Any], grid: SceneGrid) -> list[BrightPoint]:
-    points = quality["focus"]["points"]
-    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
-    return [
-        BrightPoint(float(row), float(column), point["amplitude"])
-        for row, column, point in zip(rows, columns, points, strict=True)
-    ]
-
-
-def _agreement(images: Mapping[str, xr.Dataset], reference: str, pair: str, grid: SceneGrid) -> Agreement | None:
-    two = [images[name] for name in (reference, pair)]
-    qualities = [image.attrs["quality"] for image in two]
-    points = [_points(quality, grid) for quality in qualities]
-    return agreement(
-        (two[0].image, two[1].image),
-        (points[0], points[1]),
-        spacing_m=grid.spacing_m,
-        cell_m=max(quality["focus"]["cell_m"] for quality in qualities),
-    )
 
 
 def _sure(focus: Mapping[str, Any]) -> bool:
@@ -151,7 +143,3 @@ def _wrong_codes(quality: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, st
         for pair, tx in ((pair, pair.split("-")[0]) for pair in quality)
         if tx in evidence
     ]
-
-
-def _report(one: Agreement | None) -> dict[str, float] | None:
-    return None if one is None else {name: float(f"{value:.4g}") for name, value in asdict(one).items()}

@@ -9,8 +9,10 @@ import xarray as xr
 
 from apertura.campaign import Campaign
 from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.load.agreement import agreement_of, agreement_report, common_cell_m
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
+from apertura.scene.grid import SceneGrid
 from apertura.steps.stamping import stamped
 from apertura.store import create, finish, open_array, open_stage, writing
 
@@ -24,13 +26,16 @@ def cube(campaign: Campaign) -> Path:
         for flight in flights
         for pair in flight.pairs
     }
-    fusion = {flight.name: assessment_of(campaign, flight.name)["fusion"] for flight in flights}
+    assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
+    fusion = {name: one["fusion"] for name, one in assessed.items()}
+    references = {name: images[f"{name}/{one['reference']}"] for name, one in assessed.items()}
     side = campaign.settings.processing.tile_px
     windows, folder = list(settled_scene(campaign).grid.tiles(side)), campaign.stage("cube")
     with writing(folder) as wip:
         empty = stamped(
             _empty(images, fusion, pairs), "cube", modules=[__name__], parents=images, settings={"fusion": fusion}
         )
+        empty.attrs |= _between_flights(references, settled_scene(campaign).grid)
         chunks = {"image": (1, 1, side, side)} | dict.fromkeys(
             ("coherent", "noncoherent", "magnitude"), (1, side, side)
         )
@@ -51,6 +56,23 @@ def cube(campaign: Campaign) -> Path:
                 arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
         finish(wip, folder)
     return folder
+
+
+def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> dict[str, Any]:
+    """Return how each flight's reference image lies against the first flight's, and its flags."""
+    (first, image), *others = references.items()
+    between: dict[str, Any] = {}
+    flags: dict[str, dict[str, str]] = {}
+    for name, other in others:
+        found = agreement_of(image, other, grid)
+        between[name] = agreement_report(found)
+        if found is not None and found.shifted(common_cell_m(image, other)):
+            flags[name] = {
+                "flights_apart": f"{found.points} bright points of flight {name} lie {100 * found.shift_m:.1f} ± "
+                f"{100 * found.shift_std_m:.1f} cm from where flight {first} has them, {100 * found.shift_east_m:+.1f} "
+                f"cm east and {100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
+            }
+    return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 
 def _empty(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any], pairs: Sequence[str]) -> xr.Dataset:

@@ -12,10 +12,12 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.association import Association
 from apertura.echo.association_edges import tag_jitter_s
 from apertura.echo.demodulate import remove_path
+from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.ingest import read_phase_history
 from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
 from apertura.load.positions import Placed, place
+from apertura.load.segments import keep_segments
 from apertura.load.transmitted import read_codes, symbol_samples
 from apertura.provenance import merged, sha256_file
 from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
@@ -39,10 +41,11 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         dataset = _echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
+    dataset = keep_segments(campaign, flight, pair, dataset)
     inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
     if calibration:
         inputs = merged(inputs, calibration["inputs"])
-    relevant = {**campaign.relevant("echo", pair), "calibration": calibration_spec(calibration)}
+    relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     save_stage(stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs), folder)
     return folder
@@ -64,21 +67,8 @@ def _echo(
     measured, sidelink_m = _transfer(
         (tx, rx), pulses.rx_index[paired], at, codes, waveform=waveform, processing=processing
     )
-    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
-    attrs = {
-        "frame": "ecef",
-        "pair": f"{tx.name}-{rx.name}",
-        **measured.report,
-        "stated_offset_m": offset_m,
-        "positions": placed.report,
-        "time_tags": _time_tags(tx, pulses),
-        "flags": {**pulses.flags, **placed.flags, **measured.flags},
-        "pulses": _counted(len(tx.raw.time), pulses, placed, measured),
-    }
-    if calibration:
-        attrs["flags"] |= calibration["flags"]
-        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
     at = at[measured.kept]
+    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
     beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
     frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
     return xr.Dataset(
@@ -90,10 +80,38 @@ def _echo(
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
             **_axes((tx, rx), at),
         },
-        attrs=attrs,
+        attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
+        | {"stated_offset_m": offset_m},
     )
+
+
+def _attributes(
+    nodes: tuple[Acquisition, Acquisition],
+    pulses: Association,
+    placed: Placed,
+    measured: Transfer,
+    *,
+    at: Times,
+    calibration: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Return what was found on the way to the pulses used, those sent `at`: edges crossed, pulses left out."""
+    missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
+    attrs = {
+        "frame": "ecef",
+        "pair": "-".join(node.name for node in nodes),
+        **measured.report,
+        "positions": placed.report,
+        "time_tags": _time_tags(nodes[0], pulses),
+        "flags": {**pulses.flags, **placed.flags, **measured.flags, **missing},
+        "pulses": _counted(len(nodes[0].raw.time), pulses, placed, measured),
+    }
+    if calibration:
+        attrs["flags"] |= calibration["flags"]
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    return attrs
 
 
 def _transfer(
@@ -111,7 +129,8 @@ def _transfer(
     """
     tx, rx = nodes
     if tx.name == rx.name:
-        measured = transfer_by_code(rx.captures("radar", captures), codes, rx.numerology)
+        radar, sent_ns = rx.captures("radar", captures), at.astype("datetime64[ns]").astype(np.int64)
+        measured = transfer_by_code(radar, codes, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
         return measured, np.zeros(len(measured.transfer))
     length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
     measured = transfer_by_sidelink(

@@ -63,9 +63,11 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         **_measures(grid, campaign.settings.processing.tile_px, sums),
         "fusion": assessed["fusion"],
         "coherence": _coherence(grid, images, assessed),
+        "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": _flags(
             {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()}
-        ),
+        )
+        | cube.attrs["flags"].get(flight, {}),
     }
     name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
     titles = {
@@ -159,7 +161,8 @@ def _worst(images: Sequence[xr.Dataset], fusion: Mapping[str, Any]) -> dict[str,
             "numerical_error": "that of the worst pair",
         },
         "numerical_error_db": worst["numerical_error_db"],
-        "numerical_error_std_db": worst["numerical_error_std_db"],
+        "numerical_error_confidence": worst["numerical_error_confidence"],
+        "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
         "redone": [one for quality in qualities for one in quality["redone"]],
     }
@@ -169,7 +172,7 @@ def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
     told = {name: report[name] for name in ("budget", "focus", "fusion", "redone") if report.get(name)}
     return {
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
-        "APERTURA_ERROR_STD_DB": f"{report['numerical_error_std_db']:.2f}",
+        "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
         "APERTURA_PEAK_ERROR_DB": f"{report['peak_error_db']:.2f}",
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_MODELS": canonical_json(report["models"]),

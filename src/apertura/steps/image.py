@@ -26,7 +26,7 @@ from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
 from apertura.store import finish, open_array, open_stage, resume, sharing, writing
 
-_QUOTED = ("pulses", "sidelink", "clock", "calibration")
+_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.load.budget import budget_of
-from apertura.load.pair import OpenPair, open_pair
+from apertura.load.pair import open_pair
 from apertura.load.plan import plan_pair
-from apertura.load.scene import OpenScene, expected_scene
+from apertura.load.scene import Flown, expected_scene
 from apertura.planning.plan import Plan
 from apertura.quality.budget import BudgetLine, expected
 from apertura.quality.path_errors import Effect
@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
     """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran."""
-    return plan_pair(campaign, *_opened(campaign, flight, pair), threads=threads)
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
+    return plan_pair(campaign, open_pair(campaign, flight, pair), scene, threads=threads)
 
 
-def _opened(campaign: Campaign, flight: str, pair: str) -> tuple[OpenPair, OpenScene]:
-    opened = open_pair(campaign, flight, pair)
-    return opened, expected_scene(campaign, opened.flown)
+def first_flight(campaign: Campaign) -> Flown:
+    """Return what all pairs of the first image flight fly, from which the one grid of all images is settled."""
+    flight = campaign.image_flights[0]
+    return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
 
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
@@ -34,11 +36,12 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
 
     console = Console(width=max(140, Console().width))
     seconds, disk = 0.0, 0
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
     for flight in campaign.image_flights:
         for pair in flight.pairs:
-            opened = _opened(campaign, flight.name, pair)
-            plan = plan_pair(campaign, *opened, threads=threads)
-            console.print(_table(plan, f"{flight.name}/{pair}"), _budget_table(budget_of(campaign, *opened)))
+            opened = open_pair(campaign, flight.name, pair)
+            plan = plan_pair(campaign, opened, scene, threads=threads)
+            console.print(_table(plan, f"{flight.name}/{pair}"), _budget_table(budget_of(campaign, opened, scene)))
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes

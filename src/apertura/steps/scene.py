@@ -4,8 +4,6 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.geometry.aperture import Aperture
@@ -24,5 +22,13 @@ def scene(campaign: Campaign) -> Path:
 def _first_flight(campaign: Campaign) -> Flown:
     flight = campaign.image_flights[0]
     echoes = [open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs]
-    tx, rx = (np.concatenate([echo[name].values for echo in echoes]) for name in ("tx_position", "rx_position"))
-    return Flown(Aperture(tx, rx), echoes[0].frequency.values, float(min(echo.path_limit.min() for echo in echoes)))
+    return Flown.together(
+        [
+            Flown(
+                Aperture(echo.tx_position.values, echo.rx_position.values),
+                echo.frequency.values,
+                float(echo.path_limit.min()),
+            )
+            for echo in echoes
+        ]
+    )

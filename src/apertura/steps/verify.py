@@ -17,6 +17,7 @@ from apertura.load.scene import settled_scene
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.scene.grid import SceneGrid
 from apertura.settings import Flight
+from apertura.steps.summary import print_summary
 from apertura.store import open_stage
 
 REACH_M = 1.0
@@ -120,28 +121,7 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
             finding.flight, finding.image, str(finding.target), *row, *(f"{100 * width:.1f} cm" for width in widths)
         )
     console.print(table)
-    console.print(_quality(campaign))
+    print_summary(campaign)
     if paths:
         for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
             print(campaign.results / file)
-
-
-def _quality(campaign: Campaign) -> Table:
-    table = Table(title="what each image says of itself", title_justify="left")
-    for heading in ("flight", "image", "focus", "coherence of pairs", "numerical error", "pulses", "dropped", "flags"):
-        table.add_column(heading)
-    for flight in campaign.image_flights:
-        for name in (*flight.pairs, "fused"):
-            report = json.loads((campaign.results / flight.name / name / "image.json").read_text(encoding="utf-8"))
-            pulses, coherence = report.get("pulses", {}), report.get("coherence", {}).get("mean")
-            table.add_row(
-                flight.name,
-                name,
-                report.get("focus", {}).get("verdict", ""),
-                "" if coherence is None else f"{coherence:.4f}",
-                f"{report['numerical_error_db']:.1f} dB",
-                str(pulses.get("used", "")),
-                str(pulses.get("dropped", "")),
-                ", ".join(report["flags"]) or "none",
-            )
-    return table

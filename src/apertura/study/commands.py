@@ -19,14 +19,31 @@ ATLAS = Path("results/study/atlas")
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
     "parameters": "parameters:parameter_claims",
+    "effects": "effects:effect_claims",
     "resolution": "resolution:simulated_table",
     "uav_resolution": "resolution:uav_table",
     "coherence": "coherence:coherence_claims",
+    "fusion": "fusion:fusion_claims",
     **{f"loss_{error}": _LOSS for error in ("carrier_phase", "timing", "cfo", "sfo", "localization")},
+    "positions": "positions:position_claims",
     "corrected": "corrected:corrected_claims",
     "clock": "corrected:clock_claims",
+    "swarm": "swarm:swarm_claims",
 }
 """Files of rows that make up claims.csv, in its order → what computes them; `loss_…` gives its error as argument."""
+
+PAPER_READS = {"coherence": ("lab", "static"), "fusion": ("uav",)}
+"""Part → the experiments whose campaigns it reads, from a folder that it is given."""
+
+CAMPAIGNS = "campaigns"
+
+PAPER_FIGURES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("no_errors", "sfo", "cfo", "carrier_phase", "timing", "localization", "scene"), ()),
+    **dict.fromkeys(("lab_profile", "lab_phase"), ("lab",)),
+    **dict.fromkeys(("static_profile", "static_phase"), ("static",)),
+    **dict.fromkeys(("uav_geometry", "uav_images", "uav_cuts"), ("uav",)),
+}
+"""The paper's figures with data, in its order → the experiments whose campaigns they show."""
 
 Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
 
@@ -39,7 +56,8 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     _require("part", part, PAPER_PARTS)
     path = folder / "parts" / f"{part}.csv"
     claims = pkgutil.resolve_name(f"apertura.study.paper.{PAPER_PARTS[part]}")
-    write_table(path, claims(part.removeprefix("loss_")) if PAPER_PARTS[part] == _LOSS else claims())
+    given = [part.removeprefix("loss_")] if PAPER_PARTS[part] == _LOSS else []
+    write_table(path, claims(*given, *([folder / CAMPAIGNS] if part in PAPER_READS else [])))
     typer.echo(path)
 
 
@@ -61,12 +79,19 @@ def paper_claims(folder: Folder = PAPER) -> None:
 
 
 @app.command()
-def paper_figure(error: str, folder: Folder = PAPER) -> None:
-    """Draw range-compressed data beside the image of one error, ERROR.png."""
-    from apertura.study.paper.figures import SHOWN, draw_error
+def paper_figure(name: str, folder: Folder = PAPER) -> None:
+    """Draw one figure of the paper, NAME.png."""
+    _require("figure", name, PAPER_FIGURES)
+    path = folder / f"{name}.png"
+    if PAPER_FIGURES[name]:
+        from apertura.study.paper.experiment_figures import DRAWN
 
-    _require("error", error, SHOWN)
-    typer.echo(draw_error(error, folder / f"{error}.png"))
+        DRAWN[name](folder / CAMPAIGNS, path)
+    else:
+        from apertura.study.paper.figures import draw_scene, draw_simulated
+
+        draw_scene(path) if name == "scene" else draw_simulated(name, path)
+    typer.echo(path)
 
 
 @app.command()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.antenna.beam import Beam, Beams
 from apertura.antenna.pattern import antenna_axes, gaussian_cut
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.association import detect_wrong_association
+from apertura.echo.baseline import baseline_residual, detect_wrong_association
 from apertura.echo.compression import centre_frequency, window_weights
 from apertura.echo.sidelink import METHODS, measure
 from apertura.focus.inputs import PhaseHistory
@@ -103,7 +103,7 @@ class Told:
             return {}
         used = slice(None) if self.used is None else self.used
         length_m = np.linalg.norm(self.apertures[pair].tx_m - self.apertures[pair].rx_m, axis=1)
-        line = detect_wrong_association(heard.sidelink_m[used], length_m[used])
+        line = detect_wrong_association(baseline_residual(heard.sidelink_m[used], length_m[used]))
         return {"association_suspect": line} if line else {}
 
 
@@ -135,7 +135,8 @@ class Flight:
 
     def turn(self, node: str, at_s: Floats) -> Floats:
         """Return (pulse, 3, 3) float64, forward-right-down of a node into east-north-up."""
-        return body_axes(self.nodes[node].attitude(at_s))[:, [1, 0, 2]] * np.array([[1.0], [1.0], [-1.0]])
+        to_ned = body_axes(self.nodes[node].attitude(at_s))
+        return np.stack([to_ned[:, 1], to_ned[:, 0], -to_ned[:, 2]], axis=1)
 
     def apertures(self, **moved: Floats) -> dict[str, Aperture]:
         """Return pair → phase centres, with some nodes elsewhere, (pulse, 3) metres."""

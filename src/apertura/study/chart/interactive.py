@@ -22,8 +22,8 @@ th{cursor:pointer}
 </style>
 <h1 style="font-size:18px">@TITLE@</h1>
 <p>Each point is an engine with one setting: seconds of its tables and sums for the whole image on one
-thread, and the error on random pixels
-against the double sum. The line is the Pareto front, the star the planner's choice, the dashes what is asked.</p>
+thread, and the error against the double sum: an upper bound at 95 % confidence. The line is the Pareto front, the star
+the planner's choice, the dashes what is asked, the dots what the double sum takes.</p>
 <div id="filters"></div><svg id="chart" viewBox="0 0 960 560" role="img" aria-label="error against seconds"></svg>
 <p id="tip">Point at a mark to read it.</p><table id="rows"></table>
 <script>
@@ -33,7 +33,7 @@ const colours = Object.fromEntries(@ENGINES@.map((name,i)=>[name,palette[i%palet
 const box = {left:70,right:930,top:20,bottom:510}, svg = document.getElementById("chart");
 const lo = v => Math.floor(Math.log10(Math.min(...v))), hi = v => Math.ceil(Math.log10(Math.max(...v)));
 const x0 = lo(points.map(p=>p.seconds)), x1 = Math.max(x0+1,hi(points.map(p=>p.seconds)));
-const all = points.map(p=>p.error_db).concat(asked);
+const all = points.map(p=>p.error_db).filter(d=>d!==null).concat(asked);
 const y0 = Math.floor(Math.min(...all)/20)*20, y1 = Math.ceil(Math.max(...all)/20)*20;
 const X = s => box.left+(Math.log10(s)-x0)/(x1-x0)*(box.right-box.left);
 const Y = d => box.top+(y1-d)/(y1-y0)*(box.bottom-box.top);
@@ -45,8 +45,9 @@ const make = (name,attributes,text) => {
 };
 const thin = p => p.presum>1 ? `, ${p.presum}:1 pulses` : "";
 const words = p => `${p.setting}${thin(p)}: ${p.seconds.toPrecision(3)} s `
-  +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db.toFixed(1)} dB (predicted `
-  +`${p.predicted_error_db.toFixed(1)}), ${p.pixel_pulses_per_s.toExponential(2)} pixel·pulses/s`
+  +`(predicted ${p.predicted_seconds.toPrecision(3)}), ${p.error_db===null?"the measure of errors"
+  :`${p.error_db.toFixed(1)} dB (predicted ${p.predicted_error_db.toFixed(1)})`}, `
+  +`${p.pixel_pulses_per_s.toExponential(2)} pixel·pulses/s`
   +(p.planned?" — the planner's choice":"")+(p.on_front?" — on the front":"");
 function draw() {
   svg.replaceChildren();
@@ -63,12 +64,14 @@ function draw() {
   make("text",{x:(box.left+box.right)/2,y:box.bottom+40,"text-anchor":"middle"},
     "seconds of tables and sums for the whole image, one thread");
   const seen = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
-  for (const p of seen) if (p.error_db<best) {
+  for (const p of seen) if (p.error_db!==null && p.error_db<best) {
     path += path ? `H${X(p.seconds)}V${Y(p.error_db)}` : `M${X(p.seconds)},${Y(p.error_db)}`; best = p.error_db;
   }
   if (path) make("path",{d:path,fill:"none",stroke:"#777"});
   for (const p of seen) {
-    const mark = p.planned
+    const mark = p.error_db===null
+      ? make("line",{x1:X(p.seconds),x2:X(p.seconds),y1:box.top,y2:box.bottom,stroke:"#777","stroke-dasharray":"2 4"})
+      : p.planned
       ? make("text",{x:X(p.seconds),y:Y(p.error_db)+10,"text-anchor":"middle",style:"font-size:30px;fill:#d55e00"},"★")
       : make("circle",{cx:X(p.seconds),cy:Y(p.error_db),r:5,fill:colours[p.engine],"fill-opacity":.65});
     mark.addEventListener("pointerenter",()=>{document.getElementById("tip").textContent = words(p);});

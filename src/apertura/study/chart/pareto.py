@@ -17,14 +17,17 @@ _MARKERS = "osD^vP"
 
 @dataclass(frozen=True)
 class Point:
-    """One setting: seconds are for the whole image on one thread, from what its part took."""
+    """One setting: seconds are for the whole image on one thread, from what its part took.
+
+    `error_db` is an upper bound at 95 % confidence; None of the double sum, which errors are measured against.
+    """
 
     engine: str
     setting: str
     presum: int
     seconds: float
     pixel_pulses_per_s: float
-    error_db: float
+    error_db: float | None
     predicted_seconds: float
     predicted_error_db: float
     on_front: bool
@@ -33,10 +36,11 @@ class Point:
 
 def with_front(points: Sequence[Point]) -> list[Point]:
     """Return points, fastest first, marked where nothing faster is as exact: the Pareto front."""
-    best, marked = np.inf, []
+    best, marked = float("inf"), []
     for point in points:
-        marked.append(replace(point, on_front=point.error_db < best))
-        best = min(best, point.error_db)
+        error_db = -np.inf if point.error_db is None else point.error_db
+        marked.append(replace(point, on_front=error_db < best))
+        best = min(best, error_db)
     return marked
 
 
@@ -50,14 +54,17 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     front = [point for point in points if point.on_front]
     axes.plot(*_places(front), color="0.4", drawstyle="steps-post", zorder=0, label="Pareto front")
     for point in points:
-        if point.planned:
+        if point.error_db is None:
+            label = "the double sum, which errors are measured against"
+            axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
+        elif point.planned:
             thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
             label = f"planner's choice: {point.setting}{thin}"
             axes.plot(point.seconds, point.error_db, "*", color="#d55e00", markersize=17, label=label)
     axes.axhline(accuracy_db, color="#009e73", linestyle="--", label=f"asked: {accuracy_db:g} dB")
     axes.set_xscale("log")
     axes.set_xlabel("Seconds of tables and sums for the whole image, one thread")
-    axes.set_ylabel("Error on random pixels against the double sum, dB")
+    axes.set_ylabel("Error against the double sum: upper bound at 95 %, dB")
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)
     axes.legend(fontsize=9)
@@ -65,4 +72,5 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
 
 
 def _places(points: Sequence[Point]) -> tuple[list[float], list[float]]:
-    return [point.seconds for point in points], [point.error_db for point in points]
+    places = [(point.seconds, point.error_db) for point in points if point.error_db is not None]
+    return [seconds for seconds, _ in places], [error_db for _, error_db in places]

@@ -14,20 +14,22 @@ from apertura.campaign import Campaign
 from apertura.focus.engines import load_engine, reference
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
 from apertura.imaging.stages import profiles_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import job_of, plan_job
 from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.plan import Plan
 from apertura.planning.search import Search
-from apertura.quality.measures import numerical_error
+from apertura.quality.error_bound import error_bound
+from apertura.quality.error_check import Brightness, random_pixels
 from apertura.store import open_stage
 from apertura.study.chart.interactive import write_page
 from apertura.study.chart.pareto import Point, draw_points, with_front
 from apertura.study.tables import write_table
 
 FOLDER = Path("results/study")
-PULSES, SIDE_PX, PIXELS = 1024, 256, 200
+PULSES, SIDE_PX = 1024, 256
 LEAST_ROWS = 32
 """Rows of the window that every setting forms: the pixels whose exact values are known lie in them."""
 
@@ -46,8 +48,9 @@ class Part:
         Of the block; None where the antennas have no beams.
     pixels
         (y, x, 3) float64, the window.
-    picked
-        (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known.
+    picked, density
+        (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known;
+        (pixel,) float64, how densely they are drawn there.
     exact
         (pixel,) complex128.
     reference_seconds
@@ -58,6 +61,7 @@ class Part:
     profiles: Profiles
     pixels: NDArray[np.float64]
     picked: NDArray[np.int64]
+    density: NDArray[np.float64]
     exact: NDArray[np.complex128]
     total_pixels: int
     reference_seconds: float
@@ -90,7 +94,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
     job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job), Search(job)
-    part = _part(history, profiles[block], scene, total_pixels=job.pixels, beams=beams)
+    part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
     points = [
         replace(
             point,
@@ -109,18 +113,33 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
 
 
 def _part(
-    history: PhaseHistory, profiles: Profiles, scene: OpenScene, *, total_pixels: int, beams: Beams | None
+    history: PhaseHistory,
+    profiles: Profiles,
+    scene: OpenScene,
+    plan: Plan,
+    *,
+    total_pixels: int,
+    beams: Beams | None,
 ) -> Part:
+    """Return the part; its pixels are drawn as for a certificate, by the brightness of the image as planned."""
     window = []
     for size in scene.grid.shape:
         first = max(0, size - SIDE_PX) // 2 // 16 * 16
         window.append(slice(first, min(size, first + SIDE_PX)))
     pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
-    rows = min(LEAST_ROWS, len(pixels))
-    picked = np.random.default_rng(0).integers(0, (rows, pixels.shape[1]), (PIXELS, 2))
+    rows = pixels[:LEAST_ROWS]
+    engine, generator = load_engine(plan.setting.engine), np.random.default_rng(0)
+    inputs = history if engine.READS == "phase_history" else plan.inputs(profiles)
+    prepared = engine.prepare(inputs, **plan.setting.options)
+    image = engine.form(prepared, rows, beams=beams, **plan.setting.form_options)
+    whole = [(slice(0, rows.shape[0]), slice(0, rows.shape[1]))]
+    brightness = Brightness.of(image, whole)
+    bright = brightness.draw(image, whole, BRIGHT_PIXELS, generator)
+    picked = np.concatenate([random_pixels(whole, RANDOM_PIXELS, generator), bright])
+    density = brightness.density(picked, image[tuple(picked.T)], whole, random=RANDOM_PIXELS)
     begin = perf_counter()
-    exact = reference.form(history, pixels[picked[:, 0], picked[:, 1]], beams=beams)
-    return Part(history, profiles, pixels, picked, exact, total_pixels, perf_counter() - begin, beams)
+    exact = reference.form(history, rows[tuple(picked.T)], beams=beams)
+    return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - begin, beams)
 
 
 def _settings(search: Search) -> list[Setting]:
@@ -163,25 +182,26 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     quick = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
     pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
     form_s, image = _least(lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3)
-    values = image[part.picked[:, 0], part.picked[:, 1]]
-    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, values, plan)
+    power = float((np.abs(image[:LEAST_ROWS]) ** 2).sum())
+    error = error_bound(image[tuple(part.picked.T)], part.exact, part.density, power=power)
+    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, error.bound_db, plan)
 
 
 def _reference_point(part: Part, plan: Plan) -> Point:
     setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
-    taken = part.reference_seconds * part.total_pixels / PIXELS
-    return replace(_point(part, setting, taken, part.exact, None), planned=_is_reference(plan.setting))
+    taken = part.reference_seconds * part.total_pixels / len(part.picked)
+    return replace(_point(part, setting, taken, None, None), planned=_is_reference(plan.setting))
 
 
-def _point(part: Part, setting: Setting, taken: float, values: NDArray[np.complexfloating], plan: Plan | None) -> Point:
-    """Return what a setting took and errs on the picked pixels; `plan` where it is the planner's choice."""
+def _point(part: Part, setting: Setting, taken: float, error_db: float | None, plan: Plan | None) -> Point:
+    """Return what a setting took and errs; `plan` where it is the planner's choice."""
     return Point(
         engine=setting.engine,
         setting=setting.line,
         presum=1 if plan is None or plan.presum is None else plan.presum.factor,
         seconds=taken,
         pixel_pulses_per_s=part.total_pixels * len(part.profiles) / taken,
-        error_db=numerical_error(values.astype(np.complex64), part.exact).rms_db,
+        error_db=error_db,
         predicted_seconds=setting.seconds,
         predicted_error_db=setting.error_db if plan is None else plan.predicted_error_db,
         on_front=False,

@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass
 
+AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable here"
+VERDICTS = (AGREES, DISAGREES, EXPLAINED, UNTESTABLE)
+"""`explained`: it differs from what is expected and the note says why; `not testable here`: it says what lacks."""
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -10,13 +14,13 @@ class Claim:
     Attributes
     ----------
     paper
-        Value that the source paper prints; empty where it prints none.
+        Number that the source paper prints, as printed; empty where it prints none.
     independent_model
-        Value of a model that shares no code with this project, or of a closed form; empty where the paper's stands.
-        Both are empty for requirements that this project sets itself.
+        Value of a model that shares no code with this project, or of a closed form; empty where there is none.
     verdict
-        How `computed` compares with what is given, and a note where the paper contradicts itself. It begins with
-        "consistency check" where something was fitted to the expected value, so that agreeing proves little.
+        One of `VERDICTS`: how `computed` compares with the paper or, where that prints no number, with the model.
+    note
+        By how much it differs, why, from what it is computed, and where the paper contradicts itself.
     """
 
     claim: str
@@ -25,6 +29,7 @@ class Claim:
     computed: str
     unit: str
     verdict: str
+    note: str
 
 
 def compare(
@@ -37,67 +42,67 @@ def compare(
     within: float,
     relative: bool = True,
     style: str = ".4g",
-    agreement: str = "agrees",
+    reason: str = "",
     note: str = "",
 ) -> Claim:
     """Return a row whose verdict compares what is computed with the paper or, where it is silent, with a model.
 
     Parameters
     ----------
-    claim, computed, unit, paper, independent_model
-        Columns of `Claim`; one of the last two.
+    claim, computed, unit, paper, independent_model, note
+        Columns of `Claim`; at least one of `paper` and `independent_model`.
     within
         Largest difference that still agrees: a share of the expected value, or in `unit` if not `relative`.
     style
         Format of `computed`.
-    agreement, note
-        Verdict where the difference is small enough, and what is appended to any.
+    reason
+        What explains a difference, if one is known; empty: a difference is a disagreement.
 
     Raises
     ------
     ValueError
-        If neither or both expected values are given.
+        If there is nothing to compare with.
 
     Examples
     --------
     >>> compare("bandwidth", 409.6, "MHz", paper=409.6, within=1e-3).verdict
     'agrees'
     >>> row = compare("loss", -1.7, "dB", independent_model=-1.0, within=0.5, relative=False, note="few draws")
-    >>> row.paper, row.independent_model, row.verdict
-    ('', '-1', 'differs by -0.7 dB; few draws')
+    >>> row.paper, row.independent_model, row.verdict, row.note
+    ('', '-1', 'disagrees', 'differs by -0.7 dB; few draws')
     """
-    expected = [value for value in (paper, independent_model) if value is not None]
-    if len(expected) != 1:
-        raise ValueError(f"{claim}: {paper=}, {independent_model=}: exactly one of them is compared with")
-    difference = computed - expected[0]
-    if abs(difference) <= within * (abs(expected[0]) if relative else 1):
-        verdict = agreement
-    elif relative:
-        verdict = f"differs by {100 * difference / abs(expected[0]):+.1f} %"
-    else:
-        verdict = f"differs by {difference:+.3g} {unit}"
-    texts = ["" if value is None else f"{value:.10g}" for value in (paper, independent_model)]
-    return Claim(claim, texts[0], texts[1], f"{computed:{style}}", unit, _join(verdict, note))
+    expected = independent_model if paper is None else paper
+    if expected is None:
+        raise ValueError(f"{claim}: neither a value of the paper nor of a model to compare with")
+    difference = computed - expected
+    printed, modelled = ("" if value is None else f"{value:.10g}" for value in (paper, independent_model))
+    shown = f"{computed:{style}}"
+    if abs(difference) <= within * (abs(expected) if relative else 1):
+        return Claim(claim, printed, modelled, shown, unit, AGREES, note)
+    by = f"{100 * difference / abs(expected):+.1f} %" if relative else f"{difference:+.3g} {unit}"
+    verdict = EXPLAINED if reason else DISAGREES
+    return Claim(claim, printed, modelled, shown, unit, verdict, _join(f"differs by {by}", reason, note))
 
 
 def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, style: str = ".4g", note: str) -> Claim:
-    """Return a row of something that neither the paper nor a model puts a number on, but this project does.
+    """Return a row of something said without a number, held against a limit of this project's own.
 
     Parameters
     ----------
     claim, computed, unit, style, note
         As for `compare`.
     limit, met
-        What the project requires, in words, and whether `computed` meets it.
+        What is required, in words, and whether `computed` meets it.
 
     Examples
     --------
-    >>> require("loss", 0.004, "dB", limit="below 0.01 dB", met=True, note="worst of five").verdict
-    "meets this project's requirement (below 0.01 dB); worst of five"
+    >>> row = require("loss", 0.004, "dB", limit="below 0.01 dB", met=True, note="worst of five")
+    >>> row.verdict, row.note
+    ('agrees', 'required here: below 0.01 dB; worst of five')
     """
-    verdict = f"{'meets' if met else 'misses'} this project's requirement ({limit})"
-    return Claim(claim, "", "", f"{computed:{style}}", unit, _join(verdict, note))
+    verdict = AGREES if met else DISAGREES
+    return Claim(claim, "", "", f"{computed:{style}}", unit, verdict, _join(f"required here: {limit}", note))
 
 
-def _join(verdict: str, note: str) -> str:
-    return f"{verdict}; {note}" if note else verdict
+def _join(*parts: str) -> str:
+    return "; ".join(filter(None, parts))

@@ -1,5 +1,7 @@
 """What is left of phases, timing and clocks after correction."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from apertura.echo.clock import estimate_clock
@@ -29,9 +31,10 @@ from apertura.study.point_response import (
     random_pixels,
     range_tables,
 )
+from apertura.study.stability.sweeps import ORDINARY
 
 CLOCK_PPM = 8.0
-LEAST_GAIN_DB = 20.0
+LARGEST_EXCESS_DB = 1.0
 LARGEST_LOSS_DB = 0.01
 
 
@@ -59,11 +62,15 @@ def _peaks(scene: PaperScene, corrected: Complexes) -> Floats:
 
 
 def clock_claims(*, pulses: int = 150) -> list[Claim]:
-    """Return the floor that a fast clock leaves in the divided image, without and with correction in the samples."""
+    """Return the floor that a fast clock leaves in the divided image, without and with correction in the samples.
+
+    Samples are noisy, 20 dB in the radar and 30 dB in the sidelink per subcarrier, so that the model which made them is
+    not simply taken back: a perfect clock with the same noise is what the correction is held against.
+    """
     scene = reduced_scene(pulses=pulses, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     wave = scene.waveform
     clock = Clock.of_ppm(CLOCK_PPM, carrier_hz=wave.carrier_hz, sample_rate_hz=wave.sample_rate_hz)
-    captures = _captures(scene, Impairments(clock=clock))
+    captures = _captures(scene, replace(ORDINARY, clock=clock))
     symbol = Numerology(
         wave.carrier_hz,
         wave.sample_rate_hz,
@@ -75,23 +82,27 @@ def clock_claims(*, pulses: int = 150) -> list[Claim]:
     cfo_hz = offset.cfo_of_pulses_hz(pulses)
     corrected = [correct_clock(capture, symbol, cfo_hz=cfo_hz, sfo_ppm=offset.sfo_ppm) for capture in captures]
     ideal, _ = _image(scene, _captures(scene, Impairments()))
-    images = (_image(scene, pair) for pair in (captures, corrected))
-    before_db, after_db = (error_floor_db(values, ideal, peaks) for values, peaks in images)
-    gain_db = before_db - after_db
-    note = (
-        f"consistency check: noise-free samples, corrected by the model that made them; floor {before_db:.1f} dB "
-        f"without, {after_db:.1f} dB with, measured as {offset.sfo_ppm:.3f} ppm"
-    )
-    title, limit = (
-        f"{CLOCK_PPM:g} ppm clock: floor lower by correction in the samples",
-        f"at least {LEAST_GAIN_DB:g} dB",
-    )
-    return [require(title, gain_db, "dB", limit=limit, met=gain_db >= LEAST_GAIN_DB, style=".1f", note=note)]
+    images = (_image(scene, pair) for pair in (_captures(scene, ORDINARY), captures, corrected))
+    perfect_db, before_db, after_db = (error_floor_db(values, ideal, peaks) for values, peaks in images)
+    return [
+        require(
+            f"{CLOCK_PPM:g} ppm clock corrected in the samples: floor above that of a perfect clock, same noise",
+            after_db - perfect_db,
+            "dB",
+            limit=f"at most {LARGEST_EXCESS_DB:g} dB",
+            met=after_db - perfect_db <= LARGEST_EXCESS_DB,
+            style=".2f",
+            note=f"floor {before_db:.1f} dB without, {after_db:.1f} dB with, {perfect_db:.1f} dB with a perfect clock; "
+            f"measured as {offset.sfo_ppm:.4f} ppm",
+        )
+    ]
 
 
 def _captures(scene: PaperScene, receiver: Impairments) -> list[Complexes]:
-    _, _, observation = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
-    return [samples(observation.channels[name], None).astype(np.complex64) for name in ("radar", "sidelink")]
+    _, _, seen = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
+    names = ("radar", "sidelink")
+    noise = dict(zip(names, (np.random.default_rng(number) for number in (1, 2)), strict=True))
+    return [samples(seen.channels[name], noise[name]).astype(np.complex64) for name in names]
 
 
 def _image(scene: PaperScene, captures: list[Complexes]) -> tuple[Complexes, Floats]:

@@ -65,6 +65,17 @@ def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture
     return HALF_POWER_OF_SINC * wavelength_m * slant_range_m / (2 * aperture_m)
 
 
+def coherence_of_snr(snr: float, pulses: int) -> float:
+    """Return Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes in white noise of a given power SNR per compressed pulse.
+
+    Examples
+    --------
+    >>> round(coherence_of_snr(1e3, 200), 4)
+    0.999
+    """
+    return (snr + 1 / pulses) / (snr + 1)
+
+
 def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
     """Return the power SNR of one compressed pulse at which M equal echoes in white noise are so coherent.
 

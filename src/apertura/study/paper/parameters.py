@@ -2,7 +2,7 @@
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.presets import paper_waveform
-from apertura.study.paper.claims import Claim, compare
+from apertura.study.paper.claims import EXPLAINED, UNTESTABLE, Claim, compare, require
 from apertura.study.paper.formulas import cfo_limit_hz, sfo_limit_hz
 
 BITS = 14
@@ -18,10 +18,10 @@ def parameter_claims() -> list[Claim]:
 
     Examples
     --------
-    >>> [claim.claim for claim in parameter_claims() if not claim.verdict.startswith("agrees")]
+    >>> [claim.claim for claim in parameter_claims() if claim.verdict != "agrees"]
     ['OFDM symbol T against 1/Δf', 'effective chirp ...', 'SFO limit in ppm of f_s', 'CFO of a ...', 'SFO of a ...']
     """
-    return [*_waveform(), *_clocks(), *_timing()]
+    return [*_waveform(), *_clocks(), *_timing(), *_sampling()]
 
 
 def _waveform() -> list[Claim]:
@@ -41,11 +41,12 @@ def _waveform() -> list[Claim]:
         f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
         f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples"
     )
-    rows.append(Claim("OFDM symbol T against 1/Δf", f"{symbol_us:g}", "", f"{period_us:g}", "µs", contradiction))
+    name, texts = "OFDM symbol T against 1/Δf", ("12.5", "", f"{period_us:g}")
+    rows.append(Claim(name, *texts, "µs", EXPLAINED, contradiction))
     kept = (wave.symbol_s - wave.cyclic_prefix_s) / wave.symbol_s
-    share = f"computed: {100 * kept:g} % of B; the paper's formula, which names no delay"
+    share = f"{100 * kept:g} % of B; the paper prints the formula and names no delay"
     name = "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"
-    return [*rows, Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", share)]
+    return [*rows, Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", UNTESTABLE, share)]
 
 
 def _clocks() -> list[Claim]:
@@ -68,8 +69,8 @@ def _clocks() -> list[Claim]:
         compare("SFO limit in ppm of f_s", sfo_ppm, "ppm", paper=100, within=0.05, note=halved),
         compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper=10, within=EXACT),
         compare("CFO limit in ppm of the carrier", cfo_ppm, "ppm", paper=8.3, within=0.005, style=".3g", note=first),
-        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper=41, within=0.01, note=swapped),
-        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper=12, within=0.01, note=swapped),
+        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper=41, within=0.01, reason=swapped),
+        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper=12, within=0.01, reason=swapped),
     ]
 
 
@@ -80,4 +81,21 @@ def _timing() -> list[Claim]:
         compare("timing of the samples 2δR/c, δR = 2 cm", samples_ps, "ps", paper=133, within=0.005),
         compare("association of pulses 1/f_prf at 100 Hz", 1e3 / prf_hz, "ms", paper=10, within=EXACT),
         compare("time tags 2δR/v at 10 m/s", tags_ms, "ms", paper=4, within=EXACT),
+    ]
+
+
+def _sampling() -> list[Claim]:
+    """Return the pulses' spacing along the track against a quarter of the shortest wave: no look angle is aliased."""
+    shortest_m = SPEED_OF_LIGHT_M_S / float(paper_waveform().frequency_hz[-1])
+    limit = f"at most λ/4 = {25 * shortest_m:.2f} cm at the upper band edge, two ways"
+    return [
+        require(
+            f"alias-free sampling along the track: {what}",
+            100 * speed_m_s / prf_hz,
+            "cm",
+            limit=limit,
+            met=speed_m_s / prf_hz <= shortest_m / 4,
+            note=f"{speed_m_s:g} m/s at {prf_hz:g} Hz; enough in every direction, whatever the beam",
+        )
+        for what, speed_m_s, prf_hz in (("simulation", 1.0, 100.0), ("UAV flight", 0.5, 20.0))
     ]

@@ -1,0 +1,107 @@
+"""Track noise: loss of peak predicted by the budget, measured against truth, told by the image itself, and the verdict.
+
+`python benchmarks/track_noise.py WORKFOLDER [--base sample|curved] [--draws 20]`. White noise after a moving average of
+one second, σ per axis, is added to both logs, and σ is stated in the config.
+"""
+
+import argparse
+import contextlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from judging.bases import BASES
+from judging.peaks import Peaks, find_targets, true_places
+from judging.run import copy_writable
+from rich.console import Console
+from rich.table import Table
+from spoiling.folder import RX, TX, Folder
+from spoiling.of_logs import logs, noisy
+
+from apertura.campaign import Campaign
+from apertura.load.scene import settled_scene
+from apertura.steps import echo, image, ingest, profile, scene
+from apertura.store import open_stage
+
+SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One image: losses in dB, negative; the verdict on its focus."""
+
+    pair: str
+    predicted_db: float
+    true_db: float
+    told_db: float
+    verdict: str
+
+
+def main() -> None:
+    """Draw, image, and print a row for each size and pair."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--base", choices=sorted(BASES), default="sample")
+    parser.add_argument("--draws", type=int, default=20)
+    asked = parser.parse_args()
+    right = BASES[asked.base](asked.folder / f"{asked.base}-right")
+    peaks = {pair: found for pair, _, _, found in _imaged(right)}
+    table = Table(title=f"{asked.base}: mean of {asked.draws} draws")
+    for heading in ("σ", "pair", "predicted", "measured", "spread", "told by the image", "defocused"):
+        table.add_column(heading, justify="right")
+    for size_cm in SIZES_CM:
+        draws = [one for seed in range(asked.draws) for one in _drawn(asked.folder, right, size_cm, seed, peaks)]
+        for pair in peaks:
+            table.add_row(f"{size_cm:g} cm", pair, *_row([one for one in draws if one.pair == pair]))
+    Console(width=140).print(table)
+
+
+def _row(draws: list[Draw]) -> list[str]:
+    true, told = np.array([one.true_db for one in draws]), np.array([one.told_db for one in draws])
+    predicted = float(np.mean([one.predicted_db for one in draws]))
+    defocused = sum(one.verdict == "defocused" for one in draws)
+    values = (predicted, true.mean(), true.std(), np.nanmean(told))
+    return [*(f"{value:.2f} dB" for value in values), f"{defocused} of {len(draws)}"]
+
+
+def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str, Peaks]) -> list[Draw]:
+    spoilt = copy_writable(right, folder / "spoilt")
+    if size_cm:
+        logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
+    Folder(spoilt).edit_config(
+        lambda document: [node.update(position_std_m=size_cm / 100) for node in document["nodes"].values()]
+    )
+    found = []
+    for pair, quality, predicted_db, now in _imaged(spoilt):
+        loss_db = float(np.nanmean(now.level_db - peaks[pair].level_db))
+        focus = quality["focus"]
+        found.append(Draw(pair, predicted_db, loss_db, focus.get("loss_db", np.nan), focus["verdict"]))
+    return found
+
+
+def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
+    """Carry a campaign to its images; return of each pair what it says, its predicted loss, and its targets."""
+    campaign, places = Campaign.load(root), true_places(root)
+    flight, found = campaign.image_flights[0], []
+    with contextlib.redirect_stdout(io.StringIO()):
+        for node in flight.nodes:
+            ingest.ingest(campaign, flight.name, node)
+        for pair in flight.pairs:
+            echo.echo(campaign, flight.name, pair)
+        scene.scene(campaign)
+        for pair in flight.pairs:
+            profile.profile(campaign, flight.name, pair)
+            image.image(campaign, flight.name, pair)
+    for pair in flight.pairs:
+        stage = open_stage(campaign.stage("image", flight.name, pair), "image")
+        quality = stage.attrs["quality"]
+        predicted_db = next(line["loss_db"] for line in quality["budget"] if line["cause"] == "positions")
+        found.append(
+            (pair, quality, predicted_db, find_targets(stage.image.values, settled_scene(campaign).grid, places))
+        )
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""The sidelink's measured delay against the baseline of the tracks: whether pulses carry their own positions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+EXPLAINED_M = 0.05
+"""Movement of a sidelink that errors of the logged positions alone may explain."""
+
+SIGMAS = 5.0
+
+_MEDIAN_PULSES = 15, 61, 241
+"""Of the running medians that tell movement from jitter, odd numbers: the longer, the less noise and the slower."""
+
+
+@dataclass(frozen=True)
+class BaselineResidual:
+    """What the measured delay does that the baseline does not, a constant and a linear drift apart.
+
+    Attributes
+    ----------
+    residual_m, noise_m
+        RMS of the residual's running median, metres, and the standard deviation that jitter alone gives that median.
+    jitter_m
+        Standard deviation of a single pulse, metres: of the trigger, mostly.
+    largest_m, pulse
+        Where the running median is furthest out, metres, and at which pulse.
+    excess
+        How many times what may be explained `largest_m` is, over running medians of several lengths.
+    """
+
+    residual_m: float
+    noise_m: float
+    jitter_m: float
+    largest_m: float
+    pulse: int
+    excess: float
+
+
+def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual | None:
+    """Return how far the measured path of a sidelink follows its geometry; None of less than 30 pulses.
+
+    Parameters
+    ----------
+    delay_m, baseline_m
+        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
+        between its antennas.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association". Of each length only full windows count: a window that runs over
+    the end would repeat its last pulse.
+
+    Examples
+    --------
+    >>> distance = 5 + np.sin(np.arange(200) / 20)
+    >>> [baseline_residual(moved, distance).residual_m.__round__(1) for moved in (distance, np.roll(distance, 9))]
+    [0.0, 0.3]
+    """
+    pulse = np.flatnonzero(np.isfinite(delay_m) & np.isfinite(baseline_m))
+    if pulse.size < 2 * _MEDIAN_PULSES[0]:
+        return None
+    residual = delay_m[pulse] - baseline_m[pulse]
+    jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / 2**0.5
+    found = [_smoothed(pulse, residual, jitter, width) for width in _MEDIAN_PULSES if 2 * width <= pulse.size]
+    return max(found, key=lambda one: one.excess)
+
+
+def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(residual, width), axis=1)
+    middle = pulse[width // 2 : -(width // 2)]
+    smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
+    noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
+    worst = int(np.argmax(np.abs(smooth)))
+    largest_m = float(abs(smooth[worst]))
+    return BaselineResidual(
+        float(np.sqrt(np.mean(smooth**2))),
+        float(noise_m),
+        jitter_m,
+        largest_m,
+        int(middle[worst]),
+        largest_m / max(EXPLAINED_M, SIGMAS * float(noise_m)),
+    )
+
+
+def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
+    """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
+
+    A constant and a linear drift belong to the clocks. What still moves by more than `EXPLAINED_M` and by more than
+    five times its own noise cannot come from trigger jitter: the pulses carry positions of other pulses, or wrong ones.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence either way:
+    the prediction itself must move for a wrong pair to show.
+
+    Examples
+    --------
+    >>> distance = 5 + np.sin(np.arange(200) / 20)
+    >>> detect_wrong_association(baseline_residual(distance + 3.0, distance)) is None
+    True
+    >>> detect_wrong_association(baseline_residual(np.roll(distance, 9), distance))
+    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
+    """
+    if residual is None or residual.excess <= 1:
+        return None
+    return (
+        f"sidelink leaves its geometry by {residual.largest_m:.2f} m at pulse {residual.pulse} "
+        f"(noise {residual.noise_m:.3f} m): pulses or positions are wrongly associated"
+    )
+
+
+def best_baseline(delay_m: Floats, baselines_m: Mapping[str, Floats]) -> tuple[str, float] | None:
+    """Return which of several baselines the measured delay follows best, and its residual (m); None if none is better.
+
+    Parameters
+    ----------
+    delay_m
+        (pulse,) float64, metres, as measured; NaN where the sidelink did not lock.
+    baselines_m
+        Name → (pulse,) float64, metres, the first as stated: with a log shifted in time, tracks exchanged, a lever arm
+        turned. Another is better if what leaves it is half of what leaves the first, or less, and more than noise.
+
+    Examples
+    --------
+    >>> at = np.arange(400) / 20
+    >>> stated, late = (5 + np.sin((at - shift) / 2) for shift in (0.0, 1.8))
+    >>> best_baseline(late + 2.0, {"as stated": stated, "1.8 s later": late, "0.9 s later": 5 + np.sin((at - 0.9) / 2)})
+    ('1.8 s later', 0.0)
+    """
+    residuals = {name: baseline_residual(delay_m, baseline_m) for name, baseline_m in baselines_m.items()}
+    rms_m = {name: (one.residual_m, one.noise_m) for name, one in residuals.items() if one is not None}
+    if len(rms_m) < 2:
+        return None
+    first, best = next(iter(rms_m)), min(rms_m, key=lambda name: rms_m[name][0])
+    if rms_m[best][0] > rms_m[first][0] / 2 or rms_m[first][0] < 3 * rms_m[first][1]:
+        return None
+    return best, round(rms_m[best][0], 6)

@@ -1,0 +1,144 @@
+"""The paper's experiments: recorded in the lab, standing and flying, processed as any campaign, judged and drawn."""
+
+import numpy as np
+import pytest
+from folders import run_steps
+
+from apertura.campaign import Campaign
+from apertura.quality.measures import coherence_factor
+from apertura.simulation import preset, simulate
+from apertura.simulation.experiments import CABLE_M, GAP_M, SEGMENT_M
+from apertura.steps import echo, ingest
+from apertura.study import commands
+from apertura.study.paper import experiment_figures, figures
+from apertura.study.paper.claims import AGREES, UNTESTABLE, VERDICTS
+from apertura.study.paper.coherence import coherence_claims
+from apertura.study.paper.experiments import BISTATIC, MONOSTATIC, open_experiment, profiles_at, terms_at
+from apertura.study.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
+from apertura.study.paper.losses import ERRORS
+
+PULSES = 16
+
+
+@pytest.fixture(scope="module")
+def campaigns(tmp_path_factory):
+    """A folder of the two experiments without motion, few pulses, as far as their echoes."""
+    folder = tmp_path_factory.mktemp("campaigns")
+    for name in ("lab", "static"):
+        campaign = Campaign.load(simulate(folder / name, preset(f"paper-{name}", pulses=PULSES)))
+        for node in ("uav1", "uav2"):
+            ingest.ingest(campaign, "f01", node)
+        for pair in (MONOSTATIC, BISTATIC):
+            echo.echo(campaign, "f01", pair)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["lab", "static"])
+def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaigns, name):
+    experiment = open_experiment(campaigns, name)
+    place = experiment.places_m[0]
+    assert coherence_factor(terms_at(experiment.uncorrected(), place)) < 0.3
+    assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.999
+
+
+@pytest.mark.parametrize("name", ["lab", "static"])
+@pytest.mark.parametrize("pair", [MONOSTATIC, BISTATIC])
+def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
+    experiment = open_experiment(campaigns, name)
+    history = experiment.history(pair)
+    true_m = float(history.aperture.path(experiment.places_m[:1]).mean()) / 2
+    slant_m = true_m + np.linspace(-0.6, 0.6, 601)
+    found_m = slant_m[np.abs(profiles_at(history, slant_m)).mean(axis=0).argmax()]
+    assert found_m == pytest.approx(true_m, abs=0.08)  # clutter moves it by a fraction of a cell of 37 cm
+
+
+def test_the_sidelink_of_the_lab_is_the_cable_alone(campaigns):
+    raw = open_experiment(campaigns, "lab").opened.campaign.settings.nodes["uav2"]
+    assert raw.path_offset_m.sidelink == CABLE_M
+    track = preset("paper-lab").flights[0].tracks
+    apart = np.subtract(track["uav2"].start_m, track["uav1"].start_m)
+    np.testing.assert_allclose(apart[0] + raw.lever_arms_m.sidelink[1], 0.0, atol=1e-12)  # yaw 0: right is east
+
+
+def test_coherence_is_judged_by_the_noise_of_echo_free_ranges_and_by_chance(campaigns):
+    claims = coherence_claims(campaigns)
+    assert {claim.verdict for claim in claims} <= set(VERDICTS)
+    uncorrected = [claim for claim in claims if "without correction" in claim.claim]
+    assert [claim.independent_model for claim in uncorrected] == [f"{1 / PULSES:g}"] * 2
+    printed = [claim for claim in claims if "printed" in claim.claim]
+    assert [(claim.paper, claim.verdict) for claim in printed] == [
+        (value, UNTESTABLE) for value in ("0.986", "0.9999", "0.9995")
+    ]
+    spread = next(claim for claim in claims if claim.claim.startswith("phase spread"))
+    assert float(spread.computed) > 2  # the weak reflector is a quarter as strong
+    absolute = [claim for claim in claims if claim.claim.startswith("absolute")]
+    assert {claim.verdict for claim in absolute} == {AGREES}
+    for claim in claims:
+        if claim.claim.startswith("lack of coherence"):
+            assert float(claim.computed) == pytest.approx(float(claim.independent_model), rel=0.7)
+
+
+def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
+    experiment = open_experiment(campaigns, "static")
+    history = experiment.history(BISTATIC)
+    half_m = float(history.aperture.path(experiment.places_m[:1])[0, 0]) / 2
+    expected = terms_at(history, experiment.places_m[0])
+    np.testing.assert_allclose(profiles_at(history, np.array([half_m]))[:, 0], expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["lab_profile", "lab_phase", "static_profile", "static_phase"])
+def test_figures_of_the_experiments_are_drawn_from_their_campaigns(campaigns, tmp_path, name):
+    path = experiment_figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")
+    assert path.stat().st_size > 20_000
+
+
+def test_every_figure_of_the_paper_has_what_draws_it():
+    drawn = {*figures.SHOWN, "scene", *experiment_figures.DRAWN}
+    assert drawn == set(commands.PAPER_FIGURES)
+    assert len(drawn) == 14
+    assert {error for error, _ in figures.SHOWN.values()} == set(ERRORS)
+    campaigns_read = {name for names in commands.PAPER_FIGURES.values() for name in names}
+    assert campaigns_read == {name for names in commands.PAPER_READS.values() for name in names}
+
+
+def test_the_scene_is_drawn_without_a_campaign(tmp_path):
+    assert figures.draw_scene(tmp_path / "scene.png").stat().st_size > 10_000
+
+
+def test_segments_of_the_flight_lie_as_far_apart_at_their_midpoints_as_stated():
+    specification = preset("paper-uav")
+    (flight,) = specification.flights
+    tx, rx = (np.array(flight.tracks[node].start_m) for node in ("uav1", "uav2"))
+    speed_m_s = flight.tracks["uav1"].velocity_m_s[0]
+    ((start, end),) = flight.segments[MONOSTATIC]
+    ((later, last),) = flight.segments[BISTATIC]
+    ahead_m = (rx - tx)[0] / 2
+    assert (end - start) * speed_m_s == pytest.approx(SEGMENT_M)
+    assert (later - end) * speed_m_s + ahead_m == pytest.approx(GAP_M)
+    assert last <= (flight.pulses - 1) / specification.waveform.prf_hz
+    middle_m = tx[0] + (start + last) / 2 * speed_m_s + ahead_m / 2
+    assert middle_m == pytest.approx(0.0)  # the scene's middle is abreast of both segments together
+
+
+def test_two_adjacent_segments_have_the_sidelobe_of_one_aperture_and_a_gap_raises_it():
+    assert two_segment_sidelobe_db(1.0, 0.0) == pytest.approx(-13.26, abs=0.05)
+    levels = [two_segment_sidelobe_db(3.4, gap_m) for gap_m in (0.0, 1.0, 2.0, 4.0)]
+    assert (np.diff(levels) > 0).all()
+
+
+def test_clutter_is_measured_away_from_every_target():
+    images = Images({"mono": np.zeros((100, 100), np.complex64)}, np.array([[20.0, 20.0], [70.0, 50.0]]), 0.1)
+    mask = images.clutter()
+    assert not mask[20, 34]
+    assert mask[20, 36]
+    assert not mask[70, 50]
+    assert mask.mean() == pytest.approx(1 - 2 * np.pi * 15**2 / 1e4, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_flight_through_the_pipeline_fuses_as_its_segments_say(tmp_path):
+    run_steps(simulate(tmp_path / "uav", "paper-uav"), exports=False)
+    claims = {claim.claim: claim for claim in fusion_claims(tmp_path)}
+    assert {claim.verdict for name, claim in claims.items() if "width" not in name} == {AGREES}
+    width = float(claims["UAV experiment: cross-range width, coherent sum"].computed)
+    assert 10 < width < 14  # a third of one segment's

@@ -1,0 +1,74 @@
+"""config/segments.tsv: the part of the track that images a pair, from the table to the echo and the plan."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from folders import ingest_all
+
+from apertura.campaign import Campaign
+from apertura.load.pair import open_pair
+from apertura.simulation import preset, simulate
+from apertura.steps import echo
+from apertura.store import open_stage
+
+FIRST = np.datetime64("2025-05-14T09:30:00")
+HEADING = "flight\tpair\tstart\tend\n"
+# the first half second, and the last three pulses of 40 at 20 Hz; time zones are UTC if they say nothing else
+LINES = (
+    "f01\tuav1-uav1\t2025-05-14T09:29:00\t2025-05-14T09:30:00.51\n"
+    "f01\tuav1-uav1\t2025-05-14T11:30:01.84+02:00\t2025-05-14T09:31:00\n"
+)
+
+
+@pytest.fixture
+def cut(tiny) -> Campaign:
+    (tiny / "config" / "segments.tsv").write_text(HEADING + LINES)
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    return campaign
+
+
+def test_the_echo_holds_the_pulses_inside_any_segment_of_its_pair_and_says_how_many_are_not(cut):
+    stage = open_stage(echo.echo(cut, "f01", "uav1-uav1"), "echo")
+    since_s = (stage.time.values - FIRST) / np.timedelta64(1, "s")
+    recorded = open_stage(cut.stage("raw", "f01", "uav1"), "raw").time.values
+    expected = (recorded - FIRST) / np.timedelta64(1, "s")
+    expected = expected[(expected < 0.51) | (expected > 1.84)]
+    np.testing.assert_allclose(since_s, expected)
+    assert 10 < len(expected) < 15
+    assert stage.attrs["pulses"]["used"] == len(expected)
+    assert stage.attrs["pulses"]["outside_segments"] == len(recorded) - len(expected)
+
+
+def test_a_pair_without_a_line_is_imaged_by_the_whole_track(cut):
+    other = open_stage(echo.echo(cut, "f01", "uav1-uav2"), "echo")
+    assert other.sizes["pulse"] > 30
+    assert "outside_segments" not in other.attrs["pulses"]
+
+
+def test_the_plan_before_the_echo_counts_the_pulses_inside(cut):
+    promised = open_pair(cut, "f01", "uav1-uav1").aperture
+    echo.echo(cut, "f01", "uav1-uav1")
+    formed = open_pair(cut, "f01", "uav1-uav1").aperture
+    np.testing.assert_allclose(promised.tx_m, formed.tx_m, atol=1e-6)
+
+
+def test_only_the_rows_of_a_pair_matter_to_its_echo(cut, tiny):
+    own, other = (cut.relevant("echo", pair, flight="f01") for pair in ("uav1-uav1", "uav1-uav2"))
+    assert own["segments"][0] == ["2025-05-14T09:29:00", "2025-05-14T09:30:00.510000"]
+    assert own["segments"][1][0] == "2025-05-14T09:30:01.840000"
+    assert "segments" not in other
+    (tiny / "config" / "segments.tsv").unlink()
+    whole = Campaign.load(tiny)
+    assert whole.relevant("echo", "uav1-uav2", flight="f01") == other
+    assert whole.relevant("echo", "uav1-uav1", flight="f01") != own
+
+
+def test_a_simulation_writes_the_segments_of_its_specification(tmp_path):
+    plan = preset("demo", pulses=2)
+    flight = replace(plan.flights[0], segments={"uav1-uav2": ((0.0, 0.05),)})
+    root = simulate(tmp_path / "made", replace(plan, flights=(flight,)))
+    (segment,) = Campaign.load(root).segments
+    assert (segment.flight, segment.pair) == ("f01", "uav1-uav2")
+    assert (segment.start, segment.end) == ("2025-05-14T09:30:00", "2025-05-14T09:30:00.050000")
