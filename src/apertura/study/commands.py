@@ -142,7 +142,7 @@ def atlas_sweep(cause: str, folder: Folder = ATLAS) -> None:
 
     _require("cause", cause, CAUSES)
     path = part_path(folder, cause)
-    write_table(path, run_cause(cause))
+    write_table(path, run_cause(cause), digits=6)
     typer.echo(path)
 
 

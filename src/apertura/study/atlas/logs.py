@@ -14,7 +14,7 @@ NOISE_M = 0.002
 """Of every epoch by itself."""
 
 USUAL_HZ = 20.0
-_MARGIN_S = 2.0
+_MARGIN_S = 9.0
 _TOLERATED_WAVELENGTHS = 1 / 16
 
 

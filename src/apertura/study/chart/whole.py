@@ -155,7 +155,7 @@ def _whole(name: str, runs: list[_Run]) -> Whole:
 
 def _expected_db(report: Mapping[str, Any]) -> float:
     """Return the loss of all causes that somebody stated, unrounded."""
-    return sum(line["loss_db"] for line in report["budget"] if not line["stated"].startswith("not stated"))
+    return float(sum(line["loss_db"] for line in report["budget"] if not line["stated"].startswith("not stated")))
 
 
 def _title(campaign: Campaign, rows: list[Whole], repeats: int) -> str:
