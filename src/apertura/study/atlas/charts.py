@@ -32,11 +32,16 @@ def draw_cause(outcomes: Sequence[Outcome], path: Path) -> None:
         axes.set_ylabel(label)
         axes.set_xlabel(f"{cause.title}, {cause.unit}" if cause.unit != "1" else cause.title, fontsize=9)
         if limit is not None:
+            axes.set_ylim(top=max(axes.get_ylim()[1], 2 * limit))
             axes.axhline(limit, color="0.4", linewidth=0.9, linestyle=":")
             axes.annotate(words, (0.01, limit), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
     figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     names = " ".join(sorted({flag for one in outcomes for flag in one.flags.split()})) or "none"
-    figure.suptitle(f"{cause.title} — stated to the budget as: {cause.stated}\nflags: {names}", fontsize=10)
+    figure.suptitle(
+        f"{cause.title} — stated to the budget as: {cause.stated}\n"
+        f"flags: {names}; what is too small for an axis stands on its edge",
+        fontsize=10,
+    )
     save_png(figure, path)
 
 
@@ -67,7 +72,8 @@ def _draw_panel(axes: Axes, outcomes: Sequence[Outcome], name: str, scale: float
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.8 * least)
-    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_xticks(sizes, [f"{size:g}" for size in sizes], fontsize=8)
+    axes.set_xticks([], minor=True)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.grid(which="major", alpha=0.3)
     if sizes[0] > sizes[-1]:
