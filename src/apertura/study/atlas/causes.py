@@ -86,6 +86,10 @@ def _late(flown: Flight, pair: str, late_ms: float) -> Effect:
     return offset(flown, pair, lambda paths: -_MS * paths.rate_m_s, late_ms, common=True)
 
 
+def _higher(flown: Flight, pair: str, higher_cm: float) -> Effect:
+    return offset(flown, pair, lambda paths: -_CM * paths.gradient[:, 2], higher_cm, common=True)
+
+
 def _only(pair: str, effect: Callable[..., Effect]) -> Expect:
     """Return an expectation that touches one pair."""
     return lambda flown, asked, size: effect(flown, asked, size) if asked == pair else Effect(0.0, 0.0, 0.0)
@@ -150,13 +154,10 @@ CAUSES: Mapping[str, Cause] = {
     "height": Cause(
         "Ground taken too high", "cm", (0.3, 1, 3, 10, 20, 40, 100),
         lambda flown, size, _: replace(flown.truth, terrain=FlatGround(_CM * size)),
-        lambda flown, pair, size: offset(flown, pair, lambda p: -_CM * p.gradient[:, 2], size, common=True),
-        "heights", draws=2,
+        _higher, "heights", draws=2,
     ),
     "dem": Cause(
-        "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 100), _rough,
-        lambda flown, pair, size: offset(flown, pair, lambda p: -_CM * p.gradient[:, 2], size, common=True),
-        "heights",
+        "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 100), _rough, _higher, "heights",
     ),
     "arm": Cause(
         "Lever arm of the transmitting node off, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),

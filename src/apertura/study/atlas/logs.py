@@ -30,21 +30,18 @@ class Log:
         Error of every epoch, per axis: white noise after a moving average of so long.
     gap_s
         Length of what is missing in the middle.
-    late_s
-        How much later than its time an epoch was taken.
     """
 
     rate_hz: float = USUAL_HZ
     wander_m: float = 0.0
     correlation_s: float = 1.0
     gap_s: float = 0.0
-    late_s: float = 0.0
 
     def checked(self, flown: Flight, node: str, generator: Generator) -> tuple[Floats, CheckedTrack]:
         """Return (pulse, 3) float64 positions as the log gives them, and what its checks say."""
         end_s = float(flown.time_s[-1])
         time_s = np.arange(-_MARGIN_S, end_s + _MARGIN_S, 1 / self.rate_hz)
-        place_m = flown.nodes[node].position(time_s + self.late_s)
+        place_m = flown.nodes[node].position(time_s)
         place_m += NOISE_M * generator.standard_normal(place_m.shape)
         place_m += self.wander_m * self._wander(len(time_s), generator)
         there = np.abs(time_s - end_s / 2) >= self.gap_s / 2
