@@ -235,6 +235,12 @@ def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: floa
 
 
 @step.command()
+def whole_chart(campaign: Directory = HERE, repeats: Annotated[int, typer.Option(min=1)] = 3) -> None:
+    """Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png."""
+    _run("apertura.study.chart.whole:whole_chart", campaign, repeats=repeats)
+
+
+@step.command()
 def assess(flight: str, campaign: Directory = HERE) -> None:
     """Compare the images of a flight with each other, and choose what is added up, assessment.json."""
     _run("apertura.steps.assess:assess", campaign, flight)

@@ -1,5 +1,6 @@
 # The studies need no campaign: `snakemake --snakefile workflow/rules/study.smk --cores 2 paper stability`.
 from apertura.provenance import code_sha256
+from apertura.study.atlas.causes import CAUSES
 from apertura.study.commands import PAPER_FIGURES, PAPER_PARTS, PAPER_READS
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
@@ -12,6 +13,7 @@ wildcard_constraints:
     experiment="lab|static|uav",
     impairment="|".join(SWEEPS),
     method="|".join(CHOICES),
+    cause="|".join(CAUSES),
 
 
 localrules:
@@ -29,6 +31,8 @@ rule stability:
     input:
         "results/study/stability/summary.csv",
         expand("results/study/stability/{impairment}.png", impairment=SWEEPS),
+        "results/study/atlas/summary.csv",
+        expand("results/study/atlas/{cause}.png", cause=CAUSES),
 
 
 rule paper_campaign:
@@ -185,3 +189,69 @@ rule stability_summary:
         "where each correction fails"
     shell:
         "apertura study stability-summary > {log} 2>&1"
+
+
+rule atlas_sweep:
+    output:
+        "results/study/atlas/parts/{cause}.csv",
+    log:
+        "results/logs/study/atlas.{cause}.log",
+    benchmark:
+        "results/benchmarks/study/atlas.{cause}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.atlas.outcomes"),
+    message:
+        "spoiling images by {wildcards.cause}"
+    shell:
+        "apertura study atlas-sweep {wildcards.cause} > {log} 2>&1"
+
+
+rule atlas_chart:
+    input:
+        "results/study/atlas/parts/{cause}.csv",
+    output:
+        "results/study/atlas/{cause}.png",
+    log:
+        "results/logs/study/atlas.{cause}.chart.log",
+    benchmark:
+        "results/benchmarks/study/atlas.{cause}.chart.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.atlas.charts"),
+    message:
+        "charting what {wildcards.cause} does"
+    shell:
+        "apertura study atlas-chart {wildcards.cause} > {log} 2>&1"
+
+
+rule atlas_summary:
+    input:
+        expand("results/study/atlas/parts/{cause}.csv", cause=CAUSES),
+    output:
+        "results/study/atlas/summary.csv",
+        "results/study/atlas/summary.png",
+        "results/study/atlas/flags.csv",
+    log:
+        "results/logs/study/atlas.summary.log",
+    benchmark:
+        "results/benchmarks/study/atlas.summary.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.atlas.charts"),
+    message:
+        "which mistakes are seen"
+    shell:
+        "apertura study atlas-summary > {log} 2>&1"

@@ -107,7 +107,7 @@ def _crs_name(crs: str) -> str:
 def _footer(tags: Mapping[str, str]) -> str:
     known = (
         ("APERTURA_VERSION", "apertura {}"),
-        ("APERTURA_ERROR_DB", "numerical error {} dB"),
+        ("APERTURA_ERROR_DB", "numerical error below {} dB"),
         ("APERTURA_CODE_SHA256", "code {:.12}"),
     )
     told = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]

@@ -9,10 +9,13 @@ import typer
 
 from apertura.errors import CampaignError
 
-app = typer.Typer(no_args_is_help=True, help="The paper's claims, and the stability of every correction.")
+app = typer.Typer(
+    no_args_is_help=True, help="The paper's claims, the stability of every correction, and what spoils an image."
+)
 
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
+ATLAS = Path("results/study/atlas")
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
     "parameters": "parameters:parameter_claims",
@@ -127,3 +130,41 @@ def stability_summary(folder: Folder = STABILITY) -> None:
 
     draw_summary(write_summary(folder), folder / "summary.png")
     typer.echo(write_sidelink_tables(folder))
+
+
+@app.command()
+def atlas_sweep(cause: str, folder: Folder = ATLAS) -> None:
+    """Sweep one cause that spoils images, parts/CAUSE.csv."""
+    from apertura.study.atlas.causes import CAUSES
+    from apertura.study.atlas.outcomes import run_cause
+    from apertura.study.atlas.summary import part_path
+    from apertura.study.tables import write_table
+
+    _require("cause", cause, CAUSES)
+    path = part_path(folder, cause)
+    write_table(path, run_cause(cause), digits=6)
+    typer.echo(path)
+
+
+@app.command()
+def atlas_chart(cause: str, folder: Folder = ATLAS) -> None:
+    """Draw what one cause costs, what was expected and where flags came, CAUSE.png."""
+    from apertura.study.atlas.causes import CAUSES
+    from apertura.study.atlas.charts import draw_cause
+    from apertura.study.atlas.outcomes import Outcome
+    from apertura.study.atlas.summary import part_path
+    from apertura.study.tables import read_table
+
+    _require("cause", cause, CAUSES)
+    draw_cause(read_table(part_path(folder, cause), Outcome), folder / f"{cause}.png")
+    typer.echo(folder / f"{cause}.png")
+
+
+@app.command()
+def atlas_summary(folder: Folder = ATLAS) -> None:
+    """Where each cause costs 1 dB and its flag comes, and how often alarms are missed or false: summary.csv, .png."""
+    from apertura.study.atlas.charts import draw_summary
+    from apertura.study.atlas.summary import write_summary
+
+    draw_summary(write_summary(folder), folder / "summary.png")
+    typer.echo(folder / "summary.csv")

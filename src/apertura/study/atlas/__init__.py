@@ -1,0 +1,1 @@
+"""What spoils an image, from negligible to destructive: what it costs, what was expected, which flags came."""

@@ -1,0 +1,143 @@
+"""The atlas: what spoils an image costs what the budget says, and its flag comes; rates of alarms are counted right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from apertura.errors import CampaignError
+from apertura.study import commands
+from apertura.study.atlas import outcomes
+from apertura.study.atlas.causes import CAUSES
+from apertura.study.atlas.charts import draw_cause, draw_summary
+from apertura.study.atlas.flight import PAIRS, flight
+from apertura.study.atlas.outcomes import Outcome, run_cause
+from apertura.study.atlas.summary import alarms, part_path, summary_of, write_summary
+from apertura.study.tables import read_table, write_table
+
+CELL_M = 0.1
+
+
+def outcome(size, draw=0, *, loss_db=0.0, shift_m=0.0, phase_rad=0.0, expected_loss_db=0.0, flags="", cause="height"):
+    return Outcome(
+        cause, "cm", size, draw, "a-a", loss_db, shift_m, phase_rad, 0.0, CELL_M, expected_loss_db, 0.0, 0.0, flags
+    )  # fmt: skip
+
+
+def swept(monkeypatch, name, *sizes, draws=1):
+    monkeypatch.setattr(outcomes, "CAUSES", {name: replace(CAUSES[name], sizes=sizes, draws=draws)})
+    return list(run_cause(name))
+
+
+def test_noise_of_two_centimetres_is_flagged_and_next_to_none_is_not(monkeypatch):
+    small, large = swept(monkeypatch, "track_noise", 1e-3, 2.0)
+    assert small.flags == ""
+    assert small.loss_db < 0.1
+    assert "defocused" in large.flags
+    assert large.loss_db > 2
+
+
+@pytest.mark.slow
+def test_the_budget_expects_what_track_noise_costs(monkeypatch):
+    rows = swept(monkeypatch, "track_noise", 1.0, 2.0, draws=8)
+    for size in (1.0, 2.0):
+        some = [row for row in rows if row.size == size]
+        expected, measured = (np.mean([getattr(row, name) for row in some]) for name in ("expected_loss_db", "loss_db"))
+        assert expected == pytest.approx(measured, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_path_offset_of_one_pair_turns_its_phase_as_expected_and_one_beyond_a_radian_is_flagged(monkeypatch):
+    small, large = swept(monkeypatch, "calibration", 0.3, 5.0)
+    assert small.phase_rad == pytest.approx(small.expected_phase_rad, abs=0.03)
+    assert large.phase_rad == pytest.approx(large.expected_phase_rad, rel=0.1)
+    assert (small.flags, "pairs_out_of_phase" in large.flags) == ("", True)
+
+
+@pytest.mark.slow
+def test_what_is_refused_is_neither_wrong_nor_right(monkeypatch):
+    (row,) = swept(monkeypatch, "presum", 64)
+    assert row.flags == "refused"
+    assert np.isnan(row.loss_db)
+    summary = summary_of([row])
+    assert (summary.wrong, summary.right) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    "name", sorted(CAUSES.keys() - {"track_noise_time"})
+)  # of which every size is as bad as 1.5 cm
+def test_what_is_told_of_a_negligible_size_is_the_truth(name):
+    """To a centimetre: logs have noise of their own, and a tag a millisecond late is a millimetre."""
+    cause = CAUSES[name]
+    steps = np.diff(cause.sizes)
+    assert (steps > 0).all() or (steps < 0).all()
+    flown = cause.flight()
+    told = cause.tell(flown, cause.sizes[0], np.random.default_rng(0))
+    off_m = 0.04 if name == "association" else 0.01  # a pulse is 3.3 cm
+    for pair in PAIRS:
+        for leg, true in zip(told.apertures[pair].legs, flown.truth.apertures[pair].legs, strict=True):
+            assert np.abs(leg - true).max() < off_m
+    effects = [cause.expect(flown, pair, cause.sizes[0]) for pair in PAIRS]
+    assert min(effect.loss_db for effect in effects) > -0.1
+
+
+def test_the_receiver_flies_ahead_of_the_node_that_sends():
+    apertures = flight().apertures()
+    assert np.abs(apertures["a-a"].tx_m - apertures["a-a"].rx_m).max() == 0
+    ahead = (apertures["a-b"].rx_m - apertures["a-b"].tx_m).mean(axis=0)
+    assert ahead == pytest.approx([4.7, 0, 0], abs=0.1)
+
+
+SWEEP = [
+    outcome(1.0, loss_db=0.01, expected_loss_db=0.01),
+    outcome(1.0, 1, loss_db=0.01, expected_loss_db=0.01, flags="defocused"),
+    outcome(10.0, loss_db=0.4, expected_loss_db=0.3),
+    outcome(10.0, 1, loss_db=0.4, expected_loss_db=0.3),
+    outcome(100.0, loss_db=3.0, expected_loss_db=1.5),
+    outcome(100.0, 1, loss_db=5.0, expected_loss_db=2.5, flags="defocused pairs_apart"),
+    outcome(1000.0, shift_m=0.06, flags="pairs_apart"),
+    outcome(1000.0, 1, shift_m=0.06, flags="pairs_apart"),
+]
+
+
+def test_a_summary_counts_what_is_missed_and_what_is_false():
+    row = summary_of(SWEEP)
+    assert row.size_at_1_db == pytest.approx(10 * 10 ** (0.6 / 3.6), rel=1e-3)
+    assert row.expected_at_1_db == pytest.approx(10 * 10 ** (0.7 / 1.7), rel=1e-3)
+    assert (row.size_of_harm, row.size_of_flag) == (100.0, 1000.0)
+    assert (row.expected_over_measured, row.ratio_of) == (0.5, "loss")
+    assert (row.wrong, row.missed) == (4, 0.25)  # beyond 1 dB, or half a cell
+    assert (row.right, row.false) == (2, 0.5)  # 0.4 dB is neither
+    assert row.flags == "defocused pairs_apart"
+
+
+def test_a_flag_is_counted_over_the_causes_that_raise_it():
+    other = [outcome(1.0, loss_db=9.0, cause="prf"), outcome(2.0, cause="prf")]
+    rows = {row.flag: row for row in alarms([*SWEEP, *other])}
+    assert rows["defocused"].wrong == 4
+    assert rows["defocused"].missed == 0.75
+    assert rows["defocused"].unsaid == 0.25
+    assert (rows["defocused"].right, rows["defocused"].false) == (3, pytest.approx(1 / 3, rel=1e-3))
+    assert (rows["pairs_apart"].missed, rows["pairs_apart"].false) == (0.25, 0.0)
+
+
+def test_pictures_are_the_same_bytes_for_the_same_rows(tmp_path):
+    for name in CAUSES:
+        rows = [replace(row, cause=name) for row in SWEEP] + [outcome(2000.0, loss_db=np.nan, flags="refused")]
+        write_table(part_path(tmp_path, name), rows, digits=6)
+    summaries = write_summary(tmp_path)
+    assert [row.cause for row in summaries] == list(CAUSES)
+    rows = read_table(part_path(tmp_path, "arm"), Outcome)
+    for name in ("a.png", "b.png"):
+        draw_cause(rows, tmp_path / name)
+        draw_summary(summaries, tmp_path / f"all_{name}")
+    for name in ("", "all_"):
+        assert (tmp_path / f"{name}a.png").read_bytes() == (tmp_path / f"{name}b.png").read_bytes()
+
+
+@pytest.mark.parametrize("command", ["atlas-sweep", "atlas-chart"])
+def test_a_cause_that_does_not_exist_is_told_those_that_do(command):
+    error = CliRunner().invoke(commands.app, [command, "x"]).exception
+    assert isinstance(error, CampaignError)
+    assert "track_noise" in str(error)
