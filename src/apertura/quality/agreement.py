@@ -22,6 +22,7 @@ OUT_OF_PHASE_RAD = 0.8
 
 _POINT = 0.09  # in units of eq. 6: neighbours pull each peak by about half a tenth of a cell
 _POINT_RAD = 0.05
+_TOLD_RAD = 0.4  # a phase less certain than this is none
 _NEAR_CELLS = 2.0  # one point further off than this may be another one
 
 
@@ -75,7 +76,8 @@ class Agreement:
     @property
     def out_of_phase(self) -> bool:
         """Whether adding the images would lose power, as far as their points can tell."""
-        return abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
+        told = self.phase_std_rad < _TOLD_RAD
+        return told and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
 
 
 def agreement(
@@ -86,7 +88,7 @@ def agreement(
     cell_m: float,
     spectrum: NDArray[np.float64],
 ) -> Agreement | None:
-    """Return how two images agree; None where they share no bright point.
+    """Return how two images agree; None where they do not share half of the bright points of the one with fewer.
 
     Parameters
     ----------
@@ -121,14 +123,14 @@ def agreement(
     shift_m, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
     if len(met) == 1 and np.hypot(*shift_m) > _NEAR_CELLS * cell_m and not _alone(images[1], points, spacing_m, cell_m):
         met = common_shift(lists[0], lists[1], reach=_NEAR_CELLS * cell_m, gate=cell_m)[1]
-    if not met:
+    if len(met) < min(map(len, points)) / 2 or not met:
         return None
     apart = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in met])
     values = np.array([_between(images, points[0][i], points[1][j]) for i, j in met])
     shift, count = np.median(apart, axis=0), len(met)
     unit = 2 * np.pi * np.linalg.cholesky(spectrum)  # metres to units of eq. 6
     units = (apart - shift) @ unit
-    background = np.median([points[0][i].background + points[1][j].background for i, j in met]) / 2
+    background = float(np.median([points[0][i].background + points[1][j].background for i, j in met])) / 2
     std = np.hypot(1.2533 * 1.4826 * np.median(np.abs(units)), np.sqrt(background / 2 + _POINT**2)) / np.sqrt(count)
     phasor = _mean_phasor(values)
     ratio_db = 20 * np.log10([points[1][j].amplitude / points[0][i].amplitude for i, j in met])
@@ -140,7 +142,7 @@ def agreement(
         shift_units=float(np.linalg.norm(shift @ unit)),
         shift_std_units=float(std),
         phase_rad=float(np.angle(phasor)),
-        phase_std_rad=float(np.hypot(np.sqrt(2 * max(0.0, 1 - abs(phasor))), _POINT_RAD) / np.sqrt(count)),
+        phase_std_rad=float(np.sqrt(2 * max(0.0, 1 - abs(phasor)) + background + _POINT_RAD**2) / np.sqrt(count)),
         coherence=float(abs(phasor)),
         amplitude_db=float(np.mean(ratio_db)),
         amplitude_std_db=float(np.std(ratio_db)),
