@@ -12,12 +12,18 @@ from apertura.scene.terrain import Terrain
 ELSEWHERE_DB = 20.0
 """An echo this much stronger than all from the scene says that the scene is not where the echo is."""
 
+UNGATHERED_DB = 25.0
+"""An echo so far above the median of the scene's ranges is a point's, which some place must gather; speckle has 10."""
+
+LEAST_PULSES = 64
+"""Fewer are not enough to tell whether a point dominates its cell."""
+
 _MOST_PULSES = 64
 _NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
 
 
 def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> str | None:
-    """Return one line where pulses hold a far stronger echo beyond the scene's ranges than within; None if not.
+    """Return one line where pulses hold a strong echo that an image without bright points does not gather; None if not.
 
     Parameters
     ----------
@@ -39,18 +45,29 @@ def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> 
     beyond = (path_m - (nearest[:, None] - margin)) % span_m > (farthest - nearest)[:, None] + 2 * margin
     direct = np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)
     apart = (path_m - direct[:, None] + span_m / 2) % span_m - span_m / 2
-    outside = np.where(beyond & (np.abs(apart) > margin), power, 0.0)
-    inside = np.where(beyond, 0.0, power).max(axis=1)
-    ratio_db = 10 * float(np.log10(np.median(outside.max(axis=1) / np.maximum(inside, 1e-30))))
-    floor_db = 10 * float(np.log10(np.median(outside.max(axis=1) / np.maximum(np.median(power, axis=1), 1e-30))))
-    if min(ratio_db, floor_db) <= ELSEWHERE_DB:
-        return None
-    at_m = float(np.median(path_m[np.arange(len(some)), outside.argmax(axis=1)]))
-    return (
-        f"the strongest echo, {ratio_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while the "
-        f"scene's are {nearest.min():.1f} to {farthest.max():.1f} m: heights, positions or path offsets are wrong, "
-        "or something bright stands elsewhere"
-    )
+    beside = np.where(beyond & (np.abs(apart) > margin), power, 0.0)
+    outside = beside.max(axis=1)
+    within = np.where(beyond, np.nan, power)
+    inside = np.nanmax(within, axis=1)
+    scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
+    above_db = _median_db(outside / np.maximum(inside, 1e-30))
+    if min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > ELSEWHERE_DB:
+        at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
+        return (
+            f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
+            f"{scene}: heights, positions or path offsets are wrong, or something bright stands elsewhere"
+        )
+    alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
+    if len(history) >= LEAST_PULSES and alone_db > UNGATHERED_DB:
+        return (
+            f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and no place of the image "
+            "gathers it: times, positions or heights are wrong, or it comes from beside the scene"
+        )
+    return None
+
+
+def _median_db(ratio: NDArray[np.float64]) -> float:
+    return 10 * float(np.log10(max(float(np.median(ratio)), 1e-30)))
 
 
 def _profiles(history: PhaseHistory, step_m: float, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

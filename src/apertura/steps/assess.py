@@ -37,7 +37,10 @@ def assess(campaign: Campaign, flight: str) -> Path:
         if one is None
         and _sure(quality[reference]["focus"])
         and comparable(images[reference], images[pair], grid)
-        and not shows_points_of(images[reference], images[pair], grid)
+        and (
+            quality[pair]["focus"]["verdict"] == "defocused"
+            or not shows_points_of(images[reference], images[pair], grid)
+        )
     }
     fusion = choose_fusion(
         reference,
