@@ -168,6 +168,14 @@ def test_images_without_a_point_in_common_say_nothing(two_images):
     assert agreement(images, (points[0], []), spacing_m=0.1, cell_m=0.4, spectrum=WIDE) is None
 
 
+def test_one_point_in_common_is_evidence_only_where_there_is_no_other(two_images):
+    images, points = two_images
+    one = (points[0][:1], points[1][:1])
+    where = {"spacing_m": 0.1, "cell_m": 0.4, "spectrum": WIDE}
+    assert agreement(images, one, **where) is None
+    assert agreement(images, one, **where, alone=True).points == 1
+
+
 def test_the_shift_is_the_one_that_most_brightness_agrees_on():
     generator = np.random.default_rng(6)
     here = [(*generator.uniform(0, 50, 2), 1.0) for _ in range(6)]

@@ -60,7 +60,7 @@ def draw_right(number: int, *, seed: int = 0) -> Drawn:
     specification = CampaignSpecification(f"right{number}", origin, waveform, targets, nodes, (flight,), grid)
     _weak_echoes(waveform, snr_db, scene, true)
     lasting_s = waveform.cyclic_prefix_s + waveform.symbol_s
-    if (lasting_s - 1 / waveform.subcarrier_spacing_hz) * waveform.sample_rate_hz < 32:
+    if (lasting_s - 1 / waveform.subcarrier_spacing_hz) * waveform.sample_rate_hz < 40:
         true["clock_unmeasured"] = "symbols hardly longer than their period"
     missed = max(node.impairments.missed_fraction for node in nodes.values())
     if missed > 0:

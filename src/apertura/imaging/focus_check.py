@@ -75,6 +75,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
         **({"elsewhere": elsewhere} if elsewhere else {}),
         "cell_m": round(cell_m, 4),
         "spectrum_cycles2_m2": [[float(f"{value:.4g}") for value in row] for row in _spectrum(formation)],
+        "maxima": len(points),
         "parts": {name: round(value, 4) if np.isfinite(value) else None for name, value in asdict(parts).items()},
         "points": [
             _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus

@@ -25,6 +25,7 @@ def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> 
         (_points(first, grid), _points(second, grid)),
         spacing_m=grid.spacing_m,
         cell_m=max(_focus(image)["cell_m"] for image in (first, second)),
+        alone=all(_focus(image)["maxima"] == 1 for image in (first, second)),
         spectrum=np.mean([_focus(image)["spectrum_cycles2_m2"] for image in (first, second)], axis=0),
     )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.quality.bright_points import BrightPoint, common_shift, shows_point
+from apertura.quality.bright_points import BrightPoint, common_shift
 from apertura.quality.measures import Raster
 from apertura.quality.point_targets import Patch
 
@@ -23,7 +23,6 @@ OUT_OF_PHASE_RAD = 0.8
 _POINT = 0.09  # in units of eq. 6: neighbours pull each peak by about half a tenth of a cell
 _POINT_RAD = 0.05
 _TOLD_RAD = 0.4  # a phase less certain than this is none
-_NEAR_CELLS = 2.0  # one point further off than this may be another one
 
 
 @dataclass(frozen=True)
@@ -87,8 +86,9 @@ def agreement(
     spacing_m: float,
     cell_m: float,
     spectrum: NDArray[np.float64],
+    alone: bool = False,
 ) -> Agreement | None:
-    """Return how two images agree; None where they do not share half of the bright points of the one with fewer.
+    """Return how two images agree; None where they do not share two bright points and half of those of either.
 
     Parameters
     ----------
@@ -102,6 +102,8 @@ def agreement(
         Finest resolution cell: points of both this near to each other, after a common shift, are one.
     spectrum
         (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
+    alone
+        Neither image has anything else that is bright: one point of each is then enough.
 
     Notes
     -----
@@ -114,16 +116,14 @@ def agreement(
     >>> image = (np.sinc((y - 30) / 4) * np.sinc((x - 33) / 4)).astype(np.complex64)
     >>> point = [BrightPoint(30.0, 33.0, 1.0)]
     >>> wide = np.diag([0.5, 0.5])
-    >>> found = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4, spectrum=wide)
+    >>> found = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4, spectrum=wide, alone=True)
     >>> round(found.shift_m, 3), round(found.phase_rad, 3), found.out_of_phase
     (0.0, 1.571, True)
     """
     lists = [[(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in some] for some in points]
     reach = max(REACH_M, 12 * cell_m)
-    shift_m, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
-    if len(met) == 1 and np.hypot(*shift_m) > _NEAR_CELLS * cell_m and not _alone(images[1], points, spacing_m, cell_m):
-        met = common_shift(lists[0], lists[1], reach=_NEAR_CELLS * cell_m, gate=cell_m)[1]
-    if len(met) < min(map(len, points)) / 2 or not met:
+    _, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
+    if len(met) < max(1 if alone else 2, min(map(len, points)) / 2):
         return None
     apart = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in met])
     values = np.array([_between(images, points[0][i], points[1][j]) for i, j in met])
@@ -147,15 +147,6 @@ def agreement(
         amplitude_db=float(np.mean(ratio_db)),
         amplitude_std_db=float(np.std(ratio_db)),
     )
-
-
-def _alone(
-    second: Raster, points: tuple[Sequence[BrightPoint], Sequence[BrightPoint]], spacing_m: float, cell_m: float
-) -> bool:
-    """Return whether a single point of each image can only be the same: no other, and none at its old place."""
-    reach = max(1, round(cell_m / spacing_m))
-    old = any(shows_point(second, round(point.row), round(point.column), reach=reach) for point in points[0])
-    return len(points[0]) == len(points[1]) == 1 and not old
 
 
 def _between(images: tuple[Raster, Raster], first: BrightPoint, second: BrightPoint) -> list[complex]:
