@@ -1,5 +1,7 @@
 """The images of the atlas: formed and judged as the pipeline's steps do, and where truth sees their targets."""
 
+import contextlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -76,7 +78,8 @@ def _seen(flown: Flight, told: Told, pair: str, heard: Heard) -> Seen:
     """Return one image, by the way of step image."""
     formation = _formation(told, pair, told.history(pair, heard, flown.frequency_hz))
     image = np.asarray(formation.image.compute(scheduler="synchronous"))
-    said = certified(formation, image, accuracy_db=ACCURACY_DB, threads=1)
+    with contextlib.redirect_stdout(io.StringIO()):  # the bars of tiles formed again
+        said = certified(formation, image, accuracy_db=ACCURACY_DB, threads=1)
     focus = focus_report(formation, image)
     flags = {**told.flags, **told.sidelink_flags(pair, heard), **formation.plan.flags, **said["flags"]}
     flags |= focus_flags(focus, 0.0)
