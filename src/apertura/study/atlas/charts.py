@@ -60,6 +60,7 @@ def _draw_panel(axes: Axes, outcomes: Sequence[Outcome], name: str, scale: float
         np.maximum(scale * np.array(expected), least),
         color=_EXPECTED,
         linestyle="--",
+        zorder=3,
         label="expected by budget",
     )
     shares = np.array([np.mean([bool(one.flags) for one in some]) for some in groups.values()])
@@ -109,7 +110,7 @@ def draw_summary(rows: Sequence[Summary], path: Path) -> None:
 
 def _words(row: Summary) -> list[str]:
     def size(value: float) -> str:
-        return "—" if np.isnan(value) else f"{value:.3g}"
+        return "—" if np.isnan(value) else f"{float(f'{value:.3g}'):g}"
 
     def rate(value: float, count: int) -> str:
         return "—" if not count else f"{100 * value:.0f} % of {count}"
