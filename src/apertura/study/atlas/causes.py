@@ -157,7 +157,7 @@ CAUSES: Mapping[str, Cause] = {
         _higher, "heights", draws=2,
     ),
     "dem": Cause(
-        "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 100), _rough, _higher, "heights",
+        "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 60), _rough, _higher, "heights",
     ),
     "arm": Cause(
         "Lever arm of the transmitting node off, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from apertura.study.atlas.causes import CAUSES
 from apertura.study.atlas.outcomes import Outcome
-from apertura.study.atlas.summary import HARMFUL_CELLS, HARMFUL_DB, Summary, by_size
+from apertura.study.atlas.summary import HARMFUL_CELLS, HARMFUL_DB, Summary, by_size, mean_of
 from apertura.study.png import save_png
 
 _MEASURED, _EXPECTED, _FLAGGED = "#0072b2", "#d55e00", "#cc0000"
@@ -46,20 +46,21 @@ def draw_cause(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def _draw_panel(axes: Axes, outcomes: Sequence[Outcome], name: str, scale: float) -> None:
-    groups, least = by_size(outcomes), _LEAST[name]
+    groups, least = by_size([one for one in outcomes if np.isfinite(getattr(one, name))]), _LEAST[name]
     sizes = np.array(list(groups))
     drawn = [np.maximum(scale * np.array([getattr(one, name) for one in some]), least) for some in groups.values()]
-    means = np.array([some.mean() for some in drawn])
+    means = np.array([max(scale * mean_of(some, name), least) for some in groups.values()])
     ends = np.abs([[some.min(), some.max()] for some in drawn] - means[:, None]).T
     axes.errorbar(
         sizes, means, ends, color=_MEASURED, marker="o", capsize=3, label="measured: mean, least and most of the draws"
     )
-    expected = [np.mean([getattr(one, f"expected_{name}") for one in some]) for some in groups.values()]
+    expected = [mean_of(some, f"expected_{name}") for some in groups.values()]
     axes.plot(
         sizes,
         np.maximum(scale * np.array(expected), least),
         color=_EXPECTED,
         linestyle="--",
+        zorder=3,
         label="expected by budget",
     )
     shares = np.array([np.mean([bool(one.flags) for one in some]) for some in groups.values()])
@@ -109,7 +110,7 @@ def draw_summary(rows: Sequence[Summary], path: Path) -> None:
 
 def _words(row: Summary) -> list[str]:
     def size(value: float) -> str:
-        return "—" if np.isnan(value) else f"{value:.3g}"
+        return "—" if np.isnan(value) else f"{float(f'{value:.3g}'):g}"
 
     def rate(value: float, count: int) -> str:
         return "—" if not count else f"{100 * value:.0f} % of {count}"

@@ -109,6 +109,12 @@ def by_size(outcomes: Sequence[Outcome]) -> dict[float, list[Outcome]]:
     return {size: [one for one in outcomes if one.size == size] for size in sizes}
 
 
+def mean_of(some: Sequence[Outcome], name: str) -> float:
+    """Return the mean of one column over draws that were not refused; NaN without any."""
+    values = [value for one in some if np.isfinite(value := getattr(one, name))]
+    return float(np.mean(values)) if values else float("nan")
+
+
 def summary_of(outcomes: Sequence[Outcome]) -> Summary:
     """Return what the draws of one cause come to.
 
@@ -120,8 +126,7 @@ def summary_of(outcomes: Sequence[Outcome]) -> Summary:
     first, groups = outcomes[0], by_size(outcomes)
     sizes = np.array(list(groups))
     measured, expected = (
-        np.array([np.mean([getattr(one, name) for one in some]) for some in groups.values()])
-        for name in ("loss_db", "expected_loss_db")
+        np.array([mean_of(some, name) for some in groups.values()]) for name in ("loss_db", "expected_loss_db")
     )
     ratio, ratio_of = _ratio(groups)
     wrong, right = [one for one in outcomes if is_wrong(one)], [one for one in outcomes if is_right(one)]
@@ -132,7 +137,7 @@ def summary_of(outcomes: Sequence[Outcome]) -> Summary:
         _rounded(crossing(sizes, expected, 1.0, logarithmic=True)),
         _first(groups, is_wrong),
         _first(groups, lambda one: bool(one.flags)),
-        _rounded(ratio),
+        round(ratio, 3),
         ratio_of,
         len(wrong),
         share(wrong, lambda one: not one.flags),
@@ -191,9 +196,9 @@ def _ratio(groups: dict[float, list[Outcome]]) -> tuple[float, str]:
     for what, name, least in (("loss", "loss_db", _TELLING_DB), ("shift", "shift_m", HARMLESS_CELLS * cell_m)):
         ratios = []
         for some in groups.values():
-            measured = np.mean([getattr(one, name) for one in some])
+            measured = mean_of(some, name)
             if measured > least:
-                ratios.append(np.mean([getattr(one, f"expected_{name}") for one in some]) / measured)
+                ratios.append(mean_of(some, f"expected_{name}") / measured)
         if ratios:
             return float(np.mean(ratios)), what
     return float("nan"), "nothing"
