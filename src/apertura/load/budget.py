@@ -56,6 +56,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
             unit="cm of path",
         ),
         _sampling(pair.report.get("pulses", {})),
+        _antenna(pair),
     ]
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
@@ -121,6 +122,12 @@ def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
     used, dropped = pulses.get("used"), pulses.get("dropped", 0)
     stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
     return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
+
+
+def _antenna(pair: OpenPair) -> BudgetLine:
+    """Return the line of the antennas: beams stated weigh the pulses; one that is not shades the aperture."""
+    stated = None if pair.beams is None else "weighed by the beams stated"
+    return BudgetLine("antenna", stated, Effect(0.0, 0.0, 0.0), "a beam without a phase of its own")
 
 
 def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:
