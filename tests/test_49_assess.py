@@ -110,6 +110,7 @@ def later(seconds):
     return change
 
 
+@pytest.mark.slow
 def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
     campaign = sample(tmp_path, lambda root: edit_track(root, "uav1", later(0.5)))
     report = reports_of(campaign)["uav1-uav2"]
@@ -118,6 +119,7 @@ def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
     assert "uav1 is shifted by +0.50 s" in report["hypotheses"][0]["what"]
 
 
+@pytest.mark.slow
 def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(right, tmp_path):
     def off_by_a_quarter(align):
         root = copy_writable(right.root, tmp_path / f"align-{align}")
