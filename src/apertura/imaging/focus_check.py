@@ -17,6 +17,9 @@ from apertura.quality.sub_apertures import SubApertures, compare_parts
 APART_CELLS = 6.0
 """Bright points stand so many resolution cells apart."""
 
+SPECKLE = 0.06
+"""Power about a bright point, against its own, above which it may be speckle: of 10⁶ cells the brightest has 0.07."""
+
 _PATCHES = 4
 _PLACES_PER_CELL = 2.5
 _CELL_POINTS = 5
@@ -63,7 +66,10 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     apart_px = max(8, int(np.ceil(APART_CELLS * cell_m / grid.spacing_m)))
     points = bright_points(target, formation.windows, apart_px=apart_px)
     terms = formation.contributions([point.row for point in points], [point.column for point in points])
-    measured = [_focus_of(column) for column in terms.T]
+    measured = [
+        _focus_of(column) if point.background <= SPECKLE else None
+        for point, column in zip(points, terms.T, strict=True)
+    ]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
     elsewhere = None
