@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from apertura.atlas import commands, outcomes
+from apertura.atlas.causes import CAUSES
+from apertura.atlas.charts import draw_cause, draw_summary
+from apertura.atlas.flight import PAIRS, flight
+from apertura.atlas.outcomes import Outcome, run_cause
+from apertura.atlas.summary import alarms, part_path, summary_of, write_summary
 from apertura.errors import CampaignError
-from apertura.study import commands
-from apertura.study.atlas import outcomes
-from apertura.study.atlas.causes import CAUSES
-from apertura.study.atlas.charts import draw_cause, draw_summary
-from apertura.study.atlas.flight import PAIRS, flight
-from apertura.study.atlas.outcomes import Outcome, run_cause
-from apertura.study.atlas.summary import alarms, part_path, summary_of, write_summary
 from apertura.study.tables import read_table, write_table
 
 CELL_M = 0.1

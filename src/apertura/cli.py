@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from apertura import __version__
+from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError
-from apertura.study.commands import app as study
 
 if TYPE_CHECKING:
     from apertura.campaign import Campaign

@@ -1,6 +1,6 @@
 # The studies need no campaign: `snakemake --snakefile workflow/rules/study.smk --cores 2 paper stability`.
 from apertura.provenance import code_sha256
-from apertura.study.atlas.causes import CAUSES
+from apertura.atlas.causes import CAUSES
 from apertura.study.commands import PAPER_FIGURES, PAPER_PARTS, PAPER_READS
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
@@ -204,7 +204,7 @@ rule atlas_sweep:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.study.atlas.outcomes"),
+        code=code_sha256("apertura.atlas.outcomes"),
     message:
         "spoiling images by {wildcards.cause}"
     shell:
@@ -226,7 +226,7 @@ rule atlas_chart:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.study.atlas.charts"),
+        code=code_sha256("apertura.atlas.charts"),
     message:
         "charting what {wildcards.cause} does"
     shell:
@@ -250,7 +250,7 @@ rule atlas_summary:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura.study.atlas.charts"),
+        code=code_sha256("apertura.atlas.charts"),
     message:
         "which mistakes are seen"
     shell:

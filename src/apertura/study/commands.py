@@ -15,7 +15,6 @@ app = typer.Typer(
 
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
-ATLAS = Path("results/study/atlas")
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
     "parameters": "parameters:parameter_claims",
@@ -53,7 +52,7 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     """Compute some rows of the claims table, parts/PART.csv."""
     from apertura.study.tables import write_table
 
-    _require("part", part, PAPER_PARTS)
+    require("part", part, PAPER_PARTS)
     path = folder / "parts" / f"{part}.csv"
     claims = pkgutil.resolve_name(f"apertura.study.paper.{PAPER_PARTS[part]}")
     given = [part.removeprefix("loss_")] if PAPER_PARTS[part] == _LOSS else []
@@ -61,7 +60,8 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     typer.echo(path)
 
 
-def _require(kind: str, name: str, choices: Collection[str]) -> None:
+def require(kind: str, name: str, choices: Collection[str]) -> None:
+    """Raise CampaignError with the choices there are unless a name is one of them."""
     if name not in choices:
         expected = f"one of {', '.join(choices)}"
         raise CampaignError(f"{kind} {name!r}", where="apertura study", expected=expected, remedy="Choose one of them.")
@@ -81,7 +81,7 @@ def paper_claims(folder: Folder = PAPER) -> None:
 @app.command()
 def paper_figure(name: str, folder: Folder = PAPER) -> None:
     """Draw one figure of the paper, NAME.png."""
-    _require("figure", name, PAPER_FIGURES)
+    require("figure", name, PAPER_FIGURES)
     path = folder / f"{name}.png"
     if PAPER_FIGURES[name]:
         from apertura.study.paper.experiment_figures import DRAWN
@@ -102,8 +102,8 @@ def stability_sweep(impairment: str, method: str, folder: Folder = STABILITY) ->
     from apertura.study.stability.sweeps import CHOICES, SWEEPS
     from apertura.study.tables import write_table
 
-    _require("impairment", impairment, SWEEPS)
-    _require("method", method, CHOICES)
+    require("impairment", impairment, SWEEPS)
+    require("method", method, CHOICES)
     path = part_path(folder, impairment, method)
     write_table(path, run_sweep(impairment, method))
     typer.echo(path)
@@ -116,7 +116,7 @@ def stability_chart(impairment: str, folder: Folder = STABILITY) -> None:
     from apertura.study.stability.summary import join_parts
     from apertura.study.stability.sweeps import SWEEPS
 
-    _require("impairment", impairment, SWEEPS)
+    require("impairment", impairment, SWEEPS)
     outcomes = join_parts(folder, impairment)
     draw_impairment(impairment, outcomes, folder / f"{impairment}.png")
     typer.echo(folder / f"{impairment}.csv")
@@ -130,41 +130,3 @@ def stability_summary(folder: Folder = STABILITY) -> None:
 
     draw_summary(write_summary(folder), folder / "summary.png")
     typer.echo(write_sidelink_tables(folder))
-
-
-@app.command()
-def atlas_sweep(cause: str, folder: Folder = ATLAS) -> None:
-    """Sweep one cause that spoils images, parts/CAUSE.csv."""
-    from apertura.study.atlas.causes import CAUSES
-    from apertura.study.atlas.outcomes import run_cause
-    from apertura.study.atlas.summary import part_path
-    from apertura.study.tables import write_table
-
-    _require("cause", cause, CAUSES)
-    path = part_path(folder, cause)
-    write_table(path, run_cause(cause), digits=6)
-    typer.echo(path)
-
-
-@app.command()
-def atlas_chart(cause: str, folder: Folder = ATLAS) -> None:
-    """Draw what one cause costs, what was expected and where flags came, CAUSE.png."""
-    from apertura.study.atlas.causes import CAUSES
-    from apertura.study.atlas.charts import draw_cause
-    from apertura.study.atlas.outcomes import Outcome
-    from apertura.study.atlas.summary import part_path
-    from apertura.study.tables import read_table
-
-    _require("cause", cause, CAUSES)
-    draw_cause(read_table(part_path(folder, cause), Outcome), folder / f"{cause}.png")
-    typer.echo(folder / f"{cause}.png")
-
-
-@app.command()
-def atlas_summary(folder: Folder = ATLAS) -> None:
-    """Where each cause costs 1 dB and its flag comes, and how often alarms are missed or false: summary.csv, .png."""
-    from apertura.study.atlas.charts import draw_summary
-    from apertura.study.atlas.summary import write_summary
-
-    draw_summary(write_summary(folder), folder / "summary.png")
-    typer.echo(folder / "summary.csv")

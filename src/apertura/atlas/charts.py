@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from apertura.study.atlas.causes import CAUSES
-from apertura.study.atlas.outcomes import Outcome
-from apertura.study.atlas.summary import HARMFUL_CELLS, HARMFUL_DB, Summary, by_size, mean_of
+from apertura.atlas.causes import CAUSES
+from apertura.atlas.outcomes import Outcome
+from apertura.atlas.summary import HARMFUL_CELLS, HARMFUL_DB, Summary, by_size, mean_of
 from apertura.study.png import save_png
 
 _MEASURED, _EXPECTED, _FLAGGED = "#0072b2", "#d55e00", "#cc0000"

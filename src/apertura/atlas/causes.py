@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
+from apertura.atlas.flight import GRID, Flight, Told, flight
+from apertura.atlas.logs import Log, between_epochs, told_by
 from apertura.quality.budget import NodePositions, offset_line, position_line
 from apertura.quality.path_errors import Effect
 from apertura.scene.terrain import FlatGround, GridHeights
-from apertura.study.atlas.flight import GRID, Flight, Told, flight
-from apertura.study.atlas.logs import Log, between_epochs, told_by
 
 Tell = Callable[[Flight, float, Generator], Told]
 Expect = Callable[[Flight, str, float], Effect]

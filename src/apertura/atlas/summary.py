@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apertura.study.atlas.causes import CAUSES
-from apertura.study.atlas.outcomes import Outcome
+from apertura.atlas.causes import CAUSES
+from apertura.atlas.outcomes import Outcome
 from apertura.study.stability.summary import crossing
 from apertura.study.tables import read_table, write_table
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.illumination import illuminate
+from apertura.atlas.flight import GRID, PAIRS, Flight, Floats, Heard, Told
 from apertura.focus.engines import load_engine
 from apertura.imaging.certify import certified
 from apertura.imaging.focus_check import focus_flags, focus_report
@@ -21,7 +22,6 @@ from apertura.quality.agreement import agreement
 from apertura.quality.bright_points import BrightPoint
 from apertura.quality.point_targets import locate_maximum
 from apertura.scene.ground_models import GroundModels
-from apertura.study.atlas.flight import GRID, PAIRS, Flight, Floats, Heard, Told
 
 ACCURACY_DB = -70.0
 """Worse arithmetic moves the flat tops of wide lobes by millimetres."""

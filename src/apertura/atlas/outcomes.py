@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.atlas.causes import CAUSES
+from apertura.atlas.flight import GRID, PAIRS, Flight, Heard, Told
+from apertura.atlas.images import Seen, decibels, look
 from apertura.errors import CampaignError
 from apertura.load.budget import arithmetic_line
-from apertura.study.atlas.causes import CAUSES
-from apertura.study.atlas.flight import GRID, PAIRS, Flight, Heard, Told
-from apertura.study.atlas.images import Seen, decibels, look
 
 
 @dataclass(frozen=True)

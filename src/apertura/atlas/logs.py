@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
+from apertura.atlas.flight import Flight, Floats, Told
 from apertura.geometry.phase_centres import position_spline
 from apertura.geometry.track_checks import CheckedTrack, check_track
 from apertura.quality.budget import NodePositions
-from apertura.study.atlas.flight import Flight, Floats, Told
 
 NOISE_M = 0.002
 """Of every epoch by itself."""
