@@ -47,8 +47,8 @@ def test_the_budget_expects_what_track_noise_costs(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_path_offset_of_one_pair_turns_its_phase_as_expected_and_one_beyond_a_radian_is_flagged(monkeypatch):
-    small, large = swept(monkeypatch, "calibration", 0.3, 5.0)
+def test_a_path_offset_of_one_pair_turns_its_phase_as_expected_and_half_a_turn_is_flagged(monkeypatch):
+    small, large = swept(monkeypatch, "calibration", 0.3, 6.0)
     assert small.phase_rad == pytest.approx(small.expected_phase_rad, abs=0.03)
     assert large.phase_rad == pytest.approx(large.expected_phase_rad, rel=0.1)
     assert (small.flags, "pairs_out_of_phase" in large.flags) == ("", True)
