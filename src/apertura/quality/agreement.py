@@ -17,8 +17,8 @@ SHIFTED = 0.18
 """Images further apart than this, in units of eq. 6, and than their uncertainty allows, show different places: a tenth
 of the resolution cell."""
 
-OUT_OF_PHASE_RAD = 0.8
-"""Two images so far apart in phase lose 0.7 dB when they are added."""
+OUT_OF_PHASE_RAD = 0.6
+"""Two images so far apart in phase lose 0.4 dB when they are added."""
 
 _POINT = 0.09  # in units of eq. 6: neighbours pull each peak by about half a tenth of a cell
 _POINT_RAD = 0.05
@@ -156,7 +156,7 @@ def _between(images: tuple[Raster, Raster], first: BrightPoint, second: BrightPo
 
 
 def _mean_phasor(values: NDArray[np.complex128]) -> complex:
-    """Return the mean phasor of the second against the first over points, weighted by the weaker's amplitude."""
+    """Return the mean phasor of the second against the first over points, weighted by the weaker's power."""
     product = values[:, 1] * values[:, 0].conj()
-    weight = np.abs(values / np.abs(values).max(axis=0)).min(axis=1)
+    weight = np.abs(values / np.abs(values).max(axis=0)).min(axis=1) ** 2
     return complex((weight * np.exp(1j * np.angle(product))).sum() / weight.sum())

@@ -120,7 +120,7 @@ class Focus:
     verdict
         focused, defocused, or cannot tell.
     loss_db, std_db
-        Median over the points, weighted by power, and its standard deviation; NaN without points.
+        Median over the points, weighted by amplitude, and its standard deviation; NaN without points.
     points
         How many were measured.
     why
@@ -154,7 +154,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
         return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in seen])
     own = np.array([_std_db(focus) for _, focus in seen])
-    weights = np.array([amplitude**2 for amplitude, _ in seen])
+    weights = np.array([amplitude for amplitude, _ in seen])
     loss = _weighted_median(losses, weights)
     spread = 1.4826 * _weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(own)) / np.sqrt(len(seen)))
