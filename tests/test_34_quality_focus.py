@@ -6,7 +6,7 @@ import pytest
 from apertura.geometry.aperture import Aperture
 from apertura.quality.agreement import agreement
 from apertura.quality.bright_points import BrightPoint, bright_points, common_shift
-from apertura.quality.budget import BudgetLine, NodePositions, accuracy_for, expected, position_line
+from apertura.quality.budget import BudgetLine, NodePositions, accuracy_for, expected, position_lines
 from apertura.quality.focus import judge, judge_parts, point_focus
 from apertura.quality.path_errors import Effect, PointPaths
 from apertura.quality.sub_apertures import compare_parts
@@ -89,7 +89,7 @@ def test_the_loss_by_random_errors_is_what_draws_give(std_cm, apart_m):
         along = np.abs(np.fft.fft(np.exp(2j * np.pi / WAVELENGTH_M * error), 8 * count)) / count
         losses.append(20 * np.log10(np.r_[along[:24], along[-24:]].max()))
     nodes = [NodePositions((0.01 * std_cm,) * 3, 1.0, "test")] * len(slopes)
-    predicted = position_line(paths, nodes, sidelink=not same).effect.loss_db
+    predicted = position_lines(paths, nodes, sidelink=not same)[0].effect.loss_db
     assert predicted == pytest.approx(np.mean(losses), rel=0.15, abs=0.05)
 
 

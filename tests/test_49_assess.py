@@ -116,7 +116,7 @@ def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
     report = reports_of(campaign)["uav1-uav2"]
     assert {"pairs_apart", "defocused", "pairs_out_of_phase"} & set(report["flags"])
     assert report["hypotheses"][0]["kind"] == "time"
-    assert "uav1 is shifted by +0.50 s" in report["hypotheses"][0]["what"]
+    assert "the times of the log of uav1 are 0.50 s late" in report["hypotheses"][0]["what"]
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from apertura.atlas.flight import GRID, Flight, Told, flight
 from apertura.atlas.logs import Log, between_epochs, told_by
-from apertura.quality.budget import NodePositions, offset_line, position_line
+from apertura.quality.budget import NodePositions, offset_line, position_lines
 from apertura.quality.path_errors import Effect
 from apertura.scene.terrain import FlatGround, GridHeights
 
@@ -65,7 +65,7 @@ def positions(flown: Flight, pair: str, *known: NodePositions) -> Effect:
     """Return the line of positions: of one or both nodes of a pair, in the order a, b; a node not given is exact."""
     exact = NodePositions((1e-9,) * 3, 1.0, "truth")
     nodes = [*known, exact, exact]
-    return position_line(flown.paths(pair), nodes[: len(set(pair.split("-")))], sidelink=pair == "a-b").effect
+    return position_lines(flown.paths(pair), nodes[: len(set(pair.split("-")))], sidelink=pair == "a-b")[0].effect
 
 
 def offset(flown: Flight, pair: str, slope: Callable[..., np.ndarray], size: float, *, common: bool = False) -> Effect:

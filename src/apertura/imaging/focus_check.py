@@ -95,8 +95,8 @@ def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
     if report["verdict"] != "defocused":
         return flags
     return flags | {
-        "defocused": f"{report['why']}; {-expected_db:.1f} dB expected of the errors that are stated: "
-        "positions, lever arms, heights or times are worse than that"
+        "defocused": f"{report['why']}; {abs(expected_db):.1f} dB are expected of what is stated in the budget: "
+        "positions, lever arms, heights or times are worse, or not stated"
     }
 
 

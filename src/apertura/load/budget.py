@@ -11,7 +11,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency
 from apertura.load.pair import OpenPair
 from apertura.load.scene import OpenScene
-from apertura.quality.budget import BudgetLine, noise_loss, offset_line, position_line
+from apertura.quality.budget import BudgetLine, noise_loss, offset_line, position_lines
 from apertura.quality.path_errors import Effect, PointPaths
 from apertura.scene.grid import SceneGrid
 from apertura.settings import OfdmWaveform
@@ -34,7 +34,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     paths = _paths(pair, scene)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     lines = [
-        position_line(
+        *position_lines(
             paths, pair.positions, sidelink=not monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
         ),
         offset_line(

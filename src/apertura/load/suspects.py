@@ -19,7 +19,13 @@ MOST_PULSES = 512
 _SHIFTS_S = (18.0, 37.0, 19.0, 17.0, 5.0, 3.0, 2.0, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 _HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 2.0, 1.0, 0.5)
 _PREFIX_SAMPLES = (1, 2, 3, 5, 10, 20, 50)
-_RANGES_M = (0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
+_TIME_SYSTEMS = {
+    18.0: ": GPST taken for UTC?",
+    -18.0: ": UTC taken for GPST?",
+    37.0: ": TAI taken for UTC?",
+    19.0: ": TAI taken for GPST?",
+}
+_RANGES_M = (0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
 _AXES = ("forward", "right", "down")
 _POINTS = ("radar_tx", "radar_rx", "sidelink")
 
@@ -53,7 +59,7 @@ class Suspicion:
     Attributes
     ----------
     what
-        Said of the campaign: 'the log of uav1 is shifted by -18.0 s: GPST taken for UTC?'.
+        Said of the campaign: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
     kind
         Short name.
     histories
@@ -102,13 +108,11 @@ def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -
     groups = [*((name,) for name in nodes), *([tuple(nodes)] if len(nodes) > 1 else [])]
     for shift_s in (sign * size for size in _SHIFTS_S for sign in (-1, 1)):
         for group in groups:
-            who = f"the log of {group[0]} is" if len(group) == 1 else "all logs are"
-            why = (
-                ": GPST taken for UTC?" if abs(shift_s) == 18 else ": TAI taken for UTC?" if abs(shift_s) == 37 else ""
-            )
+            who = f"the log of {group[0]}" if len(group) == 1 else "all logs"
+            late = f"{abs(shift_s):.2f} s {'late' if shift_s > 0 else 'early'}{_TIME_SYSTEMS.get(shift_s, '')}"
             histories = _flown(nodes, found, shift_s=dict.fromkeys(group, shift_s))
             if histories:
-                yield Suspicion(f"{who} shifted by {shift_s:+.2f} s{why}", "time", histories)
+                yield Suspicion(f"the times of {who} are {late}", "time", histories)
 
 
 def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:

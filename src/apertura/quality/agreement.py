@@ -68,11 +68,6 @@ class Agreement:
         return self.shift_units > SHIFTED + 3 * self.shift_std_units
 
     @property
-    def elsewhere(self) -> bool:
-        """Whether they are so far apart that their phases at one place mean nothing: half a cell."""
-        return self.shifted and self.shift_units > 5 * SHIFTED
-
-    @property
     def out_of_phase(self) -> bool:
         """Whether adding the images would lose power, as far as their points can tell."""
         told = self.phase_std_rad < _TOLD_RAD

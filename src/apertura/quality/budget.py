@@ -42,7 +42,10 @@ class BudgetLine:
     @property
     def report(self) -> dict[str, Any]:
         """As JSON values: metres, dB and radians, rounded."""
-        expected = {name: float(f"{value:.3g}") + 0.0 for name, value in asdict(self.effect).items()}
+        expected = {
+            name: float(f"{value:.3g}") + 0.0 if np.isfinite(value) else None
+            for name, value in asdict(self.effect).items()
+        }
         return {"cause": self.cause, "stated": self.stated or f"not stated; {self.unit} would do this", **expected}
 
 
@@ -65,8 +68,8 @@ class NodePositions:
     stated_by: str = "nobody"
 
 
-def position_line(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> BudgetLine:
-    """Return what errors of the logs do.
+def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:
+    """Return what errors of the logs do: of those that are stated, and what a centimetre in the others would do.
 
     Parameters
     ----------
@@ -77,20 +80,21 @@ def position_line(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink
     sidelink
         As `PointPaths.by_node`.
     """
-    effect = paths.of_noise(
-        *(
-            (np.sqrt((slope**2 * np.square(node.std_m or (0.01,) * 3)).sum(axis=1)), node.correlation_s)
-            for slope, node in zip(paths.by_node(same=len(nodes) == 1, sidelink=sidelink), nodes, strict=True)
-        )
-    )
-    if any(node.std_m is None for node in nodes):
-        return BudgetLine("positions", None, effect, "1 cm in each axis of what nobody stated")
-    words = "; ".join(
-        f"{' '.join(f'{100 * std:.2g}' for std in node.std_m or ())} cm east north up for {node.correlation_s:g} s, "
-        f"said by {node.stated_by}"
-        for node in nodes
-    )
-    return BudgetLine("positions", words, effect)
+    slopes = paths.by_node(same=len(nodes) == 1, sidelink=sidelink)
+    lines = []
+    for stated in (True, False):
+        some = [(slope, node) for slope, node in zip(slopes, nodes, strict=True) if (node.std_m is not None) == stated]
+        if some:
+            sizes = [np.sqrt((slope**2 * np.square(node.std_m or (0.01,) * 3)).sum(axis=1)) for slope, node in some]
+            effect = paths.of_noise(*((size, node.correlation_s) for size, (_, node) in zip(sizes, some, strict=True)))
+            words = "; ".join(_said(node) for _, node in some) if stated else None
+            lines.append(BudgetLine("positions", words, effect, "1 cm in each axis of what nobody stated"))
+    return lines
+
+
+def _said(node: NodePositions) -> str:
+    sizes = " ".join(f"{100 * std:.2g}" for std in node.std_m or ())
+    return f"{sizes} cm east north up for {node.correlation_s:g} s, said by the {node.stated_by}"
 
 
 def offset_line(
@@ -129,7 +133,7 @@ def summed(effects: Iterable[Effect]) -> Effect:
     return Effect(
         sum(effect.loss_db for effect in parts),
         float(np.hypot.reduce([0.0, *(effect.shift_m for effect in parts)])),
-        float(np.hypot.reduce([0.0, *(effect.phase_rad for effect in parts)])),
+        float(np.hypot.reduce([0.0, *(np.nan_to_num(effect.phase_rad) for effect in parts)])),
     )
 
 

@@ -159,7 +159,9 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     spread = 1.4826 * _weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(own)) / np.sqrt(len(seen)))
     bad = loss < DEFOCUSED_DB - 2 * std
-    line = f"{len(seen)} bright points lost {-loss:.1f} ± {std:.1f} dB of their peak to phase errors"
+    line = f"{len(seen)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
+    if not bad and loss < DEFOCUSED_DB:
+        line += f", not more than {-DEFOCUSED_DB:g} dB by two standard deviations"
     return Focus("defocused" if bad else "focused", loss, std, len(seen), line)
 
 

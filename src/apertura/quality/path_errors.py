@@ -21,7 +21,7 @@ class Effect:
     shift_m
         Over ground, metres.
     phase_rad
-        At a place on the ground, against a pair without that error.
+        At a place on the ground, against a pair without that error; NaN where that is not predicted.
     """
 
     loss_db: float
@@ -120,7 +120,8 @@ class PointPaths:
         error_m
             (pulse,) float64, metres by which paths are longer than the image takes them for.
         common
-            All pairs share its cause, which moves their images alike: only what the move leaves turns their phases.
+            All pairs share its cause, which moves their images nearly alike: what that leaves between their phases is
+            not predicted.
 
         Notes
         -----
@@ -131,8 +132,8 @@ class PointPaths:
         rest = error_m - ground @ moved
         wavenumber = 2 * np.pi / self.wavelength_m
         loss_db = 20 * np.log10(max(abs(np.exp(1j * wavenumber * (rest - rest.mean())).mean()), 1e-6))
-        turning = rest if common else error_m
-        return Effect(float(loss_db), float(np.linalg.norm(moved)), float(abs(wavenumber * turning.mean())))
+        phase_rad = float("nan") if common else float(abs(wavenumber * error_m.mean()))
+        return Effect(float(loss_db), float(np.linalg.norm(moved)), phase_rad)
 
     def of_noise(self, *parts: tuple[NDArray[np.float64], float]) -> Effect:
         """Return what random errors of the path that do not know of each other do on average.

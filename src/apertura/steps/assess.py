@@ -80,9 +80,9 @@ def _flags(
 def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], reference: str) -> dict[str, str]:
     """Return pairs that show other places than the reference, whose phases there mean nothing → why."""
     apart = {
-        pair: f"its bright points lie {100 * one.shift_m:.0f} cm from those of {reference}"
+        pair: f"its bright points lie {100 * one.shift_m:.1f} cm from those of {reference}"
         for pair, one in found.items()
-        if one is not None and one.elsewhere
+        if one is not None and one.shifted
     }
     return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 

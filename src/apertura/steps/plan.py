@@ -1,6 +1,7 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
 import shutil
+from math import isfinite
 from typing import TYPE_CHECKING
 
 from apertura.campaign import Campaign
@@ -90,4 +91,5 @@ def _budget_table(lines: list[BudgetLine]) -> "Table":
 
 
 def _effect(effect: Effect) -> tuple[str, str, str]:
-    return f"{effect.loss_db:.2f} dB", f"{100 * effect.shift_m:.2g} cm", f"{effect.phase_rad:.2g} rad"
+    phase = f"{effect.phase_rad:.2g} rad" if isfinite(effect.phase_rad) else "not predicted"
+    return f"{effect.loss_db:.2f} dB".replace("-0.00", "0.00"), f"{100 * effect.shift_m:.2g} cm", phase
