@@ -7,7 +7,8 @@ one second, σ per axis, is added to both logs, and σ is stated in the config.
 import argparse
 import contextlib
 import io
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from judging.run import copy_writable
 from rich.console import Console
 from rich.table import Table
 from spoiling.folder import RX, TX, Folder
+from spoiling.logs import Log
 from spoiling.of_logs import logs, noisy
 
 from apertura.campaign import Campaign
@@ -69,6 +71,7 @@ def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str
     spoilt = copy_writable(right, folder / "spoilt")
     if size_cm:
         logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
+    logs(saying(max(size_cm, 1e-2) / 100), RX)(Folder(spoilt))
     Folder(spoilt).edit_config(
         lambda document: [node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()]
     )
@@ -78,6 +81,17 @@ def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str
         focus = quality["focus"]
         found.append(Draw(pair, predicted_db, loss_db, focus.get("loss_db", np.nan), focus["verdict"]))
     return found
+
+
+def saying(sigma_m: float) -> Callable[[Log], Log]:
+    """Return what makes an RTKLIB log state a standard deviation."""
+
+    def change(log: Log) -> Log:
+        rows = [line.split() for line in log.quality]
+        size = f"{sigma_m:.4f}"
+        return replace(log, quality=tuple("  ".join([*row[:2], size, size, size, *row[5:]]) for row in rows))
+
+    return change
 
 
 def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:

@@ -44,7 +44,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
             paths,
             "time tags",
             -_MS * paths.rate_m_s,
-            _scaled(pair.report, "time_tags", "std_s", _MS),
+            _stated_tags_ms(campaign, pair),
             unit="ms",
             common=True,
         ),
@@ -116,6 +116,13 @@ def _axes(grid: SceneGrid, row: int, column: int, height_m: float) -> NDArray[np
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
     value = (report.get(section) or {}).get(name)
     return None if value is None else float(value) / unit
+
+
+def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
+    """Return the deviation of the transmitter's tags, milliseconds; None where the config has only its default."""
+    node = campaign.settings.nodes.get(pair.name.split("-")[0])
+    stated = node is not None and "time_tag_std_s" in node.model_fields_set
+    return node.time_tag_std_s / _MS if node is not None and stated else None
 
 
 def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:

@@ -1,6 +1,6 @@
 """Rules `export` and `export_fused`: rasters, pictures and report of one image, or of the sums of a flight's images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,13 +59,14 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     folder, grid = campaign.results / flight / "fused", settled_scene(campaign).grid
     report = {
-        **_worst(list(images.values()), assessed["fusion"]),
+        **_worst(images, assessed["fusion"]),
         **_measures(grid, campaign.settings.processing.tile_px, sums),
         "fusion": assessed["fusion"],
         "coherence": _coherence(grid, images, assessed),
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": _flags(
-            {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()}
+            {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()},
+            assessed["fusion"]["left_out"],
         )
         | cube.attrs["flags"].get(flight, {}),
     }
@@ -136,32 +137,39 @@ def _coherence(
     return {"mean": round(found, 4), **chance}
 
 
-def _flags(of_pairs: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Return the flags of all pairs; where pairs say different things of one flag, each with its name."""
-    raised: dict[str, dict[str, str]] = {}
+def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> dict[str, str]:
+    """Return the flags of all pairs, each line with its pairs unless all say it, and who is not in the coherent sum."""
+    raised: dict[str, dict[str, list[str]]] = {}
     for pair, flags in of_pairs.items():
         for flag, line in flags.items():
-            raised.setdefault(flag, {})[pair] = line
-    return {
-        flag: next(iter(lines.values()))
-        if len(set(lines.values())) == 1
-        else "; ".join(f"{pair}: {line}" for pair, line in lines.items())
+            raised.setdefault(flag, {}).setdefault(line, []).append(pair)
+    said = {
+        flag: "; ".join(
+            line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}" for line, pairs in lines.items()
+        )
         for flag, lines in raised.items()
     }
+    alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in left_out.items())
+    return said | ({"pair_left_out": alone} if alone else {})
 
 
-def _worst(images: Sequence[xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
+def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the errors and models of some images say of their sum."""
-    qualities = [image.attrs["quality"] for image in images]
+    qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
     left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
+    added = {pair: images[pair].attrs["quality"] for pair in fusion["phases_rad"]}
+    verdicts = {quality["focus"]["verdict"]: pair for pair, quality in added.items()}
+    verdict = next(one for one in ("defocused", "cannot tell", "focused") if one in verdicts)
     return {
+        "focus": {"verdict": verdict, "why": f"the worst of the pairs added coherently, {verdicts[verdict]}"},
+        "budgets": {pair: image.attrs["quality"]["budget"] for pair, image in images.items()},
         "models": {
             "fusion": f"mean of the peak-normalised images, with and without phase{left_out}",
             "numerical_error": "that of the worst pair",
         },
         "numerical_error_db": worst["numerical_error_db"],
-        "numerical_error_confidence": worst["numerical_error_confidence"],
+        "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
         "redone": [one for quality in qualities for one in quality["redone"]],
@@ -169,7 +177,7 @@ def _worst(images: Sequence[xr.Dataset], fusion: Mapping[str, Any]) -> dict[str,
 
 
 def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
-    told = {name: report[name] for name in ("budget", "focus", "fusion", "redone") if report.get(name)}
+    told = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
     return {
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
         "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
