@@ -58,13 +58,14 @@ def _table(reports: dict[tuple[str, str], dict[str, Any]]) -> "Table":
         unstated = sum(line["stated"].startswith("not stated") for line in report.get("budget", ()))
         silent = f", {unstated} causes not stated" if unstated else ""
         expected = f"{abs(focus['expected_db']):.1f} dB{silent}" if "expected_db" in focus else ""
-        mean = coherence.get("mean")
+        mean, alone = coherence.get("mean"), len((report.get("fusion") or {}).get("left_out", ()))
+        together = "" if mean is None else f"{mean:.3f} (chance {coherence['chance']:.2f})"
         table.add_row(
             flight,
             name,
             f"{focus.get('verdict', '')}{lost}",
             expected,
-            "" if mean is None else f"{mean:.3f} (chance {coherence['chance']:.2f})",
+            f"{together} {alone} left out".strip() if alone else together,
             f"< {report['numerical_error_db']:.1f} dB",
             str(pulses.get("used", "")),
             str(pulses.get("dropped", "")),
