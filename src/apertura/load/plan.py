@@ -42,7 +42,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
-    accuracy = _accuracy(campaign, pair, scene)
+    accuracy = asked_accuracy(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(plan, decisions=(*plan.decisions, accuracy), flags={**flags, **plan.flags})
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
@@ -51,14 +51,13 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     return plan
 
 
-def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float | None = None) -> Plan:
-    """Return how a job will be done with the overrides of a campaign, at its accuracy where none is given."""
-    processing = campaign.settings.processing
-    asked_db = processing.asked_db if accuracy_db is None else accuracy_db
-    return make_plan(job, accuracy_db=asked_db, overrides=processing.planned, where=f"{CONFIG}: processing")
+def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float) -> Plan:
+    """Return how a job will be done at an accuracy and with the overrides of a campaign."""
+    overrides = campaign.settings.processing.planned
+    return make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
 
 
-def _accuracy(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
+def asked_accuracy(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
     """Return the numerical error to ask for, and why."""
     asked = campaign.settings.processing.accuracy_db
     if asked != "auto":

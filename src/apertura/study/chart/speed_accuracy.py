@@ -17,7 +17,7 @@ from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
 from apertura.imaging.stages import profiles_of
 from apertura.load.pair import open_pair
-from apertura.load.plan import job_of, plan_job
+from apertura.load.plan import asked_accuracy, job_of, plan_job
 from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.plan import Plan
 from apertura.planning.search import Search
@@ -84,16 +84,17 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     adds to the planned error is added to that of every setting.
     """
     opened = open_pair(campaign, flight, pair)
-    scene, processing = open_scene(campaign), campaign.settings.processing
+    scene = open_scene(campaign)
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
     middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     if opened.history is None:
         raise ValueError("the echo stage is not there")
     history, beams = opened.history[block], opened.beams and opened.beams[block]
+    accuracy_db = float(asked_accuracy(campaign, opened, scene).value)
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
     job = job_of(campaign, opened, scene)
-    plan, search = plan_job(campaign, job), Search(job)
+    plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), Search(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
     points = [
         replace(
@@ -107,8 +108,8 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     write_table(paths[0], points, digits=6)
-    draw_points(points, paths[1], title=title, accuracy_db=processing.asked_db)
-    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=processing.asked_db)
+    draw_points(points, paths[1], title=title, accuracy_db=accuracy_db)
+    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=accuracy_db)
     return paths
 
 
