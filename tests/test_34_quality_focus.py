@@ -204,3 +204,18 @@ def test_parts_that_drift_apart_are_seen():
     assert judge_parts(still, cell_m=0.3).verdict == "cannot tell"
     assert judge_parts(moving, cell_m=0.3).verdict == "defocused"
     assert still.snr_db > 10
+
+
+@pytest.mark.parametrize("turns", [0.3, 0.7, 2.3, -1.6])
+def test_the_phase_between_pixels_needs_the_carrier_that_the_pixels_fold(turns):
+    """Two images of one point whose carriers fold to different places: in phase at the point, between the pixels."""
+    y, x = np.mgrid[:64, :64]
+    row, column = 31.4, 30.2
+    envelope = np.sinc((y - row) / 4) * np.sinc((x - column) / 4)
+    images = [(envelope * np.exp(2j * np.pi * cycles * (y - row))).astype(np.complex64) for cycles in (0.1, turns)]
+    points = [[BrightPoint(row, column, 1.0, carrier=(cycles, 0.0))] for cycles in (0.1, turns)]
+    where = {"spacing_m": 0.1, "cell_m": 0.4, "spectrum": WIDE, "alone": True}
+    assert agreement(tuple(images), tuple(points), **where).phase_rad == pytest.approx(0.0, abs=0.02)
+    folded = [[BrightPoint(row, column, 1.0)]] * 2
+    if abs(turns) > 0.5:
+        assert abs(agreement(tuple(images), tuple(folded), **where).phase_rad) > 0.3

@@ -140,9 +140,10 @@ def _between(seen: dict[str, Seen]) -> dict[str, str]:
     return shifted | ({"pairs_out_of_phase": f"{found.phase_rad:.2f} rad"} if found.out_of_phase else {})
 
 
-def _point(point: dict[str, float]) -> BrightPoint:
+def _point(point: dict[str, Any]) -> BrightPoint:
     row, column = GRID.pixel_of(point["x_m"], point["y_m"])
-    return BrightPoint(float(row), float(column), point["amplitude"], point["background"])
+    east, north = (cycles * GRID.spacing_m for cycles in point["carrier_cycles_m"])
+    return BrightPoint(float(row), float(column), point["amplitude"], point["background"], carrier=(-north, east))
 
 
 def decibels(ratio: Floats | float) -> Floats:

@@ -40,9 +40,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     """Return the covariance of the spatial spectrum of a point in the scene's middle, east and north."""
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
-    here, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
-    axes = np.stack([east - here, north - here])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    here, axes = _axes(formation, row, column)
     half = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
     return profiles.aperture.spectrum(here, axes, frequency_hz=band)
@@ -122,12 +120,29 @@ def _places(formation: Formation, point: BrightPoint, step_px: float) -> NDArray
     return formation.positions_at(rows, columns)
 
 
+def _axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a place on the ground, and unit vectors east and north from it along the grid."""
+    here, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
+    axes = np.stack([east - here, north - here])
+    return here, axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _carrier(formation: Formation, point: BrightPoint) -> list[float]:
+    """Return the spatial frequency of a point, east and north, at the middle of aperture and band, cycles per metre."""
+    profiles = formation.profiles
+    here, axes = _axes(formation, max(1.0, point.row), min(point.column, formation.grid.shape[1] - 2.0))
+    some = profiles.aperture[profiles.aperture.sample(64)]
+    slope = (some.path_gradient(here) @ axes.T).mean(axis=0)
+    cycles = slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    return [float(f"{value:.8g}") for value in cycles]
+
+
 def _verdict_report(verdict: Focus) -> dict[str, Any]:
     measured = {} if verdict.points == 0 else {"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)}
     return {"verdict": verdict.verdict, **measured, "why": verdict.why}
 
 
-def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -> dict[str, float]:
+def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -> dict[str, Any]:
     x, y = map(float, formation.grid.map_at(point.row, point.column))
     return {
         "x_m": round(x, 4),
@@ -138,6 +153,7 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "pulses": focus.pulses,
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
+        "carrier_cycles_m": _carrier(formation, point),
         "coherence": round(focus.coherence, 5),
         "coherence_allowed": round(focus.coherence_allowed, 5),
     }

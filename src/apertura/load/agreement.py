@@ -57,6 +57,12 @@ def _points(image: "xr.Dataset", grid: SceneGrid) -> list[BrightPoint]:
     points = _focus(image)["points"]
     rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
     return [
-        BrightPoint(float(row), float(column), point["amplitude"], point["background"])
+        BrightPoint(
+            float(row),
+            float(column),
+            point["amplitude"],
+            point["background"],
+            carrier=(-point["carrier_cycles_m"][1] * grid.spacing_m, point["carrier_cycles_m"][0] * grid.spacing_m),
+        )
         for row, column, point in zip(rows, columns, points, strict=True)
     ]

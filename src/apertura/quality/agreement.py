@@ -147,7 +147,10 @@ def agreement(
 def _between(images: tuple[Raster, Raster], first: BrightPoint, second: BrightPoint) -> list[complex]:
     """Return both images halfway between their peaks."""
     row, column = (first.row + second.row) / 2, (first.column + second.column) / 2
-    return [complex(Patch(image, round(row), round(column)).at(row, column)) for image in images]
+    return [
+        complex(Patch(image, round(row), round(column), point.carrier).at(row, column))
+        for image, point in zip(images, (first, second), strict=True)
+    ]
 
 
 def _mean_phasor(values: NDArray[np.complex128]) -> complex:

@@ -30,12 +30,15 @@ class BrightPoint:
         Magnitude there.
     background
         Power of what lies about it, against its own: the median over a patch, as of speckle.
+    carrier
+        Spatial frequency of its carrier down and right, cycles per pixel; None: as the pixels fold it.
     """
 
     row: float
     column: float
     amplitude: float
     background: float = 0.0
+    carrier: tuple[float, float] | None = None
 
 
 def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:

@@ -23,6 +23,9 @@ class Patch:
         (y, x) complex64, carrier kept.
     row, column
         The pixel at its middle.
+    carrier
+        Spatial frequency down and right, cycles per pixel, that the band lies about; by default the middle of the band
+        as the pixels fold it, with which phases between pixels are right but for a constant turn per pixel.
 
     Notes
     -----
@@ -31,12 +34,12 @@ class Patch:
     real and imaginary parts would not do: the carrier turns by more than a radian per pixel.
     """
 
-    def __init__(self, image: Raster, row: int, column: int) -> None:
+    def __init__(self, image: Raster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
         rows, columns = (_span(at, size) for at, size in zip((row, column), image.shape, strict=True))
         self._first = np.array([rows.start, columns.start], np.float64)
         square = np.nan_to_num(np.asarray(image[rows, columns])).astype(np.complex128)
         self._spectrum = np.fft.fft2(square, norm="forward")
-        self._turns = [_centred(self._spectrum, axis) for axis in (0, 1)]
+        self._turns = [_centred(self._spectrum, axis, carrier and carrier[axis]) for axis in (0, 1)]
 
     def at(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
         """Return the image at fractional pixels (0-based, of the whole image), complex128 in the shape of `row`."""
@@ -52,12 +55,13 @@ def _span(at: int, size: int) -> slice:
     return slice(first, min(first + PATCH_PX, size))
 
 
-def _centred(spectrum: NDArray[np.complex128], axis: int) -> NDArray[np.float64]:
-    """Return the frequency (cycles per pixel) of each DFT bin, unwrapped about the band's centroid."""
+def _centred(spectrum: NDArray[np.complex128], axis: int, middle: float | None) -> NDArray[np.float64]:
+    """Return the frequency (cycles per pixel) of each DFT bin, unwrapped about a middle or the band's centroid."""
     power = (np.abs(spectrum) ** 2).sum(axis=1 - axis)
     count = len(power)
     bins = np.arange(count)
-    middle = np.angle((power * np.exp(2j * np.pi * bins / count)).sum()) / (2 * np.pi)
+    if middle is None:
+        middle = np.angle((power * np.exp(2j * np.pi * bins / count)).sum()) / (2 * np.pi)
     turns = bins / count
     return np.asarray(turns - np.round(turns - middle))
 

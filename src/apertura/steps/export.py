@@ -15,8 +15,7 @@ from apertura.export import export_modules, write_exports
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256
-from apertura.quality.bright_points import BrightPoint
-from apertura.quality.fused import Amplitude, coherence_between
+from apertura.quality.fused import Amplitude
 from apertura.quality.measures import Raster, survey
 from apertura.quality.point_targets import find_peak
 from apertura.scene.grid import SceneGrid
@@ -62,7 +61,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         **_worst(images, assessed["fusion"]),
         **_measures(grid, campaign.settings.processing.tile_px, sums),
         "fusion": assessed["fusion"],
-        "coherence": _coherence(grid, images, assessed),
+        "coherence": _coherence(assessed),
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": _flags(
             {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()},
@@ -121,20 +120,18 @@ def _measures(grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster]) -> dict
     }
 
 
-def _coherence(
-    grid: SceneGrid, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]
-) -> dict[str, float | int | None]:
-    """Return the coherence of the pairs that were added with their phases, at the reference's bright points."""
-    added = assessed["fusion"]["phases_rad"]
-    points = images[assessed["reference"]].attrs["quality"]["focus"]["points"]
-    chance = {"chance": round(1 / len(added), 4), "points": len(points)}
-    if len(added) < 2 or not points:
+def _coherence(assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
+    """Return |Σ z|²/P² of the P pairs added with their phases, z a pair's mean phasor against the reference.
+
+    None where no pair's phase was measured.
+    """
+    added, agreed = assessed["fusion"]["phases_rad"], assessed["pairs"]
+    told = {pair: agreed[pair]["agreement"] for pair in added if agreed[pair]["agreement"]}
+    chance = {"chance": round(1 / (len(told) + 1), 4), "pairs": len(told) + 1 if told else 0}
+    if not told:
         return {"mean": None, **chance}
-    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
-    places = [BrightPoint(float(row), float(column), 1.0) for row, column in zip(rows, columns, strict=True)]
-    turned = np.array(list(added.values()))
-    found = coherence_between([images[pair].image for pair in added], turned, places)
-    return {"mean": round(found, 4), **chance}
+    phasors = [one["coherence"] * np.exp(1j * (one["phase_rad"] - added[pair])) for pair, one in told.items()]
+    return {"mean": round(float(abs(1 + sum(phasors)) ** 2) / (len(told) + 1) ** 2, 4), **chance}
 
 
 def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> dict[str, str]:
