@@ -17,9 +17,8 @@ from apertura.imaging.focus_check import focus_flags, focus_report
 from apertura.imaging.formation import Formation
 from apertura.imaging.job import imaging_job
 from apertura.imaging.range_profiles import range_compress
+from apertura.load.agreement import agreement_by_focus
 from apertura.planning.planner import make_plan
-from apertura.quality.agreement import agreement
-from apertura.quality.bright_points import BrightPoint
 from apertura.quality.point_targets import locate_maximum
 from apertura.scene.ground_models import GroundModels
 
@@ -128,22 +127,13 @@ def _peaks(image: NDArray[np.complex64], at: Callable[..., NDArray[np.complex64]
 
 def _between(seen: dict[str, Seen]) -> dict[str, str]:
     """Return the flags that step assess raises on two images."""
-    two, cell_m = [seen[pair] for pair in PAIRS], max(one.focus["cell_m"] for one in seen.values())
-    points = [[_point(point) for point in one.focus["points"]] for one in two]
-    spectrum = np.mean([one.focus["spectrum_cycles2_m2"] for one in two], axis=0)
-    where = {"spacing_m": GRID.spacing_m, "cell_m": cell_m, "spectrum": spectrum}
-    found = agreement((two[0].image, two[1].image), (points[0], points[1]), **where)
+    two = [seen[pair] for pair in PAIRS]
+    found = agreement_by_focus((two[0].image, two[1].image), (two[0].focus, two[1].focus), GRID)
     if found is None:
         sure = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])
         return {"pair_unconfirmed": "no point in common"} if sure else {}
     shifted = {"pairs_apart": f"{found.shift_m:.3f} m"} if found.shifted else {}
     return shifted | ({"pairs_out_of_phase": f"{found.phase_rad:.2f} rad"} if found.out_of_phase else {})
-
-
-def _point(point: dict[str, Any]) -> BrightPoint:
-    row, column = GRID.pixel_of(point["x_m"], point["y_m"])
-    east, north = (cycles * GRID.spacing_m for cycles in point["carrier_cycles_m"])
-    return BrightPoint(float(row), float(column), point["amplitude"], point["background"], carrier=(-north, east))
 
 
 def decibels(ratio: Floats | float) -> Floats:

@@ -1,4 +1,4 @@
-"""How well an image is focused, measured on itself: bright points, and how much of a usual pixel is noise."""
+"""How well an image is focused, measured on itself: bright points, parts of the aperture, and the echo's own place."""
 
 from dataclasses import asdict
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.inputs import Profiles
 from apertura.imaging.echo_place import echo_elsewhere
 from apertura.imaging.formation import Formation
 from apertura.imaging.parts import PART_PX, part_images
@@ -30,10 +31,14 @@ _WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, 
 def resolution_cell_m(formation: Formation) -> float:
     """Return the finest resolution cell of the image's scene, metres."""
     profiles, grid = formation.profiles, formation.grid
-    half = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
+    half = _half_band_hz(profiles)
     pixels = grid.sample_pixels(_CELL_POINTS)
     band = profiles.centre_frequency_hz - half, profiles.centre_frequency_hz + half
     return profiles.aperture.resolution_cell_m(formation.positions_at(*pixels), band_hz=band)
+
+
+def _half_band_hz(profiles: Profiles) -> float:
+    return SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
 
 
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
@@ -41,7 +46,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
     here, axes = _axes(formation, row, column)
-    half = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
+    half = _half_band_hz(profiles)
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
     return profiles.aperture.spectrum(here, axes, frequency_hz=band)
 

@@ -1,5 +1,6 @@
 """How two finished images of a campaign agree, by the bright points that each found in itself."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from apertura.quality.agreement import Agreement, agreement
 from apertura.quality.bright_points import BrightPoint, shows_point
+from apertura.quality.measures import Raster
 from apertura.scene.grid import SceneGrid
 
 if TYPE_CHECKING:
@@ -20,13 +22,20 @@ def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> 
     """
     if not comparable(first, second, grid):
         return None
+    return agreement_by_focus((first.image, second.image), (_focus(first), _focus(second)), grid)
+
+
+def agreement_by_focus(
+    images: tuple[Raster, Raster], focus: tuple[Mapping[str, Any], Mapping[str, Any]], grid: SceneGrid
+) -> Agreement | None:
+    """Return how two images on a grid agree, by what `apertura.imaging.focus_check.focus_report` says of each."""
     return agreement(
-        (first.image, second.image),
-        (_points(first, grid), _points(second, grid)),
+        images,
+        (_points(focus[0], grid), _points(focus[1], grid)),
         spacing_m=grid.spacing_m,
-        cell_m=max(_focus(image)["cell_m"] for image in (first, second)),
-        alone=all(_focus(image)["maxima"] == 1 for image in (first, second)),
-        spectrum=np.mean([_focus(image)["spectrum_cycles2_m2"] for image in (first, second)], axis=0),
+        cell_m=max(one["cell_m"] for one in focus),
+        alone=all(one["maxima"] == 1 for one in focus),
+        spectrum=np.mean([one["spectrum_cycles2_m2"] for one in focus], axis=0),
     )
 
 
@@ -38,9 +47,8 @@ def comparable(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bo
 def shows_points_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
     """Return whether a second image has a bright pixel where a first has one of its bright points."""
     reach = max(1, round(_focus(first)["cell_m"] / grid.spacing_m))
-    return any(
-        shows_point(second.image, round(point.row), round(point.column), reach=reach) for point in _points(first, grid)
-    )
+    points = _points(_focus(first), grid)
+    return any(shows_point(second.image, round(point.row), round(point.column), reach=reach) for point in points)
 
 
 def _focus(image: "xr.Dataset") -> dict[str, Any]:
@@ -53,8 +61,8 @@ def agreement_report(found: Agreement | None) -> dict[str, float] | None:
     return None if found is None else {name: float(f"{value:.4g}") for name, value in asdict(found).items()}
 
 
-def _points(image: "xr.Dataset", grid: SceneGrid) -> list[BrightPoint]:
-    points = _focus(image)["points"]
+def _points(focus: Mapping[str, Any], grid: SceneGrid) -> list[BrightPoint]:
+    points = focus["points"]
     rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
     return [
         BrightPoint(
