@@ -70,18 +70,9 @@ class Campaign:
         """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
         return "/".join(["results", *where, f"{stage}.manifest.json"])
 
-    def echo_sources(self, flight: str, pair: str) -> list[str]:
-        """Return what the echo of a pair is made from: stages of its nodes, or recorded phase history."""
-        tx, rx = pair.split("-")
-        calibration = self.settings.calibration
-        if isinstance(self.settings.waveform, OfdmWaveform):
-            used = calibration is not None and self.flight(flight).kind == "image"
-            offsets = [self.calibration_file(calibration.flight)] if calibration is not None and used else []
-            stages = [
-                self.manifest(stage, flight, node) for node in dict.fromkeys((tx, rx)) for stage in ("raw", "track")
-            ]
-            return [self.settings.waveform.codes, *stages, *offsets]
-        return [path.relative_to(self.root).as_posix() for path in self.raw_files(flight, rx).values()]
+    def relative(self, path: Path) -> str:
+        """Return a path inside the campaign folder as the workflow names it."""
+        return path.relative_to(self.root).as_posix()
 
     def calibration_file(self, flight: str) -> str:
         """Return where the path offsets of a calibration flight lie."""
@@ -90,17 +81,6 @@ class Campaign:
     def assessment_file(self, flight: str) -> str:
         """Return where it stands how the images of a flight agree."""
         return f"results/{flight}/assessment.json"
-
-    def scene_sources(self) -> list[str]:
-        """Return what the grid is settled from: nothing, or the first image flight where something is `auto`."""
-        scene, first = self.settings.scene, self.image_flights[0]
-        if "auto" not in {scene.crs, scene.spacing_m, scene.bounds_m}:
-            return []
-        return [self.manifest("echo", first.name, pair) for pair in first.pairs]
-
-    def terrain_sources(self) -> list[str]:
-        """Return the stage of pixel heights, or nothing where the ground is flat."""
-        return [self.manifest("terrain")] if self.settings.scene.dem else []
 
     def height_files(self) -> dict[str, Path]:
         """Return role → file of the DEM and of the grid of the geoid, where the config names them."""

@@ -4,7 +4,7 @@ rule speed_accuracy:
             campaign.manifest(stage, campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1])
             for stage in ("echo", "profile")
         ],
-        "results/scene.json",
+        "results/scene.manifest.json",
     output:
         "results/study/speed_accuracy.csv",
         report(

@@ -1,7 +1,6 @@
 rule cube:
     input:
-        [campaign.manifest("image", flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs],
-        [campaign.assessment_file(flight.name) for flight in campaign.image_flights],
+        lambda wildcards: result_of(campaign, "cube").sources,
     output:
         "results/cube.manifest.json",
     log:
@@ -14,7 +13,7 @@ rule cube:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        code=code_sha256("apertura.steps.cube"),
+        code=code_of("cube"),
     message:
         "stacking and adding up every image"
     shell:

@@ -1,6 +1,6 @@
 rule echo:
     input:
-        lambda wildcards: campaign.echo_sources(wildcards.flight, wildcards.pair),
+        lambda wildcards: result_of(campaign, "echo", wildcards.flight, wildcards.pair).sources,
     output:
         "results/{flight}/{pair}/echo.manifest.json",
     log:
@@ -14,7 +14,7 @@ rule echo:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("echo", wildcards.pair, flight=wildcards.flight),
-        code=code_sha256("apertura.steps.echo"),
+        code=code_of("echo"),
     message:
         "{wildcards.flight}: calibrating {wildcards.pair}"
     shell:
@@ -23,11 +23,10 @@ rule echo:
 
 rule calibrate:
     input:
-        lambda wildcards: [
-            campaign.manifest("echo", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
-        ],
+        lambda wildcards: result_of(campaign, "calibration", wildcards.flight).sources,
     output:
         "results/{flight}/calibration.json",
+        "results/{flight}/calibration.manifest.json",
     log:
         "results/logs/{flight}/calibrate.log",
     benchmark:
@@ -39,7 +38,7 @@ rule calibrate:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
         settings=campaign.relevant("calibration"),
-        code=code_sha256("apertura.steps.calibration"),
+        code=code_of("calibration"),
     message:
         "{wildcards.flight}: estimating path offsets from the reflector"
     shell:
@@ -48,9 +47,7 @@ rule calibrate:
 
 rule profile:
     input:
-        "results/{flight}/{pair}/echo.manifest.json",
-        "results/scene.json",
-        campaign.terrain_sources(),
+        lambda wildcards: result_of(campaign, "profile", wildcards.flight, wildcards.pair).sources,
     output:
         "results/{flight}/{pair}/profile.manifest.json",
     log:
@@ -64,7 +61,7 @@ rule profile:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
     params:
         settings=campaign.relevant("profile"),
-        code=code_sha256("apertura.steps.profile"),
+        code=code_of("profile"),
     message:
         "{wildcards.flight}: compressing {wildcards.pair} in range"
     shell:

@@ -1,9 +1,7 @@
 # A row of `apertura.export.EXPORTS` is all that a product needs: the outputs follow from it.
 rule export:
     input:
-        "results/{flight}/{pair}/image.manifest.json",
-        "results/{flight}/assessment.json",
-        "results/scene.json",
+        lambda wildcards: result_of(campaign, "export", wildcards.flight, wildcards.pair).sources,
     output:
         [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("pair") if not export.pictured],
         [
@@ -17,6 +15,7 @@ rule export:
             if export.pictured
         ],
         "results/{flight}/{pair}/image.json",
+        "results/{flight}/{pair}/export.manifest.json",
     log:
         "results/logs/{flight}/{pair}.export.log",
     benchmark:
@@ -27,7 +26,8 @@ rule export:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.steps.export", *export_modules("pair")),
+        settings=campaign.settings.campaign,
+        code=code_of("export"),
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
@@ -36,12 +36,7 @@ rule export:
 
 rule export_fused:
     input:
-        "results/cube.manifest.json",
-        "results/{flight}/assessment.json",
-        "results/scene.json",
-        lambda wildcards: [
-            campaign.manifest("image", wildcards.flight, pair) for pair in campaign.flight(wildcards.flight).pairs
-        ],
+        lambda wildcards: result_of(campaign, "fused", wildcards.flight).sources,
     output:
         [f"results/{{flight}}/fused/{export.file}" for export in exports_in("fused") if not export.pictured],
         [
@@ -55,6 +50,7 @@ rule export_fused:
             if export.pictured
         ],
         "results/{flight}/fused/image.json",
+        "results/{flight}/fused/export.manifest.json",
     log:
         "results/logs/{flight}/fused.export.log",
     benchmark:
@@ -65,7 +61,8 @@ rule export_fused:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura.steps.export", *export_modules("fused")),
+        settings=campaign.settings.campaign,
+        code=code_of("fused"),
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:

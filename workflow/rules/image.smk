@@ -5,10 +5,10 @@ scattergather:
 
 rule scene:
     input:
-        campaign.scene_sources(),
-        list(campaign.height_files().values()),
+        lambda wildcards: result_of(campaign, "scene").sources,
     output:
         "results/scene.json",
+        "results/scene.manifest.json",
     log:
         "results/logs/scene.log",
     benchmark:
@@ -20,7 +20,7 @@ rule scene:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
         settings=campaign.relevant("scene"),
-        code=code_sha256("apertura.steps.scene"),
+        code=code_of("scene"),
     message:
         "settling the campaign's grid"
     shell:
@@ -29,8 +29,7 @@ rule scene:
 
 rule terrain:
     input:
-        "results/scene.json",
-        list(campaign.height_files().values()),
+        lambda wildcards: result_of(campaign, "terrain").sources,
     output:
         "results/terrain.manifest.json",
     log:
@@ -44,7 +43,7 @@ rule terrain:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
         settings=campaign.relevant("terrain"),
-        code=code_sha256("apertura.steps.terrain"),
+        code=code_of("terrain"),
     message:
         "bringing the DEM onto the campaign's grid"
     shell:
@@ -53,11 +52,10 @@ rule terrain:
 
 rule layers:
     input:
-        [campaign.manifest("echo", campaign.image_flights[0].name, pair) for pair in campaign.image_flights[0].pairs],
-        "results/scene.json",
-        campaign.terrain_sources(),
+        lambda wildcards: result_of(campaign, "layers").sources,
     output:
         [f"results/layers/{export.file}" for export in exports_in("layers")],
+        "results/layers/layers.manifest.json",
     log:
         "results/logs/layers.log",
     benchmark:
@@ -68,7 +66,7 @@ rule layers:
     resources:
         mem_mb=lambda wildcards, attempt: 1000 * attempt,
     params:
-        code=code_sha256("apertura.steps.layers", *export_modules("layers")),
+        code=code_of("layers"),
     message:
         "drawing how the scene is seen"
     shell:
@@ -77,11 +75,7 @@ rule layers:
 
 rule tiles:
     input:
-        "results/{flight}/{pair}/echo.manifest.json",
-        "results/{flight}/{pair}/profile.manifest.json",
-        "results/scene.json",
-        campaign.terrain_sources(),
-        lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
+        lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).sources,
     output:
         temp("results/{flight}/{pair}/tiles/{scatteritem}.json"),
     log:
@@ -95,7 +89,7 @@ rule tiles:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image", *ENGINES.values()),
+        code=code_of("image"),
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -105,11 +99,7 @@ rule tiles:
 # One job alone forms the tiles and finishes the image; the shares of many are gathered.
 rule image:
     input:
-        "results/{flight}/{pair}/echo.manifest.json",
-        "results/{flight}/{pair}/profile.manifest.json",
-        "results/scene.json",
-        campaign.terrain_sources(),
-        lambda wildcards: list(campaign.pattern_files(wildcards.pair).values()),
+        lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).sources,
         [
             share
             for share in gather.tiles("results/{{flight}}/{{pair}}/tiles/{scatteritem}.json")
@@ -128,7 +118,7 @@ rule image:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_sha256("apertura.steps.image", *ENGINES.values()),
+        code=code_of("image"),
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:
@@ -137,15 +127,10 @@ rule image:
 
 rule assess:
     input:
-        lambda wildcards: [
-            campaign.manifest(stage, wildcards.flight, pair)
-            for pair in campaign.flight(wildcards.flight).pairs
-            for stage in ("echo", "image")
-        ],
-        "results/scene.json",
-        campaign.terrain_sources(),
+        lambda wildcards: result_of(campaign, "assessment", wildcards.flight).sources,
     output:
         "results/{flight}/assessment.json",
+        "results/{flight}/assessment.manifest.json",
     log:
         "results/logs/{flight}/assess.log",
     benchmark:
@@ -157,7 +142,7 @@ rule assess:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
         settings=campaign.relevant("assess"),
-        code=code_sha256("apertura.steps.assess"),
+        code=code_of("assessment"),
     message:
         "{wildcards.flight}: comparing the images with each other"
     shell:

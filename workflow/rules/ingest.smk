@@ -1,6 +1,10 @@
 rule ingest:
     input:
-        lambda wildcards: list(campaign.raw_files(wildcards.flight, wildcards.node).values()),
+        lambda wildcards: [
+            source
+            for stage in ("raw", "track")
+            for source in result_of(campaign, stage, wildcards.flight, wildcards.node).sources
+        ],
     output:
         "results/{flight}/{node}/raw.manifest.json",
         "results/{flight}/{node}/track.manifest.json",
@@ -15,7 +19,7 @@ rule ingest:
         mem_mb=lambda wildcards, input: 300 + int(3 * input.size_mb),
     params:
         settings=campaign.relevant("raw"),
-        code=code_sha256("apertura.steps.ingest"),
+        code=code_of("raw"),
     message:
         "{wildcards.flight}: reading the recording and flight log of {wildcards.node}"
     shell:

@@ -10,7 +10,7 @@ from apertura.campaign import Campaign
 from apertura.contracts import STAGES
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
-from apertura.store import open_stage
+from apertura.store import open_document, open_stage
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -138,10 +138,6 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
     Raises
     ------
     CampaignError
-        If it is not there.
+        If it is not there as the step left it.
     """
-    path = campaign.root / campaign.assessment_file(flight)
-    if not path.is_file():
-        raise CampaignError("no such file", where=path, expected="what step assess writes", remedy="Run the workflow.")
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
+    return open_document(campaign.root / campaign.assessment_file(flight))

@@ -1,6 +1,5 @@
 """A campaign's grid and the ground under it, opened together: from the results, or as they will be."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import map_from_frame
 from apertura.load.ground import Ground
@@ -19,7 +17,7 @@ from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.dem import COVER_NODES, UncheckedDem
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, GridHeights, Terrain
-from apertura.store import manifest_of, open_array, open_stage
+from apertura.store import manifest_of, open_array, open_document, open_stage
 
 PATH = Path("results/scene.json")
 
@@ -95,17 +93,9 @@ def settled_scene(campaign: Campaign) -> OpenScene:
     Raises
     ------
     CampaignError
-        If the grid is not settled yet.
+        If the grid is not settled yet, or its file is damaged.
     """
-    path = campaign.root / PATH
-    if not path.is_file():
-        raise CampaignError(
-            "no such file",
-            where=path,
-            expected="the grid that the workflow settles",
-            remedy=f"Run `apertura run {campaign.root}` first.",
-        )
-    document = json.loads(path.read_text(encoding="utf-8"))
+    document = open_document(campaign.root / PATH)
     grid, level = document["grid"], FlatGround(document["height_m"])
     grid = SceneGrid(**{**grid, "shape": tuple(grid["shape"]), "first": tuple(grid["first"])})
     return OpenScene(grid, level, level, (), document["inputs"], document["chosen"])
@@ -128,7 +118,7 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
     `flown` gives what the first image flight flew; asked only where something is `auto`.
     """
     asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and (campaign.root / PATH).is_file():
+    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and manifest_of(campaign.root / PATH).is_file():
         scene = settled_scene(campaign)
     else:
         grid, ground, chosen = settled(campaign, flown)

@@ -7,15 +7,15 @@ from typing import Any
 
 import xarray as xr
 
-from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.fusion.choice import choose_fusion
+from apertura.lineage import result_of
 from apertura.load.agreement import agreement_of, agreement_report, comparable, shows_points_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
 from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
-from apertura.store import open_stage
+from apertura.store import open_stage, save_document
 
 _LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
 """Flags that a wrong geometry raises, and for which a remedy is looked for."""
@@ -26,6 +26,7 @@ _SURE_SNR_DB = 20.0
 
 def assess(campaign: Campaign, flight: str) -> Path:
     """Write results/<flight>/assessment.json: how the pairs agree, what to look at, what the coherent sum holds."""
+    lineage = result_of(campaign, "assessment", flight).begin(campaign.root, [__name__])
     pairs, grid = campaign.flight(flight).pairs, settled_scene(campaign).grid
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
@@ -61,7 +62,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
     path = campaign.root / campaign.assessment_file(flight)
-    write_json(path, report)
+    save_document(path, report, lineage.record())
     return path
 
 

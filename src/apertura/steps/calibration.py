@@ -1,22 +1,21 @@
 """Rule `calibrate`: path offsets of a flight's pairs, from a reflector at a known place."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import frame_from_map
+from apertura.lineage import result_of
 from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
 from apertura.settings import Calibration
-from apertura.store import open_stage
+from apertura.store import open_document, open_stage, save_document
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:
@@ -27,7 +26,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
     CampaignError
         If config/config.yaml has no calibration section, or no reflector stands out.
     """
-    asked = _asked(campaign)
+    asked, lineage = _asked(campaign), result_of(campaign, "calibration", flight).begin(campaign.root, [__name__])
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(asked.reflector_m), "pairs": {}}
     codes = []
     for pair in campaign.flight(flight).pairs:
@@ -38,7 +37,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
         }
     report["code_sha256"] = chained_sha256(code_sha256(__name__), codes)
     path = campaign.root / campaign.calibration_file(flight)
-    write_json(path, report)
+    save_document(path, report, lineage.record())
     return path
 
 
@@ -48,7 +47,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
     path = campaign.root / campaign.calibration_file(asked.flight)
-    offsets = json.loads(path.read_text(encoding="utf-8"))["pairs"]
+    offsets = open_document(path)["pairs"]
     if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",

@@ -9,6 +9,7 @@ import xarray as xr
 
 from apertura.campaign import Campaign
 from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.lineage import result_of
 from apertura.load.agreement import agreement_of, agreement_report
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
@@ -19,7 +20,7 @@ from apertura.store import create, finish, open_array, open_stage, writing
 
 def cube(campaign: Campaign) -> Path:
     """Write results/cube.zarr: image (flight, pair, y, x) and the coherent and non-coherent sums of each flight."""
-    flights = campaign.image_flights
+    flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root, [__name__])
     pairs = sorted({pair for flight in flights for pair in flight.pairs})
     images = {
         f"{flight.name}/{pair}": open_stage(campaign.stage("image", flight.name, pair), "image")
@@ -54,7 +55,7 @@ def cube(campaign: Campaign) -> Path:
                 arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
                 arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
                 arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
-        finish(wip, folder)
+        finish(wip, folder, lineage=lineage.record())
     return folder
 
 

@@ -15,11 +15,12 @@ from apertura.echo.demodulate import remove_path
 from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.ingest import read_phase_history
+from apertura.lineage import result_of
 from apertura.load.acquisition import Acquisition, Times, common_pulses, open_acquisition
 from apertura.load.positions import Placed, place
 from apertura.load.segments import keep_segments
 from apertura.load.transmitted import read_codes, symbol_samples
-from apertura.provenance import merged, sha256_file
+from apertura.provenance import merged
 from apertura.settings import OfdmWaveform, PhaseHistoryWaveform, Processing
 from apertura.steps.calibration import calibrated, calibration_spec
 from apertura.steps.stamping import stamped
@@ -28,6 +29,7 @@ from apertura.store import save_stage
 
 def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/echo.zarr."""
+    lineage = result_of(campaign, "echo", flight, pair).begin(campaign.root, [__name__])
     waveform = campaign.settings.waveform
     parents: list[xr.Dataset] = []
     calibration = calibrated(campaign, flight, pair)
@@ -42,12 +44,13 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         dataset = pair_echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
     dataset = keep_segments(campaign, flight, pair, dataset)
-    inputs = {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}
+    inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:
         inputs = merged(inputs, calibration["inputs"])
     relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
-    save_stage(stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs), folder)
+    stage = stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs)
+    save_stage(stage, folder, lineage=lineage.record())
     return folder
 
 

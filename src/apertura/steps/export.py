@@ -12,6 +12,7 @@ from rasterio import Affine
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.export import export_modules, write_exports
+from apertura.lineage import Lineage, result_of
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256
@@ -19,13 +20,15 @@ from apertura.quality.fused import Amplitude
 from apertura.quality.measures import Raster, survey
 from apertura.quality.point_targets import find_peak
 from apertura.scene.grid import SceneGrid
-from apertura.store import open_stage
+from apertura.store import open_stage, record_files
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     """Write the products of one pair, or of 'fused', and image.json; return their paths."""
     if pair == "fused":
         return export_fused(campaign, flight)
+    modules = [__name__, *export_modules("pair")]
+    lineage = result_of(campaign, "export", flight, pair).begin(campaign.root, modules)
     image = open_stage(campaign.stage("image", flight, pair), "image")
     assessed = assessment_of(campaign, flight)
     agreed, quality = assessed["pairs"][pair], image.attrs["quality"]
@@ -35,7 +38,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "hypotheses": assessed["hypotheses"],
         "flags": {**image.attrs["flags"], **agreed["flags"]},
     }
-    origin = _with_code(Provenance.of([__name__, *export_modules("pair")], [image]), assessed)
+    origin = _with_code(Provenance.of(modules, [image]), assessed)
     folder = campaign.results / flight / pair
     written = write_exports(
         "pair",
@@ -45,12 +48,12 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         tags=origin.tags() | _quality_tags(report),
         **_georeference(settled_scene(campaign).grid),
     )
-    write_json(folder / "image.json", {"flight": flight, "pair": pair, **report})
-    return [*written, folder / "image.json"]
+    return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     """Write the products of the sums of a flight's pairs, and image.json; return their paths."""
+    lineage = result_of(campaign, "fused", flight).begin(campaign.root, [__name__, *export_modules("fused")])
     cube = open_stage(campaign.stage("cube"), "cube")
     index = cube.attrs["flights"].index(flight)
     sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
@@ -83,8 +86,15 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         tags=_fused_provenance(cube, images, assessed).tags() | _quality_tags(report),
         **_georeference(grid),
     )
-    write_json(folder / "image.json", {"flight": flight, "pairs": list(pairs), **report})
-    return [*written, folder / "image.json"]
+    return _finish(folder, written, {"flight": flight, "pairs": list(pairs), **report}, lineage)
+
+
+def _finish(folder: Path, written: list[Path], report: Mapping[str, Any], lineage: Lineage) -> list[Path]:
+    """Write image.json beside the products, then the manifest of all."""
+    files = [*written, folder / "image.json"]
+    write_json(files[-1], report)
+    record_files(folder / "export.manifest.json", files, lineage.record())
+    return files
 
 
 def _georeference(grid: SceneGrid) -> dict[str, Any]:

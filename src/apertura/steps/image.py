@@ -16,6 +16,7 @@ from apertura.imaging.certify import certified, measures
 from apertura.imaging.focus_check import focus_flags, focus_report
 from apertura.imaging.formation import Formation
 from apertura.imaging.stages import profiles_of
+from apertura.lineage import result_of
 from apertura.load.antennas import antennas_report
 from apertura.load.budget import arithmetic_line, budget_of
 from apertura.load.pair import OpenPair, open_pair
@@ -26,6 +27,7 @@ from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
 from apertura.store import finish, open_array, open_stage, resume, sharing, writing
 
+_MODULES = [__name__, *ENGINES.values()]
 _QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
 
 
@@ -34,6 +36,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
+    lineage = result_of(campaign, "image", flight, pair).begin(campaign.root, _MODULES)
     work = _open(campaign, flight, pair, threads=threads)
     folder, echo, plan = work.folder, work.echo, work.formation.plan
     with writing(folder) as wip:
@@ -57,7 +60,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         expected_db = expected(lines).loss_db
         focus["expected_db"] = round(expected_db, 3)
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"], **focus_flags(focus, expected_db)}
-        finish(wip, folder, quality=quality, flags=quality["flags"])
+        finish(wip, folder, lineage=lineage.record(), quality=quality, flags=quality["flags"])
     return folder
 
 
@@ -130,7 +133,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),
         "image",
-        modules=[__name__, *ENGINES.values()],
+        modules=_MODULES,
         parents=[echo, profile, *scene.parents],
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},

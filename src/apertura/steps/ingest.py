@@ -8,8 +8,8 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.ingest import open_recording, read_track
 from apertura.ingest.recording import Recording
+from apertura.lineage import result_of
 from apertura.load.transmitted import read_framing, symbol_samples
-from apertura.provenance import sha256_file
 from apertura.settings import OfdmWaveform
 from apertura.steps.stamping import stamped
 from apertura.store import save_stage
@@ -23,21 +23,21 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     CampaignError
         If a file is missing, damaged, or not what its format promises.
     """
-    log = campaign.track_file(flight, node)
-    track = stamped(read_track(log, node=node), "track", modules=[__name__], inputs=_hashes(campaign, log))
+    logged = result_of(campaign, "track", flight, node).begin(campaign.root, [__name__])
+    log = read_track(campaign.track_file(flight, node), node=node)
+    track = stamped(log, "track", modules=[__name__], inputs=logged.sources.digests)
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash()
-    files = list(recording.files)
+    preamble = () if recording.framing is None else (recording.framing["preamble"],)
+    recorded = result_of(campaign, "raw", flight, node).begin(campaign.root, [__name__], further=preamble)
     if recording.framing is None:
         dataset, settings = recording.cut(recording.captures, node=node), {}
     else:
         dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
-        files.append(campaign.root / recording.framing["preamble"])
-    inputs = _hashes(campaign, *files)
-    raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=inputs)
+    raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=recorded.sources.digests)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
-    save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256})
-    save_stage(track, folders[1])
+    save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256}, lineage=recorded.record())
+    save_stage(track, folders[1], lineage=logged.record())
     return folders
 
 
@@ -67,7 +67,3 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
         )
     dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
     return dataset.assign_attrs(trigger=captures.report)
-
-
-def _hashes(campaign: Campaign, *files: Path) -> dict[str, str]:
-    return {path.relative_to(campaign.root).as_posix(): sha256_file(path) for path in files}

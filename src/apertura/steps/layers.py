@@ -19,12 +19,13 @@ from rasterio import Affine
 from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.export import export_modules, write_exports
+from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import Provenance
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, Terrain
 from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
-from apertura.store import open_stage
+from apertura.store import open_stage, record_files
 
 MASK_PULSES = 17
 """Pulses, evenly spread over the aperture, from which shadow is decided."""
@@ -34,16 +35,18 @@ _TILE_PX = 256
 
 def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
     """Write the products of results/layers: incidence, bistatic angle and mask; return their paths."""
+    modules = [__name__, *export_modules("layers")]
+    lineage = result_of(campaign, "layers").begin(campaign.root, modules)
     scene, flight = open_scene(campaign), campaign.image_flights[0]
     echoes = {pair: open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs}
     rasters = _rasters(scene, [_track(echo) for echo in echoes.values()], threads=threads)
     origin = Provenance.of(
-        [__name__, *export_modules("layers")],
+        modules,
         {**echoes, **dict(zip(["terrain"], scene.parents, strict=False))},
         settings=scene.spec,
         inputs=scene.inputs,
     )
-    return write_exports(
+    written = write_exports(
         "layers",
         campaign.results / "layers",
         rasters,
@@ -52,6 +55,8 @@ def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )
+    record_files(campaign.root / lineage.result.manifest, written, lineage.record())
+    return written
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
 from apertura.imaging.stages import phase_history_of
+from apertura.lineage import result_of
 from apertura.load.scene import open_scene
 from apertura.scene.clearance import check_antennas
 from apertura.settings import CONFIG
@@ -19,6 +20,7 @@ from apertura.store import open_stage, save_stage
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr."""
+    lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root, [__name__])
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
     history, where = phase_history_of(source, campaign.settings.processing.window), f"flight {flight}, pair {pair}"
     check_antennas(scene.grid, scene.terrain, history.aperture, where=where)
@@ -38,7 +40,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     folder = campaign.stage("profile", flight, pair)
     settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
     how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": scene.inputs}
-    save_stage(stamped(dataset, "profile", **how), folder)
+    save_stage(stamped(dataset, "profile", **how), folder, lineage=lineage.record())
     return folder
 
 

@@ -4,18 +4,20 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
-from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.geometry.aperture import Aperture
+from apertura.lineage import result_of
 from apertura.load.scene import PATH, Flown, settled
-from apertura.store import open_stage
+from apertura.store import open_stage, save_document
 
 
 def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for and the height of its ground, and why."""
+    lineage = result_of(campaign, "scene").begin(campaign.root, [__name__])
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.root / PATH, ground.level(grid).height_m
-    write_json(path, {"grid": asdict(grid), "height_m": height_m, "chosen": chosen, "inputs": ground.inputs})
+    document = {"grid": asdict(grid), "height_m": height_m, "chosen": chosen, "inputs": ground.inputs}
+    save_document(path, document, lineage.record())
     return path
 
 

@@ -7,6 +7,7 @@ import xarray as xr
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.lineage import result_of
 from apertura.load.ground import Ground
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.scene.dem import height_range
@@ -23,6 +24,7 @@ def terrain(campaign: Campaign) -> Path:
     CampaignError
         If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
     """
+    lineage = result_of(campaign, "terrain").begin(campaign.root, [__name__])
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
     grid, ground = scene.grid, Ground.of(campaign.settings.scene, campaign.root, crs=scene.grid.crs)
     if ground.dem is None:
@@ -48,7 +50,7 @@ def terrain(campaign: Campaign) -> Path:
             "highest_m": highest_m,
             "datum": campaign.settings.scene.dem_datum,
         }
-        finish(wip, folder, terrain=report)
+        finish(wip, folder, lineage=lineage.record(), terrain=report)
     return folder
 
 

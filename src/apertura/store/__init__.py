@@ -1,21 +1,34 @@
 """Stages on disk: zarr folders that are complete or absent, each beside a manifest of hashes.
 
 A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a rename, and described by
-``<stage>.manifest.json``, which is written last: where the manifest stands, the folder is complete.
+``<stage>.manifest.json``, which is written last: where the manifest stands, the folder is complete. Documents and
+products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
-from apertura.store.manifest import manifest_of
+from apertura.store.manifest import (
+    damaged_files,
+    manifest_of,
+    open_document,
+    read_manifest,
+    record_files,
+    save_document,
+)
 from apertura.store.progress import create, finish, missing, open_array, resume, sharing, writing
 from apertura.store.stages import open_stage, save_stage
 
 __all__ = [
     "create",
+    "damaged_files",
     "finish",
     "manifest_of",
     "missing",
     "open_array",
+    "open_document",
     "open_stage",
+    "read_manifest",
+    "record_files",
     "resume",
+    "save_document",
     "save_stage",
     "sharing",
     "writing",

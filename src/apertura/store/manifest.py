@@ -1,47 +1,128 @@
-"""The manifest beside a stage: the hashes of its files, checked when it is opened."""
+"""The manifest of a result: hashes of its files and what it was made from; written last, checked when it is opened."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from apertura.atomic import write_json
 from apertura.errors import CampaignError
-from apertura.provenance import sha256_tree
+from apertura.provenance import sha256_file, sha256_tree
 
 
-def manifest_of(folder: Path) -> Path:
-    """Return where the manifest of a stage folder lies.
+def manifest_of(result: Path) -> Path:
+    """Return where the manifest of a stage folder or of a document lies.
 
     Examples
     --------
-    >>> manifest_of(Path("results/f01/uav1/raw.zarr")).name
-    'raw.manifest.json'
+    >>> manifest_of(Path("results/f01/uav1/raw.zarr")).name, manifest_of(Path("results/scene.json")).name
+    ('raw.manifest.json', 'scene.manifest.json')
     """
-    return folder.with_name(f"{folder.stem}.manifest.json")
+    return result.with_name(f"{result.stem}.manifest.json")
 
 
-def check_files(folder: Path) -> None:
-    """Check the files of a finished stage against its manifest.
+def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Mapping[str, Any] | None = None) -> None:
+    """Write the manifest of a result that is complete.
+
+    Parameters
+    ----------
+    manifest
+        ``….manifest.json``.
+    files
+        File relative to the manifest's folder → sha256.
+    lineage
+        What it was made from: sources (file → sha256), settings, code; None: nobody says.
+    """
+    write_json(manifest, {"files": files, **(lineage or {})})
+
+
+def record_files(manifest: Path, files: Sequence[Path], lineage: Mapping[str, Any] | None = None) -> None:
+    """Write the manifest of some files beside or below it."""
+    write_manifest(
+        manifest, {path.relative_to(manifest.parent).as_posix(): sha256_file(path) for path in sorted(files)}, lineage
+    )
+
+
+def read_manifest(manifest: Path) -> dict[str, Any]:
+    """Return a manifest.
 
     Raises
     ------
     CampaignError
-        If the folder is missing, or is not what the manifest describes.
+        If it is no manifest.
     """
-    manifest = manifest_of(folder)
-    if not manifest.is_file() or not folder.is_dir():
+    try:
+        document: dict[str, Any] = json.loads(manifest.read_text(encoding="utf-8"))
+        hashes = [*document["files"].items(), *document.get("sources", {}).items()]
+        if not all(isinstance(text, str) for pair in hashes for text in pair):
+            raise ValueError("hashes that are no text")
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise CampaignError(
+            f"no manifest ({str(error)[:80]})",
+            where=manifest,
+            expected="what the workflow wrote",
+            remedy=f"Delete {manifest} and run the workflow again.",
+        ) from error
+    return document
+
+
+def check_files(result: Path) -> None:
+    """Check the files of a finished stage, or a document, against its manifest.
+
+    Raises
+    ------
+    CampaignError
+        If it is missing, or is not what the manifest describes.
+    """
+    manifest = manifest_of(result)
+    if not manifest.is_file() or not result.exists():
         raise CampaignError(
             "not there, or not finished",
-            where=folder,
-            expected="a finished stage with its manifest",
+            where=result,
+            expected="a finished result with its manifest",
             remedy=f"{f'Delete {manifest} and run' if manifest.is_file() else 'Run'} the workflow (`apertura run`).",
         )
-    expected = json.loads(manifest.read_text(encoding="utf-8"))["files"]
-    present = sha256_tree(folder)
-    if expected != present:
-        names = sorted(expected.keys() | present.keys())
-        differing = [name for name in names if expected.get(name) != present.get(name)]
+    expected = read_manifest(manifest)["files"]
+    present = sha256_tree(result) if result.is_dir() else {"": sha256_file(result)}
+    present = {"/".join(filter(None, (result.name, name))): digest for name, digest in present.items()}
+    refuse_others(manifest, expected, present)
+
+
+def damaged_files(manifest: Path) -> list[str]:
+    """Return the files of a result that are not as they were written, or not there; every byte is read."""
+    expected = read_manifest(manifest)["files"]
+    there = {name: manifest.parent / name for name in expected}
+    return [name for name, path in there.items() if not path.is_file() or sha256_file(path) != expected[name]]
+
+
+def refuse_others(manifest: Path, expected: Mapping[str, str], present: Mapping[str, str]) -> None:
+    """Raise CampaignError unless the files present are those expected."""
+    names = sorted(expected.keys() | present.keys())
+    differing = [name for name in names if expected.get(name) != present.get(name)]
+    if differing:
         raise CampaignError(
             f"{len(differing)} files are not as they were written, first {differing[0]}",
-            where=folder,
+            where=manifest.parent,
             expected=f"what {manifest.name} describes",
             remedy=f"Delete {manifest} and run the workflow again.",
         )
+
+
+def save_document(path: Path, document: Mapping[str, Any], lineage: Mapping[str, Any] | None = None) -> None:
+    """Write a result that is one JSON document, and its manifest."""
+    manifest_of(path).unlink(missing_ok=True)
+    write_json(path, document)
+    record_files(manifest_of(path), [path], lineage)
+
+
+def open_document(path: Path) -> dict[str, Any]:
+    """Return a result that is one JSON document, after checking it against its manifest.
+
+    Raises
+    ------
+    CampaignError
+        If it is missing, or is not what the manifest describes.
+    """
+    check_files(path)
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document

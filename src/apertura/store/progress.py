@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from apertura.atomic import rename, write_json
+from apertura.atomic import rename
 from apertura.contracts import Window
 from apertura.provenance import canonical_json, sha256_tree
-from apertura.store.manifest import manifest_of
+from apertura.store.manifest import manifest_of, write_manifest
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -174,13 +174,15 @@ def writable_zarr() -> Any:
     return zarr
 
 
-def finish(wip: Path, folder: Path, **attributes: Any) -> None:
+def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None, **attributes: Any) -> None:
     """Turn work in progress into the finished stage and write its manifest.
 
     Parameters
     ----------
     wip, folder
         As `writing` yields and takes them.
+    lineage
+        What it was made from, as `write_manifest` takes it.
     **attributes
         Attributes of the stage that are known only now, such as what was measured on it.
     """
@@ -192,4 +194,4 @@ def finish(wip: Path, folder: Path, **attributes: Any) -> None:
     _lock_of(folder).write_text(canonical_json(files), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     rename(wip, folder)
-    write_json(manifest_of(folder), {"folder": folder.name, "files": files})
+    write_manifest(manifest_of(folder), {f"{folder.name}/{name}": digest for name, digest in files.items()}, lineage)

@@ -13,7 +13,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def save_stage(dataset: "xr.Dataset", folder: Path, *, chunks: Mapping[str, int] | None = None) -> None:
+def save_stage(
+    dataset: "xr.Dataset",
+    folder: Path,
+    *,
+    chunks: Mapping[str, int] | None = None,
+    lineage: Mapping[str, Any] | None = None,
+) -> None:
     """Write a stage at once: `folder`.wip, rename, manifest.
 
     Parameters
@@ -24,6 +30,8 @@ def save_stage(dataset: "xr.Dataset", folder: Path, *, chunks: Mapping[str, int]
         ``…/<stage>.zarr``.
     chunks
         Dimension → chunk length; a dimension not named is one chunk.
+    lineage
+        What it was made from, as `apertura.store.manifest.write_manifest` takes it.
     """
     writable_zarr()
     with writing(folder) as wip:
@@ -39,7 +47,7 @@ def save_stage(dataset: "xr.Dataset", folder: Path, *, chunks: Mapping[str, int]
             if "spatial_ref" in dataset.variables and {"y", "x"} <= set(array.dims):
                 encoding[name]["grid_mapping"] = "spatial_ref"
         dataset.to_zarr(wip, mode="w", consolidated=False, zarr_format=3, encoding=encoding)
-        finish(wip, folder)
+        finish(wip, folder, lineage=lineage)
 
 
 def open_stage(folder: Path, stage: str) -> "xr.Dataset":

@@ -1,0 +1,1 @@
+"""What can be told of a campaign folder before anything runs."""

@@ -1,0 +1,100 @@
+"""Results that another file, another setting or other code has overtaken, whatever the times of files say."""
+
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from apertura.campaign import Campaign
+from apertura.digests import digest_of
+from apertura.errors import CampaignError
+from apertura.lineage import Result, results_of
+from apertura.steps.code import code_of
+from apertura.store import damaged_files, read_manifest
+
+_ONLY_LOOKS = (
+    r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
+    r"report.*|unlock|cleanup.*|containerize|export-cwl|archive|compilation|print-compilation|delete-.*|help|version)"
+)
+"""Options with which snakemake reads a workflow and runs none of it."""
+
+
+def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
+    """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
+
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
+    paranoid
+        Read every file, also where its state is that of a hash taken before.
+    """
+    stale: dict[str, str] = {}
+    for name, result in results_of(campaign):
+        path = campaign.root / result.manifest
+        if not path.is_file():
+            continue
+        try:
+            reasons = list(_reasons(campaign.root, name, result, read_manifest(path), paranoid=paranoid))
+        except CampaignError:
+            reasons = ["its manifest is damaged"]
+        reasons += [f"it stands on {source}" for source in result.sources if source in stale]
+        if reasons:
+            stale[result.manifest] = "; ".join(reasons)
+    return stale
+
+
+def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
+    """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
+    for manifest, why in stale.items():
+        print(f"{manifest} is made again: {why}", file=sys.stderr, flush=True)
+    for manifest in reversed(stale if remove else ()):  # what stands on others first: a kill leaves no gap below it
+        (campaign.root / manifest).unlink()
+
+
+def forms_results(arguments: Sequence[str]) -> bool:
+    """Return whether snakemake, called so, runs jobs; while it reads the workflow it says so nowhere else.
+
+    Examples
+    --------
+    >>> forms_results(["snakemake", "--cores", "2"]), forms_results(["snakemake", "-np"])
+    (True, False)
+    """
+    return not any(re.fullmatch(_ONLY_LOOKS, argument) for argument in arguments[1:])
+
+
+def damaged_results(campaign: Campaign) -> dict[str, str]:
+    """Return manifest → what of a result is not as it was written, of those that are there; every byte is read."""
+    damaged = {}
+    for _, result in results_of(campaign):
+        path = campaign.root / result.manifest
+        if path.is_file():
+            try:
+                files = damaged_files(path)
+            except CampaignError:
+                damaged[result.manifest] = "its manifest is damaged"
+                continue
+            if files:
+                damaged[result.manifest] = f"{files[0]} is not as it was written" + (
+                    f", nor are {len(files) - 1} others" if len(files) > 1 else ""
+                )
+    return damaged
+
+
+def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
+    if not {"sources", "settings", "code"} <= recorded.keys():
+        yield "it does not say what it was made from"
+        return
+    for source in sorted({*result.sources, *recorded["sources"]}):
+        was = recorded["sources"].get(source)
+        if was is None:
+            yield f"{source} is new to it"
+        elif not (root / source).is_file():
+            yield f"{source} is gone"
+        elif digest_of(root, source, paranoid=paranoid) != was:
+            yield f"{source} has changed"
+    if recorded["settings"] != result.settings_sha256:
+        yield "its settings have changed"
+    if recorded["code"] != code_of(name):
+        yield "its code has changed"

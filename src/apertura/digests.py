@@ -1,0 +1,126 @@
+"""Hashes of a campaign's files: taken once per state of a file, whatever its times say, and compared later.
+
+A file's state is its size, inode, and times of content and of inode: `cp -p` and `rsync -a` set the former time back,
+none sets the latter. A hash is kept under that state in ``results/.hashes``, so that nothing large is read twice.
+"""
+
+import json
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from apertura.atomic import write_json
+from apertura.errors import CampaignError
+from apertura.provenance import sha256_file
+
+_KEPT = Path("results/.hashes")
+_SMALL = 1 << 16  # bytes; hashed faster than its state is looked up
+_SETTLED_S = 2.0
+"""A file changed within this time of being read may change again in the same tick of the clock: not kept."""
+
+
+def digest_of(root: Path, name: str, *, paranoid: bool = False) -> str:
+    """Return the sha256 of a campaign's file, hex; from `results/.hashes` where its state is known.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    name
+        The file relative to it.
+    paranoid
+        Read the file in any case.
+
+    Raises
+    ------
+    CampaignError
+        If the file is not there, or changes while it is read.
+    """
+    path = root / name
+    state = _state(path)
+    if state["size"] < _SMALL:
+        return sha256_file(path)
+    kept = root / _KEPT / f"{name}.json"
+    if not paranoid:
+        with suppress(OSError, ValueError, TypeError):
+            known = json.loads(kept.read_text(encoding="utf-8"))
+            if known["state"] == state:
+                return str(known["sha256"])
+    digest = sha256_file(path)
+    if _state(path) != state:
+        raise _changed(path)
+    if max(state["mtime_ns"], state["ctime_ns"]) < time.time_ns() - _SETTLED_S * 1e9:
+        with suppress(OSError):  # a folder that cannot be written: the next one hashes again
+            write_json(kept, {"state": state, "sha256": digest})
+    return digest
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Files of a campaign as a step finds them.
+
+    Attributes
+    ----------
+    root
+        The campaign folder.
+    digests
+        File relative to it → sha256.
+    """
+
+    root: Path
+    digests: Mapping[str, str]
+    _states: Mapping[str, Mapping[str, int]]
+
+    @classmethod
+    def of(cls, root: Path, names: Iterable[str]) -> "Sources":
+        """Hash some files; raise CampaignError if one is not there."""
+        states = {name: _state(root / name) for name in sorted(set(names))}
+        return cls(root, {name: digest_of(root, name) for name in states}, states)
+
+    def unchanged(self) -> dict[str, str]:
+        """Return file → sha256; raise CampaignError if one has changed since it was hashed: what was read is unknown.
+
+        Examples
+        --------
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "log.csv").write_text("time")
+        ...     sources = Sources.of(Path(folder), ["log.csv"])
+        ...     list(sources.unchanged())
+        ...     _ = (Path(folder) / "log.csv").write_text("other")
+        ...     sources.unchanged()
+        Traceback (most recent call last):
+        ...
+        apertura.errors.CampaignError: ...log.csv: changed while it was read; expected ...
+        """
+        for name, state in self._states.items():
+            if _state(self.root / name) != state:
+                raise _changed(self.root / name)
+        return dict(self.digests)
+
+
+def _state(path: Path) -> dict[str, int]:
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise CampaignError(
+            f"not readable ({error.strerror})", where=path, expected="a file that was there", remedy="Copy it there."
+        ) from error
+    return {
+        "size": found.st_size,
+        "inode": found.st_ino,
+        "device": found.st_dev,
+        "mtime_ns": found.st_mtime_ns,
+        "ctime_ns": found.st_ctime_ns,
+    }
+
+
+def _changed(path: Path) -> CampaignError:
+    return CampaignError(
+        "changed while it was read",
+        where=path,
+        expected="a file that nobody writes to",
+        remedy="Wait until it is copied, then run the workflow again.",
+    )

@@ -1,0 +1,238 @@
+"""What every result is made from: files, other results, settings. Rules, steps and checks ask here.
+
+A result is what one rule writes. Its manifest, written last, names its files and what they were made from; another
+file, another setting or other code (`apertura.steps.code`) makes it stale, whatever the times of files say.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from apertura.campaign import Campaign
+from apertura.digests import Sources
+from apertura.provenance import canonical_json, code_sha256, sha256_text
+from apertura.settings import OfdmWaveform
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one rule writes.
+
+    Attributes
+    ----------
+    manifest
+        Its manifest, relative to the campaign folder.
+    sources
+        What it is made from: files, and manifests of other results, relative to the campaign folder.
+    settings
+        What of the config matters to it.
+    """
+
+    manifest: str
+    sources: tuple[str, ...]
+    settings: Mapping[str, Any]
+
+    @property
+    def settings_sha256(self) -> str:
+        """Hash of the settings, as the manifest records it."""
+        return sha256_text(canonical_json(self.settings))
+
+    def begin(self, root: Path, modules: Sequence[str], *, further: Sequence[str] = ()) -> "Lineage":
+        """Hash what it is made from.
+
+        Parameters
+        ----------
+        root
+            The campaign folder.
+        modules
+            Whose import closure is the code that makes it.
+        further
+            Files that only reading the others names.
+        """
+        return Lineage(self, Sources.of(root, (*self.sources, *further)), tuple(modules))
+
+
+@dataclass(frozen=True)
+class Lineage:
+    """A result that is being made, and its sources as they were found."""
+
+    result: Result
+    sources: Sources
+    modules: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """Return what the manifest says of where the result comes from.
+
+        Raises
+        ------
+        CampaignError
+            If a source has changed since it was hashed.
+        """
+        made_by = {"settings": self.result.settings_sha256, "code": code_sha256(*self.modules)}
+        return {"sources": self.sources.unchanged(), **made_by}
+
+
+def result_of(campaign: Campaign, result: str, *where: str) -> Result:
+    """Return a result of a campaign.
+
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
+    result
+        A key of `RESULTS`.
+    *where
+        Flight and node (raw, track), flight and pair (echo, profile, image, export), flight (calibration, assessment,
+        fused), nothing (scene, terrain, layers, cube).
+    """
+    return RESULTS[result](campaign, *where)
+
+
+def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
+    """Yield every result of a campaign with its key of `RESULTS`, each after those it is made from."""
+    for result, *where in _order(campaign):
+        yield result, result_of(campaign, result, *where)
+
+
+def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
+    ofdm = isinstance(campaign.settings.waveform, OfdmWaveform)
+    for flight in sorted(campaign.flights, key=lambda flight: flight.kind != "calibration"):
+        for node in dict.fromkeys((flight.transmitter, *flight.nodes)) if ofdm else ():
+            yield from ((stage, flight.name, node) for stage in ("raw", "track"))
+        yield from (("echo", flight.name, pair) for pair in flight.pairs)
+        if flight.kind == "calibration":
+            yield "calibration", flight.name
+    yield ("scene",)
+    if campaign.settings.scene.dem:
+        yield ("terrain",)
+    yield ("layers",)
+    for flight in campaign.image_flights:
+        for stage in ("profile", "image"):
+            yield from ((stage, flight.name, pair) for pair in flight.pairs)
+        yield "assessment", flight.name
+        yield from (("export", flight.name, pair) for pair in flight.pairs)
+    yield ("cube",)
+    yield from (("fused", flight.name) for flight in campaign.image_flights)
+
+
+def _raw(campaign: Campaign, flight: str, node: str) -> Result:
+    files = tuple(campaign.relative(path) for path in campaign.recording_files(flight, node))
+    settings = campaign.relevant("raw")
+    return Result(campaign.manifest("raw", flight, node), files, settings)
+
+
+def _track(campaign: Campaign, flight: str, node: str) -> Result:
+    log = campaign.relative(campaign.track_file(flight, node))
+    return Result(campaign.manifest("track", flight, node), (log,), {})
+
+
+def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
+    calibration, waveform = campaign.settings.calibration, campaign.settings.waveform
+    nodes = dict.fromkeys(pair.split("-"))
+    if isinstance(waveform, OfdmWaveform):
+        sources = [campaign.manifest(stage, flight, node) for node in nodes for stage in ("raw", "track")]
+        sources.insert(0, waveform.codes)
+        if calibration is not None and campaign.flight(flight).kind == "image":
+            sources.append(campaign.manifest("calibration", calibration.flight))
+    else:
+        sources = [campaign.relative(path) for path in campaign.raw_files(flight, pair.split("-")[1]).values()]
+    settings = campaign.relevant("echo", pair, flight=flight)
+    return Result(campaign.manifest("echo", flight, pair), tuple(sources), settings)
+
+
+def _calibration(campaign: Campaign, flight: str) -> Result:
+    echoes = tuple(campaign.manifest("echo", flight, pair) for pair in campaign.flight(flight).pairs)
+    settings = campaign.relevant("calibration")
+    return Result(campaign.manifest("calibration", flight), echoes, settings)
+
+
+def _scene(campaign: Campaign) -> Result:
+    asked, first = campaign.settings.scene, campaign.image_flights[0]
+    settled_by_flight = "auto" in {asked.crs, asked.spacing_m, asked.bounds_m}
+    echoes = [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if settled_by_flight else []
+    settings = campaign.relevant("scene")
+    return Result(campaign.manifest("scene"), (*echoes, *_heights(campaign)), settings)
+
+
+def _terrain(campaign: Campaign) -> Result:
+    sources = (campaign.manifest("scene"), *_heights(campaign))
+    return Result(campaign.manifest("terrain"), sources, campaign.relevant("terrain"))
+
+
+def _layers(campaign: Campaign) -> Result:
+    first = campaign.image_flights[0]
+    echoes = [campaign.manifest("echo", first.name, pair) for pair in first.pairs]
+    settings = {"campaign": campaign.settings.campaign}
+    return Result(campaign.manifest("layers", "layers"), (*echoes, *_ground(campaign)), settings)
+
+
+def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
+    sources = (campaign.manifest("echo", flight, pair), *_ground(campaign))
+    settings = campaign.relevant("profile")
+    return Result(campaign.manifest("profile", flight, pair), sources, settings)
+
+
+def _image(campaign: Campaign, flight: str, pair: str) -> Result:
+    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
+    patterns = [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
+    sources = (*stages, *_ground(campaign), *patterns)
+    return Result(campaign.manifest("image", flight, pair), sources, campaign.relevant("image", pair))
+
+
+def _assessment(campaign: Campaign, flight: str) -> Result:
+    stages = [
+        campaign.manifest(stage, flight, pair) for pair in campaign.flight(flight).pairs for stage in ("echo", "image")
+    ]
+    sources = (*stages, *_ground(campaign))
+    settings = campaign.relevant("assess")
+    return Result(campaign.manifest("assessment", flight), sources, settings)
+
+
+def _cube(campaign: Campaign) -> Result:
+    flights = campaign.image_flights
+    images = [campaign.manifest("image", flight.name, pair) for flight in flights for pair in flight.pairs]
+    assessed = [campaign.manifest("assessment", flight.name) for flight in flights]
+    sources = (*images, *assessed, campaign.manifest("scene"))
+    settings = {"tile_px": campaign.settings.processing.tile_px}
+    return Result(campaign.manifest("cube"), sources, settings)
+
+
+def _export(campaign: Campaign, flight: str, pair: str) -> Result:
+    stages = (campaign.manifest("image", flight, pair), campaign.manifest("assessment", flight))
+    sources = (*stages, campaign.manifest("scene"))
+    return Result(campaign.manifest("export", flight, pair), sources, {"campaign": campaign.settings.campaign})
+
+
+def _fused(campaign: Campaign, flight: str) -> Result:
+    images = [campaign.manifest("image", flight, pair) for pair in campaign.flight(flight).pairs]
+    sources = (*images, campaign.manifest("assessment", flight), campaign.manifest("cube"), campaign.manifest("scene"))
+    settings = {"campaign": campaign.settings.campaign, "tile_px": campaign.settings.processing.tile_px}
+    return Result(campaign.manifest("export", flight, "fused"), sources, settings)
+
+
+def _heights(campaign: Campaign) -> list[str]:
+    return [campaign.relative(path) for path in campaign.height_files().values()]
+
+
+def _ground(campaign: Campaign) -> list[str]:
+    """Return the grid and, where there is a DEM, its heights."""
+    return [campaign.manifest("scene"), *([campaign.manifest("terrain")] if campaign.settings.scene.dem else [])]
+
+
+RESULTS: Mapping[str, Callable[..., Result]] = {
+    "raw": _raw,
+    "track": _track,
+    "echo": _echo,
+    "calibration": _calibration,
+    "scene": _scene,
+    "terrain": _terrain,
+    "layers": _layers,
+    "profile": _profile,
+    "image": _image,
+    "assessment": _assessment,
+    "cube": _cube,
+    "export": _export,
+    "fused": _fused,
+}
+"""Name → what it is made from."""

@@ -1,0 +1,21 @@
+"""Which code makes each result: a change of it makes the result again."""
+
+from apertura.export import export_modules
+from apertura.focus.engines import ENGINES
+from apertura.provenance import code_sha256
+
+_STEPS = {"raw": "ingest", "track": "ingest", "assessment": "assess", "fused": "export"}
+"""Results that are called otherwise than the module of `apertura.steps` that makes them."""
+
+
+def code_of(result: str) -> str:
+    """Return the hash of the code that makes a result, a key of `apertura.lineage.RESULTS`.
+
+    Examples
+    --------
+    >>> code_of("raw") == code_of("track") != code_of("echo")
+    True
+    """
+    tables = {"image": ENGINES.values(), "export": export_modules("pair")}
+    tables |= {kind: export_modules(kind) for kind in ("fused", "layers")}
+    return code_sha256(f"apertura.steps.{_STEPS.get(result, result)}", *tables.get(result, ()))
