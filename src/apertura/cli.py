@@ -5,7 +5,6 @@ Commands import what they run when they run: help and mistakes in the command li
 
 import os
 import pkgutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +14,7 @@ import typer
 from apertura import __version__
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError
+from apertura.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
 
 if TYPE_CHECKING:
     from apertura.campaign import Campaign
@@ -28,6 +28,7 @@ CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
 Cores = Annotated[int, typer.Option(help="cores to use")]
 Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
+Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
@@ -47,14 +48,22 @@ def _run(function: str, campaign: Path, *arguments: str, **options: object) -> N
 
 
 def main() -> None:
-    """Run the command line; what a person has to correct is said in one message, without a traceback."""
-    try:
-        app()
-    except CampaignError as error:
-        from apertura.settings import located
+    """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
+    with ended_by_signals():
+        try:
+            app()
+        except CampaignError as error:
+            from apertura.settings import located
 
-        print(f"error: {located(str(error))}", file=sys.stderr)
-        raise SystemExit(2) from None
+            print(f"error: {located(str(error))}", file=sys.stderr)
+            leave_status(2)
+            raise SystemExit(2) from None
+        except Interrupted as signalled:
+            print(signalled.code, file=sys.stderr)
+            raise SystemExit(INTERRUPTED) from None
+        except Exception:
+            leave_status(1)
+            raise
 
 
 def _print_version(asked: bool) -> None:
@@ -72,33 +81,24 @@ def _options(
     pass
 
 
-@app.command()
-def version() -> None:
-    """Print the version."""
-    print(__version__)
-
-
 @app.command(context_settings=PASS_ON)
-def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
+def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES, paranoid: Paranoid = False) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
-    raise SystemExit(_snakemake(campaign, cores, *context.args))
+    from apertura.workflow import run_workflow
+
+    raise SystemExit(run_workflow(campaign, cores, *context.args, paranoid=paranoid))
 
 
-def _snakemake(campaign: Path, cores: int, *arguments: str) -> int:
-    """Run the workflow; return its exit status."""
-    _opened(campaign).check_files()
-    root = _workflow_folder()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
-    command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *arguments]
-    here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
-    environment = {**os.environ, "PATH": f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"}
-    return subprocess.run(command, check=False, env=environment).returncode
+@app.command()
+def check(
+    campaign: CampaignFolder,
+    products: Annotated[bool, typer.Option("--products", help="read every byte of the results")] = False,
+    paranoid: Paranoid = False,
+) -> None:
+    """Print all that is wrong with a campaign folder, a line each, and which results are overtaken; run nothing."""
+    from apertura.check import print_findings
 
-
-def _workflow_folder() -> Path:
-    """Return where the root Snakefile lies: inside the installed package, or beside its sources."""
-    package = Path(__file__).parent
-    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())
+    raise SystemExit(2 if print_findings(campaign, products=products, paranoid=paranoid) else 0)
 
 
 @app.command()
@@ -112,7 +112,9 @@ def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
 @app.command(context_settings=PASS_ON)
 def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
     """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
-    status = _snakemake(campaign, cores, *context.args, "speed_accuracy")
+    from apertura.workflow import run_workflow
+
+    status = run_workflow(campaign, cores, *context.args, "speed_accuracy")
     if status == 0:
         print(*(campaign / f"results/study/speed_accuracy.{suffix}" for suffix in ("png", "html", "csv")), sep="\n")
     raise SystemExit(status)

@@ -20,6 +20,9 @@ _ONLY_LOOKS = (
 """Options with which snakemake reads a workflow and runs none of it."""
 
 
+_STANDS = "it stands on "
+
+
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
     """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
 
@@ -39,7 +42,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
             reasons = list(_reasons(campaign.root, name, result, read_manifest(path), paranoid=paranoid))
         except CampaignError:
             reasons = ["its manifest is damaged"]
-        reasons += [f"it stands on {source}" for source in result.sources if source in stale]
+        reasons += [f"{_STANDS}{source}" for source in result.sources if source in stale]
         if reasons:
             stale[result.manifest] = "; ".join(reasons)
     return stale
@@ -47,10 +50,18 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
 
 def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
     """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
-    for manifest, why in stale.items():
-        print(f"{manifest} is made again: {why}", file=sys.stderr, flush=True)
-    for manifest in reversed(stale if remove else ()):  # what stands on others first: a kill leaves no gap below it
+    for line in stale_lines(stale):
+        print(line, file=sys.stderr, flush=True)
+    for manifest in reversed(list(stale)) if remove else ():  # what stands on others first: a kill leaves no gap below
         (campaign.root / manifest).unlink()
+
+
+def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for each result that is overtaken itself, and one for those that only stand on them."""
+    own = {manifest: why for manifest, why in stale.items() if not why.startswith(_STANDS)}
+    yield from (f"{manifest}: stale, to be made again: {why}" for manifest, why in own.items())
+    if len(own) < len(stale):
+        yield f"{len(stale) - len(own)} results stand on that: to be made again, too"
 
 
 def forms_results(arguments: Sequence[str]) -> bool:

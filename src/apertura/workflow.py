@@ -1,0 +1,84 @@
+"""The workflow on a campaign folder: checked first, run by one process group, and ended with all its steps."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from apertura.campaign import Campaign
+from apertura.check.stale import forms_results, stale_results
+from apertura.lock import hold
+from apertura.signals import STATUS_FILE
+
+_GRACE_S = 3.0
+
+
+def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False) -> int:
+    """Run the workflow on a campaign folder; return its exit status.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    cores
+        To use.
+    *arguments
+        Further options and targets of snakemake.
+    paranoid
+        Read every source again, also those whose state is known.
+
+    Returns
+    -------
+    int
+        0; 2 where the campaign or the machine has to be seen to, 130 after a signal, and 1 for a defect.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign is not fit to run, or another run holds it.
+    """
+    campaign = Campaign.load(root)
+    campaign.check_files()
+    if forms_results(["", *arguments]):
+        hold(root).close()
+    stale = stale_results(campaign, paranoid=paranoid)
+    forced = ["--forcerun", *stale] if stale else []  # in time for a dry run; the workflow says why
+    folder = _workflow_folder()
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(folder / "Snakefile"), "--directory", str(root)]
+    command += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores), *arguments, *forced]
+    here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
+    path = f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+    with tempfile.TemporaryDirectory() as scratch:
+        said = Path(scratch) / "status"
+        status = _supervised(command, {**os.environ, "PATH": path, STATUS_FILE: str(said)})
+        told = set(said.read_text(encoding="utf-8").split()) if said.is_file() else set()
+    return 2 if status == 1 and told == {"2"} else status
+
+
+def _supervised(command: Sequence[str], environment: dict[str, str]) -> int:
+    """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
+    process = subprocess.Popen(command, env=environment, start_new_session=True)
+    try:
+        return process.wait()
+    except BaseException:
+        _end(process)
+        raise
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    os.killpg(process.pid, signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_GRACE_S)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)  # steps that outlive snakemake, too: work in progress survives it
+    process.wait()
+
+
+def _workflow_folder() -> Path:
+    """Return where the root Snakefile lies: inside the installed package, or beside its sources."""
+    package = Path(__file__).parent
+    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())
