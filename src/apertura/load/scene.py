@@ -1,6 +1,6 @@
 """A campaign's grid and the ground under it, opened together: from the results, or as they will be."""
 
-import json
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
+from apertura.documents import DAMAGED, read_json, undamaged
+from apertura.errors import quoted
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import map_from_frame
 from apertura.load.ground import Ground
@@ -97,18 +98,20 @@ def settled_scene(campaign: Campaign) -> OpenScene:
     CampaignError
         If the grid is not settled yet.
     """
-    path = campaign.root / PATH
-    if not path.is_file():
-        raise CampaignError(
-            "no such file",
-            where=path,
-            expected="the grid that the workflow settles",
-            remedy=f"Run `apertura run {campaign.root}` first.",
-        )
-    document = json.loads(path.read_text(encoding="utf-8"))
-    grid, level = document["grid"], FlatGround(document["height_m"])
-    grid = SceneGrid(**{**grid, "shape": tuple(grid["shape"]), "first": tuple(grid["first"])})
-    return OpenScene(grid, level, level, (), document["inputs"], document["chosen"])
+    path, expected = campaign.root / PATH, "the grid that the workflow settles"
+    document = read_json(path, expected=expected, remedy=f"Run `apertura run {campaign.root}` first.")
+    with undamaged(path, expected=expected, remedy=DAMAGED):
+        grid, level = document["grid"], FlatGround(_number(document["height_m"]))
+        places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
+        shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
+        whole = SceneGrid(f"{grid['crs']}", **places, shape=shape, first=first, name=f"{grid['name']}")
+        return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
+
+
+def _number(value: object) -> float:
+    if not isinstance(value, int | float):
+        raise TypeError(f"{quoted(value)} is no number")
+    return float(value)
 
 
 def open_scene(campaign: Campaign) -> OpenScene:

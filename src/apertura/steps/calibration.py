@@ -1,6 +1,5 @@
 """Rule `calibrate`: path offsets of a flight's pairs, from a reflector at a known place."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import xarray as xr
 
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
+from apertura.documents import DAMAGED, read_json, undamaged
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
@@ -48,7 +48,10 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
     path = campaign.root / campaign.calibration_file(asked.flight)
-    offsets = json.loads(path.read_text(encoding="utf-8"))["pairs"]
+    expected = "what step calibrate writes"
+    document = read_json(path, expected=expected, remedy="Run the workflow.")
+    with undamaged(path, expected=expected, remedy=DAMAGED):
+        offsets = {name: _taken(offset) for name, offset in document["pairs"].items()}
     if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",
@@ -56,7 +59,18 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
             expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(offsets)}",
             remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
         )
-    return {"flight": asked.flight, **{name: offsets[pair][name] for name in ("offset_m", "std_m", "inputs", "flags")}}
+    return {"flight": asked.flight, **offsets[pair]}
+
+
+def _taken(offset: dict[str, Any]) -> dict[str, Any]:
+    """Return what is taken of a pair's report; raise an error that says what is wrong with it."""
+    std_m = offset["std_m"]
+    return {
+        "offset_m": float(offset["offset_m"]),
+        "std_m": None if std_m is None else float(std_m),
+        "inputs": {str(role): str(digest) for role, digest in offset["inputs"].items()},
+        "flags": {str(name): str(text) for name, text in offset["flags"].items()},
+    }
 
 
 def _asked(campaign: Campaign) -> Calibration:

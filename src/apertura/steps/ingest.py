@@ -9,6 +9,7 @@ from apertura.errors import CampaignError
 from apertura.ingest import open_recording, read_track
 from apertura.ingest.recording import Recording
 from apertura.load.transmitted import read_framing, symbol_samples
+from apertura.paths import inside
 from apertura.provenance import sha256_file
 from apertura.settings import OfdmWaveform
 from apertura.steps.stamping import stamped
@@ -32,7 +33,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
         dataset, settings = recording.cut(recording.captures, node=node), {}
     else:
         dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
-        files.append(campaign.root / recording.framing["preamble"])
+        files.append(_preamble(recording, campaign))
     inputs = _hashes(campaign, *files)
     raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=inputs)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
@@ -49,7 +50,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     if not isinstance(waveform, OfdmWaveform):
         raise TypeError("a recording of samples needs an OFDM waveform")
     framing = read_framing(
-        campaign.root / described["preamble"],
+        _preamble(recording, campaign),
         described,
         sample_rate_hz=recording.sample_rate_hz,
         where=recording.files[0],
@@ -67,6 +68,12 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
         )
     dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
     return dataset.assign_attrs(trigger=captures.report)
+
+
+def _preamble(recording: Recording, campaign: Campaign) -> Path:
+    """Return the file of chips that the recorder's metadata name, which must lie in the campaign."""
+    name = (recording.framing or {})["preamble"]
+    return inside(campaign.root, name, where=f"{recording.files[0]}: apertura:framing.preamble")
 
 
 def _hashes(campaign: Campaign, *files: Path) -> dict[str, str]:
