@@ -1,49 +1,20 @@
-"""From a YAML document to a validated value, or to the one message that says all that is wrong with it."""
+"""From a document to a validated value, or to the one message that says all that is wrong with it."""
 
 import difflib
 import re
-from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ArgsKwargs
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, quoted
 
 T = TypeVar("T")
 
 _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
 """What pydantic adds to the way to a key where it may hold one of several types."""
 
-
-def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
-    """Return the document in a YAML file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    expected, remedy
-        What the message says where there is no such file.
-
-    Raises
-    ------
-    CampaignError
-        If it is not there or is not YAML.
-    """
-    if not path.is_file():
-        raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
-    try:
-        document: object = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CampaignError(
-            f"not readable as YAML ({' '.join(str(error).split())})",
-            where=path,
-            expected="YAML",
-            remedy="Correct the line named.",
-        ) from error
-    return document
+_MOST_COMPLAINTS = 12
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
@@ -67,18 +38,22 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     try:
         return adapter.validate_python(document)
     except ValidationError as error:
-        schema = adapter.json_schema()
-        wrong: dict[str, list[str]] = {}
-        for item in error.errors(include_url=False):
-            key, line = _complaint(dict(item), schema)
-            wrong.setdefault(key, []).append(line)
-        lines = [f"{key}: {' or '.join(complaints)}" for key, complaints in wrong.items()]
-        raise CampaignError(
-            "; ".join(sorted(lines, key=lambda line: "unknown key" not in line)),
-            where=where,
-            expected=expected,
-            remedy="Correct what is named.",
-        ) from error
+        found = _complaints(error, adapter.json_schema())
+        raise CampaignError(found, where=where, expected=expected, remedy="Correct what is named.") from error
+    except ArithmeticError as error:  # of numbers that are each allowed and not together
+        found = f"numbers too large or small to calculate with ({error})"
+        raise CampaignError(found, where=where, expected=expected, remedy="Correct the wildest.") from error
+
+
+def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
+    wrong: dict[str, list[str]] = {}
+    for item in error.errors(include_url=False, include_context=False)[: 10 * _MOST_COMPLAINTS]:
+        key, line = _complaint(dict(item), schema)
+        wrong.setdefault(quoted(key)[1:-1], []).append(line)
+    lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
+    lines.sort(key=lambda line: "unknown key" not in line)
+    more = len(lines) - _MOST_COMPLAINTS
+    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
@@ -91,7 +66,7 @@ def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":
         return key, "missing"
-    shown = "" if isinstance(item["input"], dict | BaseModel | ArgsKwargs) else f" (found {item['input']!r})"
+    shown = "" if isinstance(item["input"], dict | BaseModel | ArgsKwargs) else f" (found {quoted(item['input'])})"
     return key, f"{item['msg'].removeprefix('Value error, ')}{shown}"
 
 

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.io import loadmat
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
+from apertura.ingest.isolated import UnreadableError, read_isolated
+
+_LARGEST = {"fp": 1e30, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7}
+"""What a field may hold: samples whose squares float32 still adds, Hz, m."""
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 
@@ -35,14 +38,15 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     Source: C. H. Casteel et al., "A challenge problem for 2D/3D imaging of targets from a volumetric data set in an
     urban environment", Proc. SPIE 6568, 2007, and the data set's read-me.
     """
-    passes = [_read(path) for path in sorted(paths)]
+    paths = sorted(paths)
+    passes = _read(paths)
     first = passes[0]["freq"]
-    for path, fields in zip(sorted(paths), passes, strict=True):
+    for path, fields in zip(paths, passes, strict=True):
         if fields["freq"].shape != first.shape or np.ptp(fields["freq"] - first) > 1e-6 * first[0]:
             raise _error("other frequencies than the first file", path)
     antenna = np.concatenate([np.stack([f["x"], f["y"], f["z"]], -1) for f in passes])
     reference = 2 * np.concatenate([f["r0"] for f in passes]) / SPEED_OF_LIGHT_M_S
-    transfer = np.concatenate([f["fp"].T for f in passes]).astype(np.complex64)
+    transfer = np.concatenate([f["fp"].T for f in passes])
     pulses = np.arange(len(transfer))
     return xr.Dataset(
         {
@@ -50,7 +54,7 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
             "tx_position": (("pulse", "axis"), antenna),
             "rx_position": (("pulse", "axis"), antenna.copy()),
             "transfer": (("pulse", "subcarrier"), transfer),
-            "frequency": ("subcarrier", _even(first, sorted(paths)[0])),
+            "frequency": ("subcarrier", _even(first, paths[0])),
             "reference_delay": ("pulse", reference),
             "path_limit": ("pulse", np.full(len(pulses), np.inf)),
         },
@@ -58,32 +62,41 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     )
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]]:
+def _read(paths: Sequence[Path]) -> list[dict[str, NDArray[Any]]]:
     try:
-        data = loadmat(path, squeeze_me=True, struct_as_record=False)["data"]
-        fields = {name: np.asarray(getattr(data, name)) for name in ("fp", "freq", "x", "y", "z", "r0")}
-    except Exception as error:  # loadmat raises many kinds for a file that is not one
-        raise _error(f"not readable ({str(error).splitlines()[0]})", path) from error
-    fields |= {name: np.atleast_1d(fields[name]).astype(np.float64) for name in ("freq", "x", "y", "z", "r0")}
-    if fields["fp"].shape != (fields["freq"].size, fields["x"].size):
+        passes = read_isolated("apertura.ingest.mat_fields:read_fields", paths)
+    except UnreadableError as error:
+        raise _error(f"not readable ({error})", error.path) from error
+    for path, fields in zip(paths, passes, strict=True):
+        _check(fields, path)
+    return passes
+
+
+def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
+    size = fields["x"].size
+    if fields["fp"].shape != (fields["freq"].size, size) or any(fields[name].size != size for name in ("y", "z", "r0")):
         raise _error(
-            f"fp is {fields['fp'].shape} for {fields['freq'].size} frequencies, {fields['x'].size} pulses", path
+            f"fp is {fields['fp'].shape} for {fields['freq'].size} frequencies, {size} pulses (y "
+            f"{fields['y'].size}, z {fields['z'].size}, r0 {fields['r0'].size})",
+            path,
         )
     for name, values in fields.items():
         bad = np.argwhere(~np.isfinite(values))
         if bad.size:
             raise _error(f"{name} is not a number at index {bad[0].tolist()} ({len(bad)} in all)", path)
+        largest = float(np.abs(values).max())
+        if largest > _LARGEST[name]:
+            raise _error(f"{name} reaches {largest:.3g}", path)
     silent = np.flatnonzero(~fields["fp"].any(axis=0))
     if silent.size:
         raise _error(f"pulse {int(silent[0])} holds only zeros ({silent.size} in all)", path)
-    return fields
 
 
 def _even(frequency: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     """Return equal steps through `frequency`, which the files round to float32."""
     even = np.linspace(frequency[0], frequency[-1], frequency.size)
-    step = even[1] - even[0]
-    if step <= 0 or np.abs(even - frequency).max() > 1e-2 * step:
+    step = even[1] - even[0] if even.size > 1 else 0.0
+    if step <= 0 or frequency[0] <= 0 or np.abs(even - frequency).max() > 1e-2 * step:
         raise _error("frequencies that do not rise in equal steps", path)
     return even
 

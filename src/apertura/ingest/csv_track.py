@@ -7,7 +7,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, quoted
+from apertura.ingest.tables import numbers, read_table
 from apertura.ingest.track import FIXES, make_track
 
 _POSITION = ["latitude_deg", "longitude_deg", "height_m"]
@@ -28,27 +29,28 @@ def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
         If a column is missing or a cell is not a number or a time.
     """
     try:
-        table = pd.read_csv(path, skipinitialspace=True)
-        missing = [name for name in ("time_utc", *_POSITION) if name not in table.columns]
-        if missing:
-            raise ValueError(f"no column {missing[0]} among {list(table.columns)}")
-        time = pd.to_datetime(table["time_utc"], utc=True, format="ISO8601").dt.tz_localize(None).to_numpy()
-        geodetic = table[_POSITION].to_numpy(np.float64)
+        table = read_table(path, ("time_utc", *_POSITION), optional=(*_ATTITUDE, *_STD, "quality"))
+        time = (
+            pd.to_datetime(table["time_utc"], utc=True, format="ISO8601")
+            .dt.tz_localize(None)
+            .dt.as_unit("ns")
+            .to_numpy()
+        )
+        geodetic = numbers(table[_POSITION])
         attitude, std = (
-            table[names].to_numpy(np.float64) if set(names) <= set(table.columns) else None
-            for names in (_ATTITUDE, _STD)
+            numbers(table[names]) if set(names) <= set(table.columns) else None for names in (_ATTITUDE, _STD)
         )
         fix = _fix(table["quality"]) if "quality" in table else None
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, ArithmeticError) as error:
         raise CampaignError(
-            str(error).splitlines()[0],
+            str(error).partition("\n")[0],
             where=path,
             expected=f"columns time_utc (ISO 8601), {', '.join(_POSITION)}, optionally {', '.join(_ATTITUDE)}, "
             f"{', '.join(_STD)}, quality ({', '.join(FIXES)}, or their numbers 1 to 6)",
             remedy="Correct the log or export it again.",
         ) from error
     return make_track(
-        time.astype("datetime64[ns]"),
+        time,
         geodetic,
         attitude_deg=attitude,
         position_std_m=std,
@@ -64,5 +66,5 @@ def _fix(quality: "pd.Series[str]") -> NDArray[np.int8]:
     words = quality.map(lambda cell: "" if pd.isna(cell) else str(cell).strip().lower().removesuffix(".0"))
     unknown = words[~words.isin(numbers)]
     if len(unknown):
-        raise ValueError(f"quality {unknown.iloc[0]!r}")
+        raise ValueError(f"quality {quoted(unknown.iloc[0])}")
     return np.array([numbers[word] for word in words], np.int8)

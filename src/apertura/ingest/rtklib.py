@@ -7,11 +7,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.constants import GPS_UTC_LEAP_S
-from apertura.errors import CampaignError
+from apertura.documents import read_text
+from apertura.errors import CampaignError, quoted
+from apertura.ingest.tables import LARGEST_LOG, number
+from apertura.ingest.times import utc_times
 from apertura.ingest.track import make_track
 
 _GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
 _QUALITY = ("Q", "sdn(m)", "sde(m)", "sdu(m)")
+_LAST_WEEK, _WEEK_S = 11_000, 604_800
+_EXPECTED = "an RTKLIB solution in lat/lon/ellipsoidal height whose header says GPST or UTC"
+_REMEDY = "Export the solution with these output settings."
 _LEAP_SINCE = np.datetime64("2017-01-01", "ns")
 
 
@@ -31,27 +37,27 @@ def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
     -----
     Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
     """
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2).splitlines()
     columns = _columns([line for line in lines if line.startswith("%")], path)
     gpst = columns[0] == "GPST"
     quality = [columns.index(name) + 1 for name in _QUALITY if name in columns]  # a time is two cells
     quality = quality if len(quality) == len(_QUALITY) else quality[:1]
-    rows = [(number, line.split()) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "%"]
+    rows = ((line, text.split()) for line, text in enumerate(lines, 1) if text.strip() and text[0] != "%")
     times, geodetic, stated = [], [], []
-    for number, cells in rows:
+    for line, cells in rows:
         try:
             times.append(_time(cells[0], cells[1]))
-            geodetic.append([float(cell) for cell in cells[2:5]])
-            stated.append([float(cells[column]) if column < len(cells) else np.nan for column in quality])
+            geodetic.append([number(cell) for cell in cells[2:5]])
+            stated.append([number(cells[column]) if column < len(cells) else np.nan for column in quality])
         except (ValueError, IndexError) as error:
-            raise _error(f"line {number} is {' '.join(cells)[:60]!r}", path) from error
+            raise _error(f"line {line} is {quoted(' '.join(cells), 60)}", path) from error
         if len(geodetic[-1]) != 3:
-            raise _error(f"line {number} has {len(cells)} columns", path)
-    time = np.array(times, "datetime64[ns]")
+            raise _error(f"line {line} has {len(cells)} columns", path)
+    time = _times(times, path)
     return make_track(
         _utc(time, path) if gpst else time,
         np.array(geodetic).reshape(-1, 3),
-        fix=np.nan_to_num(np.array(stated)[:, 0]).astype(np.int8) if quality and times else None,
+        fix=_fix(np.array(stated)[:, 0], path) if quality and times else None,
         position_std_m=np.array(stated)[:, 1:] if len(quality) > 1 and times else None,
         node=node,
         where=path,
@@ -67,14 +73,37 @@ def _columns(header: list[str], path: Path) -> list[str]:
         raise _error("heights are geodetic (above a geoid)", path)
     names = columns.lstrip("% ").split()
     if names[0] not in {"GPST", "UTC"}:
-        raise _error(f"time system {names[0]!r}", path)
+        raise _error(f"time system {quoted(names[0])}", path)
     return names
 
 
-def _time(first: str, second: str) -> np.datetime64:
+def _time(first: str, second: str) -> str | np.datetime64:
+    """Return a calendar date as text, which costs less to read all at once, or what week and seconds say."""
     if "/" in first:
-        return np.datetime64(f"{first.replace('/', '-')}T{second}", "ns")
-    return _GPS_EPOCH + np.timedelta64(7 * int(first), "D") + np.timedelta64(round(float(second) * 1e9), "ns")
+        return f"{first.replace('/', '-')}T{second}"
+    week, seconds = int(number(first)), number(second)
+    if not (0 <= week <= _LAST_WEEK and 0 <= seconds < _WEEK_S and week == number(first)):
+        raise ValueError(f"week {first} and second {second}")
+    return _GPS_EPOCH + np.timedelta64(7 * week, "D") + np.timedelta64(round(seconds * 1e9), "ns")
+
+
+def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime64]:
+    dates = [place for place, time in enumerate(stated) if isinstance(time, str)]
+    times = np.array([np.datetime64("NaT") if isinstance(time, str) else time for time in stated], "datetime64[ns]")
+    try:
+        times[dates] = utc_times([time for time in stated if isinstance(time, str)])
+    except ValueError as error:
+        raise _error(str(error), path) from error
+    return times
+
+
+def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
+    """Return kinds of solution, 0 where the log says none."""
+    stated = np.nan_to_num(quality, nan=0.0)
+    wrong = np.flatnonzero(~np.isin(stated, range(10)))
+    if wrong.size:
+        raise _error(f"Q {stated[wrong[0]]:g} in solution {int(wrong[0])}", path)
+    return np.asarray(stated, np.int8)
 
 
 def _utc(time: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]:
@@ -87,6 +116,6 @@ def _error(found: str, path: Path) -> CampaignError:
     return CampaignError(
         found,
         where=path,
-        expected="an RTKLIB solution in lat/lon/ellipsoidal height whose header says GPST or UTC",
-        remedy="Export the solution with these output settings.",
+        expected=_EXPECTED,
+        remedy=_REMEDY,
     )

@@ -5,42 +5,55 @@ import than a recording to open.
 """
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
-from apertura.errors import CampaignError
+from apertura.documents import read_text
+from apertura.errors import CampaignError, quoted
 from apertura.ingest.recording import Captures, Recording
+from apertura.ingest.times import utc_times
 
 _DATATYPE = "ci16_le"
 _BYTES_PER_SAMPLE = 4  # of one channel: two int16
 
+LARGEST_META = 64_000_000
+"""Bytes of a metadata file: some 400 000 captures."""
+
+_EXPECTED = "SigMF metadata with one capture segment per trigger, ISO 8601 UTC in the core:datetime of each"
+
+Count = Annotated[int, Field(ge=0, le=1 << 40, strict=True)]
+"""Of samples, chips or bits."""
+
+Frequency = Annotated[float, Field(ge=-1e12, le=1e12)]
+
 
 class _Framing(BaseModel):
-    preamble: str
-    chip_samples: int
-    centre_hz: float
-    counter_bits: int
-    bit_chips: int
-    guard_samples: int
+    preamble: str = Field(min_length=1, max_length=200)
+    chip_samples: Annotated[int, Field(ge=1, le=1 << 20, strict=True)]
+    centre_hz: Frequency
+    counter_bits: Annotated[int, Field(ge=0, le=62, strict=True)]
+    bit_chips: Annotated[int, Field(ge=1, le=1 << 20, strict=True)]
+    guard_samples: Count
 
 
 class _Global(BaseModel):
     datatype: str = Field(alias="core:datatype")
     version: str = Field(alias="core:version")
-    sample_rate_hz: float = Field(alias="core:sample_rate", gt=0)
-    num_channels: int = Field(1, alias="core:num_channels", ge=1)
+    sample_rate_hz: float = Field(alias="core:sample_rate", gt=0, le=1e12)
+    num_channels: int = Field(1, alias="core:num_channels", ge=1, le=64, strict=True)
     sha512: str | None = Field(None, alias="core:sha512", pattern="^[0-9a-fA-F]{128}$")
-    channels: list[str] | None = Field(None, alias="apertura:channels")
+    channels: list[Annotated[str, Field(max_length=80)]] | None = Field(None, alias="apertura:channels")
     framing: _Framing | None = Field(None, alias="apertura:framing")
 
 
 class _Capture(BaseModel):
-    start: int = Field(alias="core:sample_start", ge=0)
+    start: Count = Field(alias="core:sample_start")
     datetime: str = Field(alias="core:datetime", pattern="Z$")
-    frequency_hz: float = Field(0.0, alias="core:frequency")
-    frame: int = Field(-1, alias="apertura:frame")
+    frequency_hz: Frequency = Field(0.0, alias="core:frequency")
+    frame: int = Field(-1, alias="apertura:frame", ge=-1, lt=1 << 62, strict=True)
 
 
 class _Meta(BaseModel):
@@ -82,36 +95,40 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
 
 
 def _read_meta(path: Path) -> _Meta:
+    remedy = "Correct the metadata or record again."
+    text = read_text(path, expected=_EXPECTED, remedy=remedy, largest=LARGEST_META)
     try:
-        meta = _Meta.model_validate_json(path.read_bytes())
+        meta = _Meta.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = error.errors(include_url=False, include_context=False)[0]
         key = ".".join(map(str, first["loc"]))
-        given = f", not {first['input']!r}" if isinstance(first["input"], (str, int, float)) and key else ""
+        given = f", not {quoted(first['input'])}" if isinstance(first["input"], (str, int, float)) and key else ""
         raise CampaignError(
             f"not valid SigMF: {f'{key}: ' if key else ''}{first['msg']}{given}",
             path,
-            "SigMF metadata with one capture segment per trigger, ISO 8601 UTC in the core:datetime of each",
-            "Correct the metadata or record again.",
+            _EXPECTED,
+            remedy,
         ) from error
     if meta.header.datatype != _DATATYPE:
-        raise CampaignError(f"core:datatype {meta.header.datatype}", path, _DATATYPE, "Convert the recording.")
+        raise CampaignError(f"core:datatype {quoted(meta.header.datatype)}", path, _DATATYPE, "Convert the recording.")
     return meta
 
 
 def _channels(header: _Global, path: Path) -> list[str]:
     names = ["radar", "sidelink"][: header.num_channels] if header.channels is None else header.channels
-    if len(names) != header.num_channels or "radar" not in names:
+    if len(names) != header.num_channels or "radar" not in names or len(set(names)) < len(names):
         raise CampaignError(
             f"apertura:channels {names} for core:num_channels {header.num_channels}",
             path,
-            "one name per channel, 'radar' among them",
+            "one name per channel, each its own, 'radar' among them",
             "Correct the metadata.",
         )
     return names
 
 
 def _map(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -> NDArray[np.int16]:
+    if not path.is_file():
+        raise CampaignError("no such file", path, f"the samples of {meta_path.name}", "Copy it there.")
     size, frame = path.stat().st_size, channels * _BYTES_PER_SAMPLE
     if size % frame or size == 0:
         raise CampaignError(
@@ -133,13 +150,13 @@ def _map(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -
 def _length(captures: list[_Capture], total: int, path: Path) -> int:
     lengths = np.diff([*(capture.start for capture in captures), total])
     length = int(np.median(lengths))
-    short = np.flatnonzero(lengths < length)
+    short = np.flatnonzero((lengths < length) | (lengths < 1))
     if short.size:
         pulse = int(short[0])
         raise CampaignError(
             f"capture {pulse} holds {lengths[pulse]} samples (the data end at sample {total})",
             path,
-            f"{length}, as most captures do",
+            f"{max(length, 1)}, as most captures do",
             "The data are truncated (copy them again) or core:sample_start is wrong.",
         )
     return length
@@ -147,7 +164,7 @@ def _length(captures: list[_Capture], total: int, path: Path) -> int:
 
 def _times(captures: list[_Capture], path: Path) -> NDArray[np.datetime64]:
     try:
-        tags = np.array([capture.datetime.removesuffix("Z") for capture in captures], "datetime64[ns]")
+        tags = utc_times([capture.datetime.removesuffix("Z") for capture in captures])
     except ValueError as error:
         raise CampaignError(
             f"core:datetime: {error}", path, "ISO 8601 UTC on every capture", "Write the time tags."

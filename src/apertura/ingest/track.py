@@ -8,9 +8,16 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import ecef_from_geodetic
+from apertura.ingest.times import outside
 
 FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
 """Kinds of solution by RTKLIB's numbers, Q."""
+
+LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
+"""Heights above the ellipsoid that an aircraft or a balloon logs."""
+
+_WIDEST_DEG = 1080.0
+_WORST_STD_M = 1e7
 
 
 def make_track(
@@ -32,8 +39,7 @@ def make_track(
     geodetic
         (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
     attitude_deg
-        (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; None where not logged.
-
+        (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None where not logged.
     position_std_m
         (epoch, 3) float64: standard deviations to north, east and up, metres, NaN where not logged; None: nowhere.
     fix
@@ -42,7 +48,7 @@ def make_track(
     Raises
     ------
     CampaignError
-        If times do not increase, a value is not finite, or a latitude is out of range.
+        If times do not increase, or a value is not finite or is none that a flight on Earth has.
 
     Examples
     --------
@@ -54,15 +60,17 @@ def make_track(
     if len(time_utc) < 2:
         raise CampaignError(f"{len(time_utc)} epochs", where, "at least two", "Export the whole log.")
     _check_times(time_utc, where)
-    bad = ~np.isfinite(geodetic).all(axis=1) | (np.abs(geodetic[:, 0]) > 90)
+    latitude, longitude, height = geodetic.T
+    bad = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (height >= LOWEST_M) & (height <= HIGHEST_M))
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         raise CampaignError(
             f"{int(bad.sum())} epochs without a position, first epoch {first}: {geodetic[first].tolist()}",
             where,
-            "finite latitude, longitude and ellipsoidal height",
+            f"finite latitude, longitude and ellipsoidal height, the height between {LOWEST_M:g} and {HIGHEST_M:g} m",
             "Drop those lines or export again.",
         )
+    _check_stated(attitude_deg, position_std_m, fix, where)
     attitude = np.full_like(geodetic, np.nan) if attitude_deg is None else np.radians(attitude_deg)
     quality = {
         name: (dims, values)
@@ -80,7 +88,36 @@ def make_track(
     )
 
 
+def _check_stated(
+    attitude_deg: NDArray[np.float64] | None,
+    position_std_m: NDArray[np.float64] | None,
+    fix: NDArray[np.int8] | None,
+    where: Path,
+) -> None:
+    """Raise CampaignError where a stated value is none that the log of a flight has; NaN says nothing."""
+    std, kinds = "a standard deviation", sorted(FIXES.values())
+    for name, values, low, high in (
+        ("an angle of attitude", attitude_deg, -_WIDEST_DEG, _WIDEST_DEG),
+        (std, position_std_m, 0.0, _WORST_STD_M),
+        ("a kind of solution", fix, 0, kinds[-1]),
+    ):
+        wrong = None if values is None else np.argwhere((values < low) | (values > high))
+        if values is not None and wrong is not None and wrong.size:
+            raise CampaignError(
+                f"{name} of {values[tuple(wrong[0])]:g} in epoch {int(wrong[0][0])}",
+                where,
+                f"{low:g} to {high:g}",
+                "Drop those lines or export again.",
+            )
+
+
 def _check_times(time_utc: NDArray[np.datetime64], where: Path) -> None:
+    beyond = outside(time_utc)
+    if beyond.size:
+        epoch = int(beyond[0])
+        raise CampaignError(
+            f"epoch {epoch} is at {time_utc[epoch]}", where, "times between 1980 and 2199", "Correct the log."
+        )
     steps = np.diff(time_utc)
     wrong = np.flatnonzero(steps <= np.timedelta64(0, "ns"))
     if wrong.size:

@@ -1,6 +1,5 @@
 """A campaign from Python: its flights and pairs, and what the workflow made of them, by name."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
 from apertura.contracts import STAGES
+from apertura.documents import read_json
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
 from apertura.store import open_document, open_stage
@@ -79,12 +79,7 @@ class OpenCampaign:
         known = (*self.campaign.flight(flight).pairs, "fused")
         _check_name(pair, "pair", known, where=f"campaign.report({flight!r})")
         path = self.campaign.results / flight / pair / "image.json"
-        if not path.is_file():
-            raise CampaignError(
-                "no such file", where=path, expected="the report of an image", remedy="Run the workflow first."
-            )
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return document
+        return read_json(path, expected="the report of an image", remedy="Run the workflow first.")
 
     def flags(self, flight: str, pair: str) -> dict[str, str]:
         """Return the limits that an image exceeds: name → what was measured, in one line."""

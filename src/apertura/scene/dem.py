@@ -13,6 +13,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
 from apertura.scene.geoid import undulation
 from apertura.scene.grid import SceneGrid
+from apertura.scene.raster import opened_raster
 from apertura.scene.terrain import Terrain, bilinear
 
 LATTICE_M = 50.0
@@ -24,7 +25,11 @@ COVER_NODES = 129
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Land on Earth lies between (Dead Sea −430 m, Everest 8849 m), above whichever datum."""
 
+MOST_POSTS = 100_000_000
+"""Posts of a DEM that are held in memory at once."""
+
 _TILE_PX = 512
+_EXPECTED = "the raster that was opened before"
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +41,7 @@ class Dem(Terrain):
     Attributes
     ----------
     path
-        A raster that GDAL reads; band 1 holds heights.
+        A GeoTIFF; band 1 holds heights.
     shape
         Rows and columns of the raster.
     pixel_from_map
@@ -148,11 +153,18 @@ class Dem(Terrain):
             [int(np.clip(np.floor(by(axis)), 0, size - 2)) for axis, size in zip(at, self.shape, strict=True)]
             for by in (np.min, np.max)
         )
-        import rasterio
         from rasterio.windows import Window
 
-        with rasterio.open(self.path) as raster:
-            window = Window.from_slices(*((low, high + 2) for low, high in zip(first, last, strict=True)))
+        counts = [high + 2 - low for low, high in zip(first, last, strict=True)]
+        if counts[0] * counts[1] > MOST_POSTS:
+            raise CampaignError(
+                f"{counts[0]} × {counts[1]} posts under {row.shape[0]} × {row.shape[1]} pixels",
+                where=self.path,
+                expected=f"at most {MOST_POSTS} posts at once",
+                remedy="Warp the DEM to a spacing near that of the scene with a GIS.",
+            )
+        with opened_raster(self.path, expected=_EXPECTED, remedy="Copy the DEM again.") as raster:
+            window = Window(first[1], first[0], counts[1], counts[0])
             posts = raster.read(1, window=window, masked=True)
             posts = posts.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
         posts *= self.metres_per_unit

@@ -1,15 +1,20 @@
 """A DEM file opened: where its posts lie and what its heights count from, or what is wrong with it."""
 
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 from pyproj import CRS
+from pyproj.exceptions import CRSError
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, shown
 from apertura.geometry.geodesy import LOCAL
 from apertura.scene.dem import Dem
 from apertura.scene.geoid import carried_datum, geoid_file, grid_names
 from apertura.scene.grid import SceneGrid
+from apertura.scene.raster import opened_raster
+
+_EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
+_REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
 
 
 def open_dem(
@@ -20,7 +25,7 @@ def open_dem(
     Parameters
     ----------
     path
-        A raster that GDAL reads, heights in band 1.
+        A GeoTIFF, heights in band 1; files beside it (.aux.xml, .ovr, .tfw) count for nothing.
     scene
         The grid that the DEM must reach over; or the CRS alone, what pyproj reads or 'local', of whatever grid is read.
     datum
@@ -58,12 +63,7 @@ def open_dem(
 
 
 def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
-    with _opened(path) as raster:
-        inverse, shape, unit = ~raster.transform, raster.shape, (raster.units[0] or "metre").lower()
-        system = CRS.from_user_input(raster.crs) if raster.crs else None
-    if min(shape) < 2:
-        raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")
-    pixel_from_map = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
+    pixel_from_map, shape, unit, system = _header(path)
     if crs == LOCAL:
         if system is not None and (system.is_geographic or system.is_projected):
             raise _wrong(path, f"CRS {system.name} under a scene in the local frame", "a DEM in the frame's own axes")
@@ -83,17 +83,31 @@ def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
     return Dem(path, shape, pixel_from_map, horizontal.to_wkt(), geodetic.to_wkt(), undulations, metres)
 
 
-def _opened(path: Path) -> Any:
-    if not path.is_file():
-        raise CampaignError(
-            "no such file", where=path, expected="the DEM of scene.dem", remedy="Copy it there, or correct scene.dem."
+def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | None]:
+    """Return (x, y) → (column, row), rows and columns, unit of the heights and CRS."""
+    with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
+        shape, unit, place, kind = (
+            raster.shape,
+            (raster.units[0] or "metre").lower(),
+            raster.transform,
+            raster.dtypes[0],
         )
-    import rasterio
-
-    try:
-        return rasterio.open(path)
-    except rasterio.errors.RasterioIOError as error:
-        raise _wrong(path, f"not readable ({error})", "a raster that GDAL reads") from error
+        try:
+            system = CRS.from_user_input(raster.crs) if raster.crs else None
+        except CRSError as error:
+            raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
+    if min(shape) < 2:
+        raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")
+    if not np.issubdtype(np.dtype(kind), np.integer) and not np.issubdtype(np.dtype(kind), np.floating):
+        raise _wrong(path, f"heights of type {kind}", "integers or floating-point numbers")
+    sides = (float(np.hypot(place.a, place.d)), float(np.hypot(place.b, place.e)))
+    if not np.isfinite(place[:6]).all() or abs(place.determinant) <= 1e-9 * sides[0] * sides[1]:
+        raise _wrong(path, f"a degenerate transform {[float(value) for value in place[:6]]}", "pixels with an area")
+    inverse = ~place
+    coefficients = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
+    if not np.isfinite(coefficients).all():
+        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels that can be told apart")
+    return coefficients, shape, unit, system
 
 
 def _wrong(path: Path, found: str, expected: str) -> CampaignError:
@@ -101,7 +115,7 @@ def _wrong(path: Path, found: str, expected: str) -> CampaignError:
         found,
         where=path,
         expected=expected,
-        remedy="Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum).",
+        remedy=_REMEDY,
     )
 
 

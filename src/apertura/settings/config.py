@@ -6,6 +6,7 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from apertura import validation
+from apertura.documents import read_yaml
 from apertura.settings.nodes import Node
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
@@ -53,7 +54,7 @@ def read_settings(path: Path) -> Settings:
         If it is not there, is not YAML, or `validated` refuses it.
     """
     remedy = "`apertura init` writes a commented one."
-    return validated(validation.read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
+    return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
 
 
 def located(message: str) -> str:

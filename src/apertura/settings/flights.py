@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, quoted
 from apertura.settings.config import CONFIG
 from apertura.settings.section import Name
 from apertura.settings.table import table_rows
@@ -70,12 +70,12 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
     except ValidationError as error:
         problem = error.errors()[0]["msg"].removeprefix("Value error, ")
     if cells["kind"] not in {"image", "calibration"}:
-        problem = f"kind {cells['kind']!r} is neither image nor calibration"
+        problem = f"kind {quoted(cells['kind'])} is neither image nor calibration"
     unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
     if unknown:
-        problem = f"node {unknown[0]!r} is not in {CONFIG}: nodes"
+        problem = f"node {quoted(unknown[0])} is not in {CONFIG}: nodes"
     if not nodes or len(set(nodes)) != len(nodes):
-        problem = f"nodes {cells['nodes']!r} are none or doubled"
+        problem = f"nodes {quoted(cells['nodes'])} are none or doubled"
     if problem:
         raise CampaignError(
             problem,

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, quoted
 from apertura.settings.flights import FLIGHTS, Flight
 from apertura.settings.table import table_rows
 
 SEGMENTS = Path("config/segments.tsv")
+_FIRST_YEAR, _LAST_YEAR = 1980, 2199
 _COLUMNS = ["flight", "pair", "start", "end"]
 
 
@@ -50,14 +51,14 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
     for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per segment."):
         problem, expected = None, "flight, pair, start and end in UTC such as 2025-05-14T09:30:00.5"
         if cells["flight"] not in pairs:
-            problem, expected = f"flight {cells['flight']!r} is not in {FLIGHTS}", f"one of {', '.join(pairs)}"
+            problem, expected = f"flight {quoted(cells['flight'])} is not in {FLIGHTS}", f"one of {', '.join(pairs)}"
         elif cells["pair"] not in pairs[cells["flight"]]:
-            problem = f"flight {cells['flight']} has no pair {cells['pair']!r}"
+            problem = f"flight {cells['flight']} has no pair {quoted(cells['pair'])}"
             expected = f"one of {', '.join(pairs[cells['flight']])}"
         start, end = (_utc(cells[name]) for name in ("start", "end"))
         for name, time in (("start", start), ("end", end)):
             if not problem and time is None:
-                problem = f"{name} {cells[name]!r} is no time"
+                problem = f"{name} {quoted(cells[name])} is no time"
         if not problem and start is not None and end is not None and start >= end:
             problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before its end"
         if problem or start is None or end is None:
@@ -69,6 +70,7 @@ def _utc(text: str) -> datetime | None:
     """Return a time in UTC; one without time zone is UTC already. None if the text is no time."""
     try:
         time = datetime.fromisoformat(text)
-    except ValueError:
+        time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
+    except (ValueError, OverflowError):
         return None
-    return time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
+    return time if _FIRST_YEAR <= time.year <= _LAST_YEAR else None

@@ -1,10 +1,15 @@
 """Tab-separated tables of the config: a heading, then one line per row."""
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from apertura.errors import CampaignError
+from apertura.documents import read_text
+from apertura.errors import CampaignError, quoted
+
+LARGEST_TABLE = 1_000_000
+"""Bytes of a table of the config."""
 
 
 def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[tuple[str, dict[str, str]]]:
@@ -22,20 +27,27 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
     Raises
     ------
     CampaignError
-        If the file is not there or has other columns.
+        If the file is not there, is not UTF-8, or has other columns.
     """
-    if not path.is_file():
+    listed = f"a tab-separated table {list(columns)}"
+    text = read_text(path, expected=listed, remedy=remedy, largest=LARGEST_TABLE)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter="\t", strict=True)
+    heading = None
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if heading is None:
+                heading = cells
+                if cells != list(columns):
+                    raise CampaignError(f"columns {quoted(cells, 300)}", path, listed, "Correct the heading.")
+            elif len(cells) > len(columns):
+                found = f"{len(cells)} cells, the last {quoted(cells[-1])}"
+                raise CampaignError(found, f"{path}: line {rows.line_num}", listed, "Correct the line.")
+            elif row:
+                yield f"{path}: line {rows.line_num}", dict(zip(columns, cells + [""] * len(columns), strict=False))
+    except csv.Error as error:
         raise CampaignError(
-            "no such file", where=path, expected=f"a tab-separated table {list(columns)}", remedy=remedy
-        )
-    with path.open(encoding="utf-8", newline="") as lines:
-        table = csv.DictReader(lines, delimiter="\t")
-        if table.fieldnames is None or [name.strip() for name in table.fieldnames] != list(columns):
-            raise CampaignError(
-                f"columns {table.fieldnames}",
-                where=path,
-                expected=f"{list(columns)}, tab-separated",
-                remedy="Correct it.",
-            )
-        for number, row in enumerate(table, start=2):
-            yield f"{path}: line {number}", {key: (row.get(key) or "").strip() for key in columns}
+            f"not readable as a table ({error})", f"{path}: line {rows.line_num}", listed, "Correct the line."
+        ) from error
+    if heading is None:
+        raise CampaignError("an empty file", path, listed, remedy)

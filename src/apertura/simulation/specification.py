@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
+from apertura.documents import read_yaml
 from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
@@ -20,7 +21,7 @@ from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelNa
 from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
-from apertura.validation import read_yaml, validated
+from apertura.validation import validated
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
 

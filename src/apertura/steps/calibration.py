@@ -55,7 +55,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
             expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(offsets)}",
             remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
         )
-    return {"flight": asked.flight, **{name: offsets[pair][name] for name in ("offset_m", "std_m", "inputs", "flags")}}
+    return {"flight": asked.flight, **offsets[pair]}
 
 
 def _asked(campaign: Campaign) -> Calibration:

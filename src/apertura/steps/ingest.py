@@ -10,6 +10,7 @@ from apertura.ingest import open_recording, read_track
 from apertura.ingest.recording import Recording
 from apertura.lineage import result_of
 from apertura.load.transmitted import read_framing, symbol_samples
+from apertura.paths import inside
 from apertura.settings import OfdmWaveform
 from apertura.steps.stamping import stamped
 from apertura.store import save_stage
@@ -28,8 +29,10 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     track = stamped(log, "track", modules=[__name__], inputs=logged.sources.digests)
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash()
-    preamble = () if recording.framing is None else (recording.framing["preamble"],)
-    recorded = result_of(campaign, "raw", flight, node).begin(campaign.root, [__name__], further=preamble)
+    preamble = () if recording.framing is None else (_preamble(recording, campaign),)
+    recorded = result_of(campaign, "raw", flight, node).begin(
+        campaign.root, [__name__], further=[campaign.relative(path) for path in preamble]
+    )
     if recording.framing is None:
         dataset, settings = recording.cut(recording.captures, node=node), {}
     else:
@@ -49,7 +52,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     if not isinstance(waveform, OfdmWaveform):
         raise TypeError("a recording of samples needs an OFDM waveform")
     framing = read_framing(
-        campaign.root / described["preamble"],
+        _preamble(recording, campaign),
         described,
         sample_rate_hz=recording.sample_rate_hz,
         where=recording.files[0],
@@ -67,3 +70,9 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
         )
     dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
     return dataset.assign_attrs(trigger=captures.report)
+
+
+def _preamble(recording: Recording, campaign: Campaign) -> Path:
+    """Return the file of chips that the recorder's metadata name, which must lie in the campaign."""
+    name = (recording.framing or {})["preamble"]
+    return inside(campaign.root, name, where=f"{recording.files[0]}: apertura:framing.preamble")

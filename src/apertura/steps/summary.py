@@ -1,10 +1,10 @@
 """`apertura summary`: what every image of a finished campaign says of itself, in one table with its flags below."""
 
-import json
 from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
+from apertura.documents import DAMAGED, read_json, undamaged
+from apertura.errors import shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -40,10 +40,10 @@ def print_summary(campaign: Campaign) -> None:
 
 def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
     path = campaign.results / flight / name / "image.json"
-    if not path.is_file():
-        raise CampaignError("no such file", path, "a finished campaign", "Run the workflow first.")
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
+    report = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
+    with undamaged(path, expected="the report of an image", remedy=DAMAGED):
+        flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
+        return {**report, "flags": flags, "numerical_error_db": float(report["numerical_error_db"])}
 
 
 def _table(reports: dict[tuple[str, str], dict[str, Any]]) -> "Table":

@@ -1,6 +1,5 @@
 """Found against put: every point target of truth.json, in the GeoTIFFs a user would open."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from apertura.campaign import Campaign
+from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.export import product_files
 from apertura.load.scene import settled_scene
@@ -51,11 +51,10 @@ def verify(campaign: Campaign) -> list[Finding]:
         If the campaign has no truth.json or no results.
     """
     path = campaign.root / "truth.json"
-    if not path.is_file():
-        raise CampaignError(
-            "no such file", where=path, expected="true target places", remedy="Only simulated campaigns have them."
-        )
-    targets = json.loads(path.read_text(encoding="utf-8"))["targets"]
+    expected, remedy = "true target places", "Only simulated campaigns have them."
+    document = read_json(path, expected=expected, remedy=remedy)
+    with undamaged(path, expected=expected, remedy=remedy):
+        targets = [{name: float(target[name]) for name in ("x", "y")} for target in document["targets"]]
     return [finding for flight in campaign.image_flights for finding in _flight(campaign, flight, targets)]
 
 

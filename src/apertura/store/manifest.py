@@ -1,11 +1,11 @@
 """The manifest of a result: hashes of its files and what it was made from; written last, checked when it is opened."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from apertura.atomic import write_json
+from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.provenance import sha256_file, sha256_tree
 
@@ -51,18 +51,12 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     CampaignError
         If it is no manifest.
     """
-    try:
-        document: dict[str, Any] = json.loads(manifest.read_text(encoding="utf-8"))
-        hashes = [*document["files"].items(), *document.get("sources", {}).items()]
-        if not all(isinstance(text, str) for pair in hashes for text in pair):
-            raise ValueError("hashes that are no text")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise CampaignError(
-            f"no manifest ({str(error)[:80]})",
-            where=manifest,
-            expected="what the workflow wrote",
-            remedy=f"Delete {manifest} and run the workflow again.",
-        ) from error
+    expected, remedy = "a manifest as the workflow wrote it", f"Delete {manifest} and run the workflow again."
+    document = read_json(manifest, expected=expected, remedy=remedy)
+    with undamaged(manifest, expected=expected, remedy=remedy):
+        for hashes in (document["files"], document.get("sources", {})):
+            if not all(isinstance(text, str) for pair in hashes.items() for text in pair):
+                raise TypeError("a hash that is no text")
     return document
 
 
@@ -124,5 +118,4 @@ def open_document(path: Path) -> dict[str, Any]:
         If it is missing, or is not what the manifest describes.
     """
     check_files(path)
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
+    return read_json(path, expected="a result of the workflow", remedy="Run the workflow.")
