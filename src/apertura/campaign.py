@@ -6,6 +6,7 @@ from typing import Any
 
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS
+from apertura.paths import inside
 from apertura.settings import (
     CONFIG,
     FLIGHTS,
@@ -42,9 +43,10 @@ class Campaign:
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
         root = Path(root)
-        settings = read_settings(root / CONFIG)
-        flights = tuple(read_flights(root / FLIGHTS, nodes=settings.nodes))
-        return cls(root, settings, flights, tuple(read_segments(root / SEGMENTS, flights=flights)))
+        config, table, segments = (inside(root, path.as_posix(), where=root) for path in (CONFIG, FLIGHTS, SEGMENTS))
+        settings = read_settings(config)
+        flights = tuple(read_flights(table, nodes=settings.nodes))
+        return cls(root, settings, flights, tuple(read_segments(segments, flights=flights)))
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
@@ -64,28 +66,34 @@ class Campaign:
         >>> Campaign(Path("c"), None, ()).stage("echo", "f01", "uav1-uav2").as_posix()
         'c/results/f01/uav1-uav2/echo.zarr'
         """
-        return self.results.joinpath(*where, f"{stage}.zarr")
+        return self.result(*where, f"{stage}.zarr")
+
+    def result(self, *where: str) -> Path:
+        """Return results/<where…>; raise CampaignError if that leads through a link."""
+        return inside(self.root, "/".join(["results", *where]), where=self.root)
 
     def manifest(self, stage: str, *where: str) -> str:
         """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
         return "/".join(["results", *where, f"{stage}.manifest.json"])
 
+    def file(self, name: str, key: str) -> Path:
+        """Return a file that `key` of the config names; raise CampaignError unless it lies in the campaign folder."""
+        return inside(self.root, name, where=f"{CONFIG}: {key}")
+
+    @property
+    def codes_file(self) -> Path:
+        """The transmitted code symbols."""
+        return self.file(getattr(self.settings.waveform, "codes", ""), "waveform.codes")
+
     def relative(self, path: Path) -> str:
         """Return a path inside the campaign folder as the workflow names it."""
         return path.relative_to(self.root).as_posix()
 
-    def calibration_file(self, flight: str) -> str:
-        """Return where the path offsets of a calibration flight lie."""
-        return f"results/{flight}/calibration.json"
-
-    def assessment_file(self, flight: str) -> str:
-        """Return where it stands how the images of a flight agree."""
-        return f"results/{flight}/assessment.json"
-
     def height_files(self) -> dict[str, Path]:
         """Return role → file of the DEM and of the grid of the geoid, where the config names them."""
         scene = self.settings.scene
-        return {role: self.root / name for role, name in (("dem", scene.dem), ("geoid", scene.geoid)) if name}
+        named = {"dem": scene.dem, "geoid": scene.geoid}
+        return {role: self.file(name, f"scene.{role}") for role, name in named.items() if name}
 
     def antennas(self, pair: str) -> dict[str, tuple[str, Antenna]]:
         """Return which antennas of a pair have beams: radar_tx, radar_rx → node and antenna."""
@@ -95,11 +103,12 @@ class Campaign:
 
     def pattern_files(self, pair: str) -> dict[str, Path]:
         """Return key of the config → file of each sampled pattern of a pair's antennas."""
-        return {
-            f"nodes.{node}.antennas.{point}.pattern": self.root / antenna.pattern
+        named = {
+            f"nodes.{node}.antennas.{point}.pattern": antenna.pattern
             for point, (node, antenna) in self.antennas(pair).items()
             if antenna.pattern
         }
+        return {key: self.file(name, key) for key, name in named.items()}
 
     def segments_of(self, flight: str, pair: str) -> list[tuple[str, str]]:
         """Return start and end (UTC) of the parts of the track that image a pair; none: all of it."""
@@ -124,10 +133,10 @@ class Campaign:
                     remedy=f"Copy it there, or correct {key}.",
                 )
         waveform = self.settings.waveform
-        if isinstance(waveform, OfdmWaveform) and not (self.root / waveform.codes).is_file():
+        if isinstance(waveform, OfdmWaveform) and not self.codes_file.is_file():
             raise CampaignError(
                 "no such file",
-                where=self.root / waveform.codes,
+                where=self.codes_file,
                 expected=f"the transmitted code symbols, as {CONFIG}: waveform.codes",
                 remedy="Copy the file there.",
             )
@@ -179,9 +188,12 @@ class Campaign:
             )
         return flights[name]
 
+    def _recorded(self, flight: str, name: str) -> Path:
+        return inside(self.root, f"raw/{flight}/{name}", where=self.root)
+
     def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
         """Return raw/<flight>/<node><suffix>, which must exist."""
-        path = self.root / "raw" / flight / f"{node}{suffix}"
+        path = self._recorded(flight, f"{node}{suffix}")
         if not path.is_file():
             raise CampaignError(
                 "no such file",
@@ -212,7 +224,7 @@ class Campaign:
         """Return the one raw/<flight>/<node>.track.* file."""
         logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
         if len(logs) == 1:
-            return logs[0]
+            return self._recorded(flight, logs[0].name)
         raise CampaignError(
             f"{len(logs)} track files {[path.name for path in logs]}",
             where=self.root / "raw" / flight / f"{node}.track.*",
@@ -221,7 +233,8 @@ class Campaign:
         )
 
     def _history_files(self, flight: str, node: str, suffix: str) -> list[Path]:
-        files = sorted((self.root / "raw" / flight).glob(f"{node}.*{suffix}"))
+        found = sorted((self.root / "raw" / flight).glob(f"{node}.*{suffix}"))
+        files = [self._recorded(flight, path.name) for path in found]
         if not files:
             raise CampaignError(
                 "no such file",

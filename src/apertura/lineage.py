@@ -151,7 +151,7 @@ def _scene(campaign: Campaign) -> Result:
     asked, first = campaign.settings.scene, campaign.image_flights[0]
     settled_by_flight = "auto" in {asked.crs, asked.spacing_m, asked.bounds_m}
     echoes = [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if settled_by_flight else []
-    settings = campaign.relevant("scene")
+    settings = {**campaign.relevant("scene"), "campaign": campaign.settings.campaign}
     return Result(campaign.manifest("scene"), (*echoes, *_heights(campaign)), settings)
 
 

@@ -48,7 +48,16 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     stale = stale_results(campaign, paranoid=paranoid)
     forced = ["--forcerun", *stale] if stale else []  # in time for a dry run; the workflow says why
     folder = _workflow_folder()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(folder / "Snakefile"), "--directory", str(root)]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "snakemake",
+        "--snakefile",
+        str(folder / "Snakefile"),
+        "--directory",
+        str(root),
+    ]
     command += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores), *arguments, *forced]
     here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
     path = f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"

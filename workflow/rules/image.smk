@@ -19,7 +19,7 @@ rule scene:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        settings=campaign.relevant("scene"),
+        settings=result_of(campaign, "scene").settings,
         code=code_of("scene"),
     message:
         "settling the campaign's grid"

@@ -1,6 +1,7 @@
 """Antennas of a pair: from what the config states of them to the beams that weigh its pulses."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,13 +40,17 @@ def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float6
     stated = campaign.antennas(pair)
     if not stated:
         return None
-    found = {point: _beam(campaign, antenna, axes[point]) for point, (_, antenna) in stated.items()}
+    patterns = campaign.pattern_files(pair)
+    files = {point: patterns.get(f"nodes.{node}.antennas.{point}.pattern") for point, (node, _) in stated.items()}
+    found = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
     return Beams(found.get("radar_tx"), found.get("radar_rx"))
 
 
-def _beam(campaign: Campaign, antenna: Antenna, axes: NDArray[np.float64]) -> Beam:
+def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> Beam:
     if antenna.beamwidth_deg is None:
-        sampled = read_beam_pattern(campaign.root / str(antenna.pattern))
+        if pattern is None:
+            raise TypeError("an antenna has a beamwidth or a pattern")
+        sampled = read_beam_pattern(pattern)
         cuts = tuple(sampled_cut(*samples, cutoff_db=antenna.cutoff_db) for samples in sampled)
     else:
         widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)

@@ -1,5 +1,6 @@
 """The ground under a scene as the config states it: flat at a height, or a DEM, and the files that takes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,11 +41,11 @@ class Ground:
     crs: str
 
     @classmethod
-    def of(cls, asked: Scene, root: Path, *, crs: str) -> "Ground":
-        """Open what section `scene` names; paths count from the campaign folder."""
-        named = root / asked.geoid if asked.geoid else None
+    def of(cls, asked: Scene, files: Mapping[str, Path], *, crs: str) -> "Ground":
+        """Open what section `scene` names; `files` are those of `Campaign.height_files`."""
+        named = files.get("geoid")
         if asked.dem and asked.dem_datum:
-            dem = open_dem(root / asked.dem, crs, datum=asked.dem_datum, geoid=named)
+            dem = open_dem(files["dem"], crs, datum=asked.dem_datum, geoid=named)
             return cls(asked.height_m, dem, None, crs)
         geoid = None if asked.height_datum == "ellipsoid" else geoid_file(asked.height_datum, named)
         return cls(asked.height_m, None, geoid, crs)

@@ -78,7 +78,7 @@ class OpenCampaign:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
         known = (*self.campaign.flight(flight).pairs, "fused")
         _check_name(pair, "pair", known, where=f"campaign.report({flight!r})")
-        path = self.campaign.results / flight / pair / "image.json"
+        path = self.campaign.result(flight, pair, "image.json")
         return read_json(path, expected="the report of an image", remedy="Run the workflow first.")
 
     def flags(self, flight: str, pair: str) -> dict[str, str]:
@@ -135,4 +135,4 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
     CampaignError
         If it is not there as the step left it.
     """
-    return open_document(campaign.root / campaign.assessment_file(flight))
+    return open_document(campaign.result(flight, "assessment.json"))

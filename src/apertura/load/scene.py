@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,6 @@ from apertura.scene.dem import COVER_NODES, UncheckedDem
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, GridHeights, Terrain
 from apertura.store import manifest_of, open_array, open_document, open_stage
-
-PATH = Path("results/scene.json")
 
 Bounds = tuple[float, float, float, float]
 
@@ -95,7 +92,7 @@ def settled_scene(campaign: Campaign) -> OpenScene:
     CampaignError
         If the grid is not settled yet, or its file is damaged.
     """
-    document = open_document(campaign.root / PATH)
+    document = open_document(campaign.result("scene.json"))
     grid, level = document["grid"], FlatGround(document["height_m"])
     grid = SceneGrid(**{**grid, "shape": tuple(grid["shape"]), "first": tuple(grid["first"])})
     return OpenScene(grid, level, level, (), document["inputs"], document["chosen"])
@@ -118,7 +115,7 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
     `flown` gives what the first image flight flew; asked only where something is `auto`.
     """
     asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and manifest_of(campaign.root / PATH).is_file():
+    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and manifest_of(campaign.result("scene.json")).is_file():
         scene = settled_scene(campaign)
     else:
         grid, ground, chosen = settled(campaign, flown)
@@ -128,7 +125,7 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
         return scene
     if manifest_of(campaign.stage("terrain")).is_file():
         return open_scene(campaign)
-    dem = Ground.of(asked, campaign.root, crs=scene.grid.crs).dem
+    dem = Ground.of(asked, campaign.height_files(), crs=scene.grid.crs).dem
     return replace(scene, terrain=UncheckedDem(dem, scene.grid)) if dem else scene
 
 
@@ -146,7 +143,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
     if crs == "auto":
         crs, chosen["crs"] = utm_crs(_middle(flown())), "UTM zone of the first image flight"
-    ground = Ground.of(asked, campaign.root, crs=crs)
+    ground = Ground.of(asked, campaign.height_files(), crs=crs)
     height_m = None
     if bounds == "auto":
         bounds, height_m = _bounds(flown(), ground)

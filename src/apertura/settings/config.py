@@ -10,7 +10,7 @@ from apertura.documents import read_yaml
 from apertura.settings.nodes import Node
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
-from apertura.settings.section import Name, Section
+from apertura.settings.section import Name, Section, Title
 from apertura.settings.waveform import PhaseHistoryWaveform, Waveform
 
 CONFIG = Path("config/config.yaml")
@@ -20,7 +20,7 @@ CONFIG = Path("config/config.yaml")
 class Settings(Section):
     """config/config.yaml."""
 
-    campaign: str = Field(description="name of the campaign", examples=["my_campaign"])
+    campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
     waveform: Waveform = Field(description="what was transmitted")
     nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")

@@ -5,8 +5,16 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "benchmarks", "cube.zarr"})
+from apertura.errors import quoted
+
+RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "benchmarks", "tiles"})
 """Names of the results folder that no flight or node may take."""
+
+_RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt")
+"""What files of the results folder end in: scene.json, cube.manifest.json, cube.zarr …"""
+
+_LONGEST = 64
+_LONGEST_TITLE = 120
 
 Metres3 = tuple[float, float, float]
 
@@ -19,11 +27,25 @@ class Section(BaseModel):
 
 def _plain_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_.]+", name) or name.startswith("."):
-        raise ValueError(f"name {name!r}: only letters, digits, '_' and '.' may be used")
-    if name in RESERVED_NAMES:
+        raise ValueError(f"name {quoted(name)}: only letters, digits, '_' and '.' may be used")
+    if len(name) > _LONGEST:
+        raise ValueError(f"name of {len(name)} characters: at most {_LONGEST} may be used")
+    if name.lower() in RESERVED_NAMES or name.lower().endswith(_RESERVED_ENDS):
         raise ValueError(f"name {name!r} is taken by the results folder; choose another")
     return name
 
 
+def _title(text: str) -> str:
+    odd = next((one for one in text if not one.isprintable() or one in '"<>&\\'), None)
+    if odd is not None:
+        raise ValueError(f"{quoted(text)}: {quoted(odd)} may not be used: it becomes part of WKT, HTML and file tags")
+    if not 1 <= len(text.strip()) <= _LONGEST_TITLE:
+        raise ValueError(f"{len(text.strip())} characters: 1 to {_LONGEST_TITLE} may be used")
+    return text
+
+
 Name = Annotated[str, AfterValidator(_plain_name)]
 """Of a flight or a node."""
+
+Title = Annotated[str, AfterValidator(_title)]
+"""What people read: a line without what WKT, HTML or a terminal would take for their own."""

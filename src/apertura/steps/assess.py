@@ -61,7 +61,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "fusion": fusion.report,
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
-    path = campaign.root / campaign.assessment_file(flight)
+    path = campaign.result(flight, "assessment.json")
     save_document(path, report, lineage.record())
     return path
 

@@ -36,7 +36,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
             "inputs": echo.attrs["inputs"]
         }
     report["code_sha256"] = chained_sha256(code_sha256(__name__), codes)
-    path = campaign.root / campaign.calibration_file(flight)
+    path = campaign.result(flight, "calibration.json")
     save_document(path, report, lineage.record())
     return path
 
@@ -46,7 +46,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     asked = campaign.settings.calibration
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
-    path = campaign.root / campaign.calibration_file(asked.flight)
+    path = campaign.result(asked.flight, "calibration.json")
     offsets = open_document(path)["pairs"]
     if pair not in offsets:
         raise CampaignError(

@@ -37,7 +37,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
         dataset = read_phase_history(waveform.format, files, pair=pair)
     else:
-        files = [campaign.root / waveform.codes]
+        files = [campaign.codes_file]
         codes = read_codes(files[0], waveform.subcarriers)
         tx, rx = pair.split("-")
         nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}

@@ -39,7 +39,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "flags": {**image.attrs["flags"], **agreed["flags"]},
     }
     origin = _with_code(Provenance.of(modules, [image]), assessed)
-    folder = campaign.results / flight / pair
+    folder = campaign.result(flight, pair)
     written = write_exports(
         "pair",
         folder,
@@ -59,7 +59,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    folder, grid = campaign.results / flight / "fused", settled_scene(campaign).grid
+    folder, grid = campaign.result(flight, "fused"), settled_scene(campaign).grid
     report = {
         **_worst(images, assessed["fusion"]),
         **_measures(grid, campaign.settings.processing.tile_px, sums),

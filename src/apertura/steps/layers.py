@@ -48,7 +48,7 @@ def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
     )
     written = write_exports(
         "layers",
-        campaign.results / "layers",
+        campaign.result("layers"),
         rasters,
         titles={name: f"{campaign.settings.campaign} · flight {flight.name} · {name}" for name in rasters},
         tags=origin.tags(),

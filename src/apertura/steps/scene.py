@@ -7,7 +7,7 @@ from pathlib import Path
 from apertura.campaign import Campaign
 from apertura.geometry.aperture import Aperture
 from apertura.lineage import result_of
-from apertura.load.scene import PATH, Flown, settled
+from apertura.load.scene import Flown, settled
 from apertura.store import open_stage, save_document
 
 
@@ -15,7 +15,7 @@ def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for and the height of its ground, and why."""
     lineage = result_of(campaign, "scene").begin(campaign.root, [__name__])
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
-    path, height_m = campaign.root / PATH, ground.level(grid).height_m
+    path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
     document = {"grid": asdict(grid), "height_m": height_m, "chosen": chosen, "inputs": ground.inputs}
     save_document(path, document, lineage.record())
     return path

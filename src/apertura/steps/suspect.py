@@ -91,7 +91,7 @@ def _other_echoes(
 
     def formed(one: Evidence, nodes: Mapping[str, Acquisition], waveform: OfdmWaveform) -> PhaseHistory:
         tx, rx = (nodes[name] for name in one.pair.split("-"))
-        codes = read_codes(campaign.root / waveform.codes, waveform.subcarriers)
+        codes = read_codes(campaign.codes_file, waveform.subcarriers)
         echo = pair_echo(tx, rx, codes, waveform, campaign.settings.processing, calibration[one.pair])
         return _evidence(nodes, one.pair, echo, campaign.settings.processing.window).history
 

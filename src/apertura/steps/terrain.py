@@ -26,7 +26,7 @@ def terrain(campaign: Campaign) -> Path:
     """
     lineage = result_of(campaign, "terrain").begin(campaign.root, [__name__])
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
-    grid, ground = scene.grid, Ground.of(campaign.settings.scene, campaign.root, crs=scene.grid.crs)
+    grid, ground = scene.grid, Ground.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
     if ground.dem is None:
         raise CampaignError(
             "no DEM",

@@ -90,11 +90,16 @@ def _applies(campaign: Campaign, name: str) -> bool:
 
 
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
-    """Return the campaign with changed settings, its inputs linked into another folder."""
+    """Return the campaign with changed settings, its inputs, by hard links, in another folder."""
     work.mkdir(parents=True, exist_ok=True)
     for path in campaign.root.resolve().iterdir():
-        if path.name != "results" and not (work / path.name).exists():
-            (work / path.name).symlink_to(path)
+        if (
+            path.is_dir()
+            and not path.name.startswith(".")
+            and path.name != "results"
+            and not (work / path.name).exists()
+        ):
+            shutil.copytree(path, work / path.name, copy_function=os.link)
     processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
     return replace(campaign, root=work, settings=campaign.settings.model_copy(update={"processing": processing}))
 

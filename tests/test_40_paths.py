@@ -1,0 +1,108 @@
+"""Nothing leaves the campaign folder: neither by a name, nor through a link, nor by what a name does elsewhere."""
+
+import shutil
+
+import pytest
+import yaml
+from folders import copy_writable
+
+from apertura.campaign import Campaign
+from apertura.check.links import linked_results
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import local_crs
+from apertura.settings.config import validated
+from apertura.steps import ingest
+
+
+def edit(root, key, value, *, load=True):
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    section = document
+    *way, last = key.split(".")
+    for name in way:
+        section = section[name]
+    section[last] = value
+    path.write_text(yaml.safe_dump(document))
+    return Campaign.load(root) if load else None
+
+
+@pytest.mark.parametrize(
+    "name", ["../codes.npy", "raw/../../codes.npy", "/etc/passwd", "raw\\codes.npy", "raw/\x1b[2J"]
+)
+@pytest.mark.parametrize("key", ["waveform.codes", "scene.dem", "scene.geoid"])
+def test_a_name_that_leaves_the_folder_is_refused_with_its_key(tiny, key, name):
+    (tiny.parent / "codes.npy").write_bytes((tiny / "raw/codes.npy").read_bytes())
+    if key == "scene.dem":
+        edit(tiny, "scene.dem_datum", "ellipsoid", load=False)
+    with pytest.raises(CampaignError, match=rf"config\.yaml: {key}: path .*inside the campaign folder") as refused:
+        edit(tiny, key, name).check_files()
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "file", ["raw/f01/uav1.track.csv", "raw/f01/uav1.sigmf-data", "raw/codes.npy", "config/config.yaml", "raw/f01"]
+)
+def test_an_input_that_is_a_link_is_refused(tiny, tmp_path, file):
+    path, elsewhere = tiny / file, tmp_path / "elsewhere"
+    shutil.move(path, elsewhere)
+    path.symlink_to(elsewhere)
+    with pytest.raises(CampaignError, match="leads through a symbolic link"):
+        Campaign.load(tiny).check_files()
+
+
+def test_a_campaign_folder_may_itself_be_reached_through_a_link(tiny, tmp_path):
+    (tmp_path / "link").symlink_to(tiny)
+    Campaign.load(tmp_path / "link").check_files()
+
+
+def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "f01/uav1/raw.zarr").mkdir(parents=True)
+    (tiny / "results").symlink_to(elsewhere)
+    campaign = Campaign.load(tiny)
+    with pytest.raises(CampaignError, match="leads through a symbolic link"):
+        ingest.ingest(campaign, "f01", "uav1")
+    assert [path.name for path in elsewhere.rglob("*")] == ["f01", "uav1", "raw.zarr"]
+    assert len(list(linked_results(campaign))) == 1
+
+
+@pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "layers/mask.tif"])
+def test_a_link_anywhere_below_the_results_is_named(tiny, tmp_path, name):
+    path = tiny / "results" / name
+    path.parent.mkdir(parents=True)
+    path.symlink_to(tmp_path)
+    assert [str(found.where) for found in linked_results(Campaign.load(tiny))] == [str(path)]
+
+
+def test_results_without_links_are_let_be(finished_tiny):
+    assert list(linked_results(finished_tiny)) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["scene.json", "cube.manifest.json", "Fused", "cube.zarr", "x.ZARR", "a.tif", "raw.zarr.wip", "logs", "x" * 65],
+)
+def test_a_flight_named_as_a_file_of_the_results_is_refused(tiny, name):
+    path = tiny / "config" / "flights.tsv"
+    path.write_text(path.read_text().replace("f01", name))
+    with pytest.raises(CampaignError, match=r"flights\.tsv: line 2: name"):
+        Campaign.load(tiny)
+
+
+@pytest.mark.parametrize(
+    "name", ['a"],b', "<script>", "\x1b[31mred", "two\nlines", "", "x" * 121, "back\\slash", "a & b"]
+)
+def test_a_campaign_name_that_wkt_html_or_a_terminal_would_read_is_refused(tiny, name):
+    document = yaml.safe_load((tiny / "config/config.yaml").read_text()) | {"campaign": name}
+    with pytest.raises(CampaignError, match="campaign") as refused:
+        validated(document, where="config.yaml")
+    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("name", ["Bodensee, Süd (2. Flug)", "it's", "日本", "a/b"])
+def test_other_names_stay_as_they_are(name):
+    assert name in local_crs(name)
+
+
+def test_a_copy_of_the_results_elsewhere_is_no_link(finished_tiny, tmp_path):
+    assert list(linked_results(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy")))) == []

@@ -1,0 +1,201 @@
+"""Nothing stale: results say what they were made from, and another file, setting or code is told by its hash."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+from folders import copy_writable
+
+from apertura.campaign import Campaign
+from apertura.check import stale
+from apertura.check.stale import damaged_results, stale_lines, stale_results
+from apertura.digests import Sources, digest_of
+from apertura.errors import CampaignError
+from apertura.lineage import results_of
+from apertura.lock import hold
+
+LOG = "raw/f01/uav2.track.pos"
+
+
+@pytest.fixture
+def finished(finished_tiny, tmp_path):
+    """The tiny campaign with all its results, to be spoilt at will."""
+    return copy_writable(finished_tiny.root, tmp_path / "finished")
+
+
+def edit(root, change):
+    path = root / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    change(document)
+    path.write_text(yaml.safe_dump(document))
+    return Campaign.load(root)
+
+
+def replace_keeping_times(path, data):
+    """What `rsync -a` and `cp -p` do: other bytes, the old time of modification."""
+    before = path.stat()
+    beside = path.with_name("beside")
+    beside.write_bytes(data)
+    os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns))
+    beside.replace(path)
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+
+
+def names(stale):
+    """Which results, without their places."""
+    return {Path(manifest).name.partition(".")[0] for manifest in stale}
+
+
+def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
+    results = list(results_of(finished_tiny))
+    assert len(results) == 17
+    for _, result in results:
+        recorded = json.loads((finished_tiny.root / result.manifest).read_text())
+        assert set(recorded) == {"files", "sources", "settings", "code"}
+        assert set(recorded["sources"]) == set(result.sources)
+        assert recorded["files"]
+    assert stale_results(finished_tiny) == {}
+
+
+def test_a_log_replaced_under_its_old_time_is_noticed_with_all_that_stands_on_it(finished):
+    campaign, path = Campaign.load(finished), finished / LOG
+    data = path.read_bytes()
+    replace_keeping_times(path, data.replace(b"8", b"9", 1))
+    found = stale_results(campaign)
+    assert found["results/f01/uav2/track.manifest.json"] == f"{LOG} has changed"
+    assert "results/f01/uav1-uav2/echo.manifest.json" in found
+    assert "results/f01/uav1-uav1/echo.manifest.json" not in found
+    assert "results/f01/uav1-uav1/export.manifest.json" in found  # through the assessment
+    assert list(stale_lines(found)) == [
+        f"results/f01/uav2/track.manifest.json: stale, to be made again: {LOG} has changed",
+        f"{len(found) - 1} results stand on that: to be made again, too",
+    ]
+    replace_keeping_times(path, data)
+    assert stale_results(campaign) == {}
+
+
+def test_samples_replaced_under_their_old_time_and_size_are_noticed_although_their_hash_is_kept(finished):
+    campaign, path = Campaign.load(finished), finished / "raw/f01/uav1.sigmf-data"
+    os.utime(path, (1e9, 1e9))
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 1
+    assert stale_results(campaign) == {}
+    replace_keeping_times(path, data)
+    assert "results/f01/uav1/raw.manifest.json" in stale_results(campaign)
+
+
+def test_a_hash_is_taken_once_per_state_of_a_file_and_again_when_asked(tmp_path, monkeypatch):
+    path = tmp_path / "raw.bin"
+    path.write_bytes(bytes(100_000))
+    monkeypatch.setattr("apertura.digests._SETTLED_S", -1.0)
+    first, kept = digest_of(tmp_path, "raw.bin"), tmp_path / "results/.hashes/raw.bin.json"
+    forged = json.loads(kept.read_text()) | {"sha256": "0" * 64}
+    kept.write_text(json.dumps(forged))
+    assert digest_of(tmp_path, "raw.bin") == "0" * 64
+    assert digest_of(tmp_path, "raw.bin", paranoid=True) == first
+    assert digest_of(tmp_path, "raw.bin") == first
+    kept.write_text('{"state": 3}')
+    assert digest_of(tmp_path, "raw.bin") == first
+
+
+def test_a_file_that_has_just_been_written_is_hashed_each_time(tmp_path):
+    """It may change again within one tick of the clock, and no time would tell."""
+    (tmp_path / "raw.bin").write_bytes(bytes(100_000))
+    digest_of(tmp_path, "raw.bin")
+    assert not (tmp_path / "results").exists()
+
+
+def test_what_changes_while_it_is_read_is_no_source(tmp_path):
+    path = tmp_path / "raw.bin"
+    path.write_bytes(bytes(10))
+    sources = Sources.of(tmp_path, ["raw.bin"])
+    assert set(sources.unchanged()) == {"raw.bin"}
+    path.write_bytes(bytes(11))
+    with pytest.raises(CampaignError, match=r"raw\.bin: changed while it was read"):
+        sources.unchanged()
+
+
+def test_results_copied_with_other_times_and_inodes_are_not_stale(finished, tmp_path):
+    copied = copy_writable(finished, tmp_path / "copied")
+    for path in copied.rglob("*"):
+        os.utime(path, (2e9, 2e9) if path.stat().st_ino % 2 else (1e9, 1e9))
+    assert stale_results(Campaign.load(copied)) == {}
+    assert damaged_results(Campaign.load(copied)) == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected", "spared"),
+    [
+        (lambda document: document.update(campaign="other"), {"scene", "export", "layers"}, {"raw", "track", "echo"}),
+        (lambda document: document.update(processing={"window": "none"}), {"profile", "image"}, {"echo", "scene"}),
+        (lambda document: document["nodes"]["uav2"].update(time_tag_std_s=1e-3), {"echo"}, {"raw", "track"}),
+    ],
+    ids=["name", "window", "node"],
+)
+def test_a_setting_makes_stale_what_it_matters_to(finished, change, expected, spared):
+    found = names(stale_results(edit(finished, change)))
+    assert expected <= found
+    assert not spared & found
+
+
+def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
+    known = stale.code_of
+    monkeypatch.setattr(stale, "code_of", lambda result: "0" if result == "profile" else known(result))
+    found = stale_results(Campaign.load(finished))
+    assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
+    assert not {"raw", "track", "echo", "scene", "layers"} & names(found)
+
+
+def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finished):
+    campaign = Campaign.load(finished)
+    (finished / "results/f01/uav1/track.manifest.json").unlink()
+    (finished / "results/cube.manifest.json").write_text("{")
+    found = stale_results(campaign)
+    assert "results/f01/uav1/track.manifest.json is gone" in found["results/f01/uav1-uav1/echo.manifest.json"]
+    assert found["results/cube.manifest.json"].startswith("its manifest is damaged")
+
+
+@pytest.mark.parametrize(
+    ("file", "manifest"),
+    [
+        ("f01/uav1-uav1/db.tif", "f01/uav1-uav1/export"),
+        ("f01/fused/quicklook.png", "f01/fused/export"),
+        ("f01/fused/image.json", "f01/fused/export"),
+        ("layers/mask.tif", "layers/layers"),
+        ("scene.json", "scene"),
+        ("f01/assessment.json", "f01/assessment"),
+        ("cube.zarr/zarr.json", "cube"),
+    ],
+)
+def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
+    path = finished / "results" / file
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert list(damaged_results(Campaign.load(finished))) == [f"results/{manifest}.manifest.json"]
+
+
+@pytest.mark.parametrize("file", ["scene.json", "f01/assessment.json"])
+def test_a_damaged_document_is_not_read(finished, file):
+    path = finished / "results" / file
+    path.write_text(path.read_text().replace("1", "2", 1))
+    from apertura.load.results import assessment_of
+    from apertura.load.scene import settled_scene
+
+    campaign = Campaign.load(finished)
+    with pytest.raises(CampaignError, match=r"not as they were written, first .*Delete .*manifest\.json"):
+        (settled_scene(campaign), assessment_of(campaign, "f01"))
+
+
+def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
+    with hold(tmp_path), pytest.raises(CampaignError, match=f"another run holds this campaign: process {os.getpid()}"):
+        hold(tmp_path)
+    hold(tmp_path).close()
+
+
+def test_results_moved_into_another_folder_are_not_stale(finished, tmp_path):
+    shutil.move(finished, tmp_path / "moved")
+    assert stale_results(Campaign.load(tmp_path / "moved")) == {}
