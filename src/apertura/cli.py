@@ -86,7 +86,9 @@ def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_COR
 
 def _snakemake(campaign: Path, cores: int, *arguments: str) -> int:
     """Run the workflow; return its exit status."""
-    _opened(campaign).check_files()
+    from apertura.check.files import require_files
+
+    require_files(_opened(campaign))
     root = _workflow_folder()
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(root / "Snakefile"), "--directory", str(campaign)]
     command += ["--workflow-profile", str(root / "profiles" / "default"), "--cores", str(cores), *arguments]
