@@ -20,6 +20,7 @@ _PER_POST = 2  # samples
 _WINDOW = 7  # samples: three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
+_MARGIN = _WINDOW + 1  # samples about the scene: an opening asks for six on either side
 
 
 def check_dem(inspected: Inspected) -> Iterator[CampaignError]:
@@ -45,7 +46,7 @@ def check_spikes(inspected: Inspected) -> Iterator[CampaignError]:
     window = sampled_about(grid, post_m / _PER_POST)
     heights = _heights(dem, grid, window)
     spikes = needles(heights, taller_than_m=max(TALLEST_M, _STEEPEST_POSTS * post_m))
-    edge = _WINDOW - _PER_POST  # what stands further from the scene than a post does not touch it
+    edge = _MARGIN - _PER_POST  # what stands further from the scene than a post does not touch it
     for beside in (spikes[:edge], spikes[-edge:], spikes[:, :edge], spikes[:, -edge:]):
         beside[:] = False
     if not spikes.any():
@@ -84,15 +85,17 @@ def post_width_m(dem: Dem, grid: SceneGrid) -> float:
 
 
 def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
-    """Return samples of so many metres over a grid and a window's width about it, at most a million in its middle."""
+    """Return samples of so many metres over a grid and a margin about it, at most a million in its middle."""
     (xmin, ymin, xmax, ymax), most = grid.bounds_m, int(np.sqrt(_MOST_SAMPLES))
-    sides = [min(round(side / spacing_m) + 2 * _WINDOW, most) for side in (xmax - xmin, ymax - ymin)]
+    sides = [min(round(side / spacing_m) + 2 * _MARGIN, most) for side in (xmax - xmin, ymax - ymin)]
     west, north = (xmin + xmax - sides[0] * spacing_m) / 2, (ymin + ymax + sides[1] * spacing_m) / 2
     return SceneGrid(grid.crs, west, north, spacing_m, (sides[1], sides[0]))
 
 
 def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np.bool_]:
     """Return (row, column) bool: what stands out of a surface, up or down, narrower than a window of seven samples.
+
+    Within two windows' half widths of a void or of the edge nothing is said: land goes on there as nobody knows.
 
     Examples
     --------
@@ -105,11 +108,12 @@ def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np
     with np.errstate(invalid="ignore"):
         up = heights - _over_windows(_over_windows(heights, np.fmin), np.fmax)
         down = _over_windows(_over_windows(heights, np.fmax), np.fmin) - heights
-        return np.asarray((up > taller_than_m) | (down > taller_than_m))
+        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN beside a void and an edge
+        return np.asarray(((up > taller_than_m) | (down > taller_than_m)) & np.isfinite(near))
 
 
 def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.float64]:
-    """Return the extreme of the window about each sample, both ways; voids and what lies outside do not count."""
+    """Return the extreme of the window about each sample, both ways; outside is NaN, as voids are."""
     half = _WINDOW // 2
     for axis in (0, 1):
         padded = np.pad(heights, [(half, half) if way == axis else (0, 0) for way in (0, 1)], constant_values=np.nan)

@@ -11,11 +11,14 @@ from apertura.check.tags import Times, paired, span
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
+from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.settings import CONFIG, Flight, LeverArms, OfdmWaveform
 
 _TAGS = 256  # of a pair at which distances are taken
 _POINTS = 9  # along each side of the scene
 _CURVATURE = 0.99  # of a straight path: ground under a scene of unknown height bends away from the track
+_MOSTLY = 0.9  # of the distance: then it is one of heights
+_CHECK = "Check scene.crs and scene.bounds_m (easting before northing), and the place in the logs."
 _HORIZON_M = 4.12e3
 """Radio horizon over a smooth Earth with refraction, metres per square root of the height in metres."""
 
@@ -58,9 +61,21 @@ def check_distance(inspected: Inspected) -> Iterator[CampaignError]:
             f"no echo travels less than {_length(path_m)}",
             where=f"{CONFIG}: scene",
             expected=f"a total path of at most {_length(limit_m)}, what waveform.cyclic_prefix_s holds",
-            remedy=likely_place(inspected)
-            or "Check scene.crs and scene.bounds_m (easting before northing), and the place in the logs.",
+            remedy=_too_high(inspected, distance_m) or likely_place(inspected) or _CHECK,
         )
+
+
+def _too_high(inspected: Inspected, distance_m: float) -> str:
+    """Return what to correct where it is the height that keeps scene and track apart; else ''."""
+    if inspected.middle_m is None or inspected.ground is None or inspected.ground.dem:
+        return ""
+    above_m = float(geodetic_from_ecef(inspected.middle_m)[2]) - inspected.level_m
+    if abs(above_m) < _MOSTLY * distance_m:
+        return ""
+    return (
+        f"The track is {above_m:.0f} m above the ground: check heights in the logs (metres, not feet, above the "
+        "ellipsoid) and scene.height_m."
+    )
 
 
 def _reach(
