@@ -9,6 +9,7 @@ from folders import contents, recordings_of, small_simulation
 from typer.testing import CliRunner
 
 from apertura.campaign import Campaign
+from apertura.check.files import require_files
 from apertura.cli import app
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import projected_from_ecef
@@ -52,13 +53,13 @@ def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid
 def test_a_preset_makes_a_campaign_that_loads_and_whose_files_pass_the_check(tmp_path, name):
     root = simulate(tmp_path / "campaign", preset(name, pulses=3))
     campaign = Campaign.load(root)
-    campaign.check_files()
+    require_files(campaign)
     specification = preset(name)
     assert [flight.name for flight in campaign.flights] == [flight.name for flight in specification.flights]
     assert campaign.settings.nodes.keys() == specification.nodes.keys()
     next((root / "raw").rglob("*.sigmf-data")).unlink()
     with pytest.raises(CampaignError, match="no such file"):
-        campaign.check_files()
+        require_files(campaign)
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

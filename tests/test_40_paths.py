@@ -7,7 +7,9 @@ import yaml
 from folders import copy_writable
 
 from apertura.campaign import Campaign
-from apertura.check.links import linked_results
+from apertura.check.files import require_files
+from apertura.check.inspected import Inspected
+from apertura.check.links import check_links
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import local_crs
 from apertura.settings.config import validated
@@ -35,7 +37,7 @@ def test_a_name_that_leaves_the_folder_is_refused_with_its_key(tiny, key, name):
     if key == "scene.dem":
         edit(tiny, "scene.dem_datum", "ellipsoid", load=False)
     with pytest.raises(CampaignError, match=rf"config\.yaml: {key}: path .*inside the campaign folder") as refused:
-        edit(tiny, key, name).check_files()
+        require_files(edit(tiny, key, name))
     assert str(refused.value).isprintable()
 
 
@@ -47,12 +49,12 @@ def test_an_input_that_is_a_link_is_refused(tiny, tmp_path, file):
     shutil.move(path, elsewhere)
     path.symlink_to(elsewhere)
     with pytest.raises(CampaignError, match="leads through a symbolic link"):
-        Campaign.load(tiny).check_files()
+        require_files(Campaign.load(tiny))
 
 
 def test_a_campaign_folder_may_itself_be_reached_through_a_link(tiny, tmp_path):
     (tmp_path / "link").symlink_to(tiny)
-    Campaign.load(tmp_path / "link").check_files()
+    require_files(Campaign.load(tmp_path / "link"))
 
 
 def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
@@ -63,7 +65,7 @@ def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
     with pytest.raises(CampaignError, match="leads through a symbolic link"):
         ingest.ingest(campaign, "f01", "uav1")
     assert [path.name for path in elsewhere.rglob("*")] == ["f01", "uav1", "raw.zarr"]
-    assert len(list(linked_results(campaign))) == 1
+    assert len(list(check_links(Inspected(campaign)))) == 1
 
 
 @pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "layers/mask.tif"])
@@ -71,11 +73,11 @@ def test_a_link_anywhere_below_the_results_is_named(tiny, tmp_path, name):
     path = tiny / "results" / name
     path.parent.mkdir(parents=True)
     path.symlink_to(tmp_path)
-    assert [str(found.where) for found in linked_results(Campaign.load(tiny))] == [str(path)]
+    assert [str(found.where) for found in check_links(Inspected(Campaign.load(tiny)))] == [str(path)]
 
 
 def test_results_without_links_are_let_be(finished_tiny):
-    assert list(linked_results(finished_tiny)) == []
+    assert list(check_links(Inspected(finished_tiny))) == []
 
 
 @pytest.mark.parametrize(
@@ -105,4 +107,4 @@ def test_other_names_stay_as_they_are(name):
 
 
 def test_a_copy_of_the_results_elsewhere_is_no_link(finished_tiny, tmp_path):
-    assert list(linked_results(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy")))) == []
+    assert list(check_links(Inspected(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy"))))) == []

@@ -8,6 +8,7 @@ import pytest
 from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all
 
 from apertura.campaign import Campaign
+from apertura.check.files import require_files
 from apertura.load.pair import open_pair
 from apertura.steps import echo, ingest, profile, scene
 
@@ -35,7 +36,7 @@ def test_a_value_of_the_wrong_kind_is_named(tiny):
 
 def test_a_missing_node_file_is_named(tiny):
     (tiny / "raw" / "f01" / "uav2.sigmf-data").unlink()
-    message = complaint(Campaign.load(tiny).check_files)
+    message = complaint(lambda: require_files(Campaign.load(tiny)))
     assert "raw/f01/uav2.sigmf-data" in message
     assert "node uav2" in message
 
@@ -179,7 +180,7 @@ def test_an_antenna_that_is_none_is_named(tiny, antenna, expected):
 
 def test_a_missing_pattern_is_named_with_its_key(tiny):
     edit_config(tiny, stating({"boresight_deg": [90, -20], "pattern": "config/horn.csv"}))
-    message = complaint(Campaign.load(tiny).check_files)
+    message = complaint(lambda: require_files(Campaign.load(tiny)))
     assert "config/horn.csv: no such file" in message
     assert "nodes.uav1.antennas.radar_rx.pattern" in message
 

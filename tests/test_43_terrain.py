@@ -14,6 +14,7 @@ from folders import complaint, copy_writable, run_steps, settle_ground
 from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
+from apertura.check.files import require_files
 from apertura.cli import main
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef
@@ -194,7 +195,7 @@ def test_a_dem_without_its_datum_is_refused(tiny):
 
 def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
     campaign = edit_scene(tiny, dem="terrain/dem.tif", dem_datum="ellipsoid")
-    message = complaint(campaign.check_files)
+    message = complaint(lambda: require_files(campaign))
     assert "terrain/dem.tif: no such file" in message
     assert "scene.dem" in message
 

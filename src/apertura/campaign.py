@@ -115,32 +115,6 @@ class Campaign:
         own = (segment for segment in self.segments if (segment.flight, segment.pair) == (flight, pair))
         return sorted((segment.start, segment.end) for segment in own)
 
-    def check_files(self) -> None:
-        """Raise CampaignError unless every file that flights.tsv or the config promises is there."""
-        for flight in self.flights:
-            for node in flight.nodes:
-                self.raw_files(flight.name, node)
-        named = {f"scene.{role}": path for role, path in self.height_files().items()}
-        for flight in self.image_flights:
-            for pair in flight.pairs:
-                named |= self.pattern_files(pair)
-        for key, path in named.items():
-            if not path.is_file():
-                raise CampaignError(
-                    "no such file",
-                    where=path,
-                    expected=f"the file of {CONFIG}: {key}",
-                    remedy=f"Copy it there, or correct {key}.",
-                )
-        waveform = self.settings.waveform
-        if isinstance(waveform, OfdmWaveform) and not self.codes_file.is_file():
-            raise CampaignError(
-                "no such file",
-                where=self.codes_file,
-                expected=f"the transmitted code symbols, as {CONFIG}: waveform.codes",
-                remedy="Copy the file there.",
-            )
-
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
         settings = self.settings.model_dump(mode="json")

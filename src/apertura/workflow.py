@@ -10,11 +10,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from apertura.campaign import Campaign
+from apertura.check import print_problems
 from apertura.check.stale import forms_results, stale_results
 from apertura.lock import hold
 from apertura.signals import STATUS_FILE
 
 _GRACE_S = 3.0
+_ELSEWHERE = ("memory",)
+"""Checks of this machine, of no use where steps run on others."""
 
 
 def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False) -> int:
@@ -41,8 +44,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     CampaignError
         If the campaign is not fit to run, or another run holds it.
     """
+    if print_problems(root, without=_ELSEWHERE if _runs_elsewhere(arguments) else (), stream=sys.stderr):
+        return 2
     campaign = Campaign.load(root)
-    campaign.check_files()
     if forms_results(["", *arguments]):
         hold(root).close()
     stale = stale_results(campaign, paranoid=paranoid)
@@ -66,6 +70,11 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         status = _supervised(command, {**os.environ, "PATH": path, STATUS_FILE: str(said)})
         told = set(said.read_text(encoding="utf-8").split()) if said.is_file() else set()
     return 2 if status == 1 and told == {"2"} else status
+
+
+def _runs_elsewhere(arguments: Sequence[str]) -> bool:
+    """Return whether steps run on other machines than this one."""
+    return any(argument.startswith(("--executor", "--profile", "-e")) for argument in arguments)
 
 
 def _supervised(command: Sequence[str], environment: dict[str, str]) -> int:

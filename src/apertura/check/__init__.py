@@ -1,18 +1,126 @@
-"""What can be told of a campaign folder before anything runs."""
+"""What is wrong with a campaign folder, all of it at once, before anything runs: headers, logs and numbers, no samples.
 
+Here stands what cannot be imaged at all; what is merely worse is measured by the step that meets it, and is a flag.
+"""
+
+import pkgutil
 import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
+
+from apertura.check.loading import load
+from apertura.errors import CampaignError
+from apertura.settings import located
+
+if TYPE_CHECKING:
+    from apertura.check.inspected import Inspected
+
+Check = Callable[["Inspected"], Iterable[CampaignError]]
+
+CHECKS: Mapping[str, str] = {
+    "flights": "apertura.check.flights:check_flights",
+    "files": "apertura.check.files:check_files",
+    "links": "apertura.check.links:check_links",
+    "results": "apertura.check.results:check_writable",
+    "codes": "apertura.check.codes:check_codes",
+    "recordings": "apertura.check.recordings:check_recordings",
+    "channels": "apertura.check.recordings:check_channels",
+    "intervals": "apertura.check.tags:check_intervals",
+    "overlap": "apertura.check.tags:check_overlap",
+    "segments": "apertura.check.tags:check_segments",
+    "tracks": "apertura.check.tracks:check_tracks",
+    "attitude": "apertura.check.tracks:check_attitude",
+    "coverage": "apertura.check.coverage:check_coverage",
+    "patterns": "apertura.check.antennas:check_patterns",
+    "crs": "apertura.check.scene:check_scene_crs",
+    "dem": "apertura.check.dem:check_dem",
+    "spikes": "apertura.check.dem:check_spikes",
+    "apart": "apertura.check.places:check_nodes_apart",
+    "distance": "apertura.check.places:check_distance",
+    "ground": "apertura.check.ground:check_ground",
+    "calibration": "apertura.check.calibration:check_calibration",
+    "memory": "apertura.check.resources:check_memory",
+    "disk": "apertura.check.resources:check_disk",
+}
+"""Name → ``module:function``; a function takes what is `Inspected` and yields problems, or raises one."""
 
 
-def print_findings(root: Path, *, products: bool = False, paranoid: bool = False) -> int:
-    """Print what is wrong with a campaign folder, a line each, and which results are overtaken; return how many."""
-    from apertura.campaign import Campaign
+def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
+    """Return what is wrong with a campaign folder; an empty list: nothing known.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    without
+        Names of checks to leave out, such as 'memory' where steps run on another machine.
+
+    Examples
+    --------
+    >>> [str(problem) for problem in problems("nowhere")]
+    ['nowhere: no such folder; expected a campaign folder. `apertura init` makes one.']
+    """
+    campaign, found = load(Path(root))
+    if campaign is None:
+        return found
+    from apertura.check.inspected import Inspected
+
+    inspected = Inspected(campaign)
+    for name, function in CHECKS.items():
+        if name not in without:
+            found += _each(pkgutil.resolve_name(function), inspected)
+    return list({str(problem): problem for problem in found}.values())
+
+
+def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
+    """Print the problems of a campaign folder, one line each; return how many there are."""
+    found = problems(root, without=without)
+    for problem in found:
+        print(as_line(problem), file=stream or sys.stdout)
+    return len(found)
+
+
+def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
+    """Print the problems of a campaign folder and what of its results is overtaken; return how many lines.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    products
+        Read every byte of the results, too, and name what is not as it was written.
+    paranoid
+        Read every input again, also those whose state is that of a hash taken before.
+    """
+    found = print_problems(root)
+    campaign, _ = load(Path(root))
+    if campaign is None or found:
+        return found
     from apertura.check.stale import damaged_results, stale_lines, stale_results
 
-    campaign = Campaign.load(root)
-    campaign.check_files()
     lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
     if products:
-        lines += [f"{name}: damaged: {why}" for name, why in damaged_results(campaign).items()]
-    print(*lines, sep="\n", end="\n" if lines else "", file=sys.stdout)
+        lines += [f"{manifest}: damaged: {why}" for manifest, why in damaged_results(campaign).items()]
+    for line in lines:
+        print(line)
     return len(lines)
+
+
+def as_line(problem: CampaignError) -> str:
+    r"""Return a problem as one line, with the config's place where it names a key alone.
+
+    Examples
+    --------
+    >>> as_line(CampaignError("a\nb", "scene.dem", "c", "D."))
+    'config/config.yaml: scene.dem: a b; expected c. D.'
+    """
+    return " ".join(located(str(problem)).split())
+
+
+def _each(check: Check, inspected: "Inspected") -> Iterator[CampaignError]:
+    """Yield what a check yields, and what it raises in the end."""
+    try:
+        yield from check(inspected)
+    except CampaignError as problem:
+        yield problem

@@ -4,14 +4,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from apertura.campaign import Campaign
+from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 
 
-def linked_results(campaign: Campaign) -> Iterator[CampaignError]:
+def check_links(inspected: Inspected) -> Iterator[CampaignError]:
     """Yield an error for each symbolic link that the results, or Snakemake's own records, hold or are."""
     for folder in ("results", ".snakemake"):
-        top = campaign.root / folder
+        top = inspected.campaign.root / folder
         yield from (_refused(path) for path in _links(top))
 
 

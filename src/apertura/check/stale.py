@@ -10,6 +10,7 @@ from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
 from apertura.lineage import Result, results_of
+from apertura.paths import inside
 from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest
 
@@ -20,11 +21,10 @@ _ONLY_LOOKS = (
 """Options with which snakemake reads a workflow and runs none of it."""
 
 
-_STANDS = "it stands on "
-
-
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
     """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
+
+    The reason is empty where it only stands on one that is made again.
 
     Parameters
     ----------
@@ -42,8 +42,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
             reasons = list(_reasons(campaign.root, name, result, read_manifest(path), paranoid=paranoid))
         except CampaignError:
             reasons = ["its manifest is damaged"]
-        reasons += [f"{_STANDS}{source}" for source in result.sources if source in stale]
-        if reasons:
+        if reasons or not stale.keys().isdisjoint(result.sources):
             stale[result.manifest] = "; ".join(reasons)
     return stale
 
@@ -57,11 +56,22 @@ def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) ->
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each result that is overtaken itself, and one for those that only stand on them."""
-    own = {manifest: why for manifest, why in stale.items() if not why.startswith(_STANDS)}
-    yield from (f"{manifest}: stale, to be made again: {why}" for manifest, why in own.items())
-    if len(own) < len(stale):
-        yield f"{len(stale) - len(own)} results stand on that: to be made again, too"
+    """Yield a line for each reason and the results it holds for, and one for those that only stand on them.
+
+    Examples
+    --------
+    >>> list(stale_lines({"a.json": "its code has changed", "b.json": "its code has changed", "c.json": ""}))
+    ['a.json and 1 more: stale, its code has changed', '1 result stands on that: stale, too']
+    """
+    holds_for: dict[str, list[str]] = {}
+    for manifest, why in stale.items():
+        holds_for.setdefault(why, []).append(manifest)
+    standing = len(holds_for.pop("", ()))
+    for why, manifests in holds_for.items():
+        more = f" and {len(manifests) - 1} more" if len(manifests) > 1 else ""
+        yield f"{manifests[0]}{more}: stale, {why}"
+    if standing:
+        yield f"{standing} results stand on that: stale, too" if standing > 1 else "1 result stands on that: stale, too"
 
 
 def forms_results(arguments: Sequence[str]) -> bool:
@@ -101,7 +111,7 @@ def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any],
         was = recorded["sources"].get(source)
         if was is None:
             yield f"{source} is new to it"
-        elif not (root / source).is_file():
+        elif not inside(root, source, where=root / result.manifest).is_file():
             yield f"{source} is gone"
         elif digest_of(root, source, paranoid=paranoid) != was:
             yield f"{source} has changed"

@@ -7,6 +7,7 @@ from typing import Any
 from apertura.atomic import write_json
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
+from apertura.paths import inside
 from apertura.provenance import sha256_file, sha256_tree
 
 
@@ -85,7 +86,7 @@ def check_files(result: Path) -> None:
 def damaged_files(manifest: Path) -> list[str]:
     """Return the files of a result that are not as they were written, or not there; every byte is read."""
     expected = read_manifest(manifest)["files"]
-    there = {name: manifest.parent / name for name in expected}
+    there = {name: inside(manifest.parent, name, where=manifest) for name in expected}
     return [name for name, path in there.items() if not path.is_file() or sha256_file(path) != expected[name]]
 
 

@@ -1,0 +1,81 @@
+"""Whether everything is there that flights.tsv and the config promise."""
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+from apertura.campaign import Campaign
+from apertura.check.inspected import Inspected, participants
+from apertura.errors import CampaignError
+from apertura.ingest import RECORDERS
+from apertura.settings import CONFIG, FLIGHTS, Flight, OfdmWaveform
+
+
+def check_files(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield every file that is missing, empty or may not be read."""
+    campaign = inspected.campaign
+    for flight in campaign.flights:
+        yield from _recorded(campaign, flight)
+    lookups: list[Callable[[], dict[str, Path]]] = [
+        lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
+    ]
+    lookups += [partial(campaign.pattern_files, pair) for flight in campaign.image_flights for pair in flight.pairs]
+    if isinstance(campaign.settings.waveform, OfdmWaveform):
+        lookups.append(lambda: {"waveform.codes": campaign.codes_file})
+    for lookup in lookups:
+        try:
+            named = lookup()
+        except CampaignError as problem:  # a path that leaves the folder
+            yield problem
+            continue
+        for key, path in named.items():
+            yield from _readable(path, f"the file of {CONFIG}: {key}", f"Copy it there, or correct {key}.")
+
+
+def require_files(campaign: Campaign) -> None:
+    """Raise CampaignError with the first file that is missing."""
+    for problem in check_files(Inspected(campaign)):
+        raise problem
+
+
+def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
+    """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
+    if not isinstance(campaign.settings.waveform, OfdmWaveform):
+        for node in flight.nodes:
+            yield from _found(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
+        return
+    for node in participants(flight):
+        expected = f"the recording of node {node} in flight {flight.name}"
+        remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
+        for path in promised_recording(campaign.root / "raw" / flight.name, node):
+            yield from _readable(path, expected, remedy)
+        yield from _found(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
+
+
+def promised_recording(folder: Path, node: str) -> list[Path]:
+    """Return the files of a node's recording in the format that is begun there, else in the first known one."""
+    rows = [[folder / f"{node}{suffix}" for suffix in row] for row in RECORDERS]
+    return next((row for row in rows if any(path.is_file() for path in row)), rows[0])
+
+
+def _found(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
+    """Yield that files are missing, as whoever looks for them says it, or what is wrong with those found."""
+    try:
+        paths = files()
+    except CampaignError as problem:
+        yield problem
+        return
+    for path in paths:
+        yield from _readable(path, "what was recorded", "Copy it again.")
+
+
+def _readable(path: Path, expected: str, remedy: str) -> Iterator[CampaignError]:
+    if path.is_symlink():
+        yield CampaignError("a symbolic link", where=path, expected=expected, remedy="Copy the file itself there.")
+    elif not path.is_file():
+        yield CampaignError("no such file", where=path, expected=expected, remedy=remedy)
+    elif path.stat().st_size == 0:
+        yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")
+    elif not os.access(path, os.R_OK):
+        yield CampaignError("may not be read", where=path, expected=expected, remedy=f"Run `chmod u+r {path}`.")

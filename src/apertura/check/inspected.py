@@ -1,0 +1,183 @@
+"""A campaign while it is checked: recordings, logs and grid opened once, whoever asks for them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import LOCAL, geodetic_from_ecef
+from apertura.ingest import open_recording, read_track
+from apertura.settings import Flight, OfdmWaveform
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apertura.ingest.recording import Recording
+    from apertura.load.ground import Ground
+    from apertura.scene.grid import SceneGrid
+
+T = TypeVar("T")
+Key = tuple[str, str]
+"""Flight and node."""
+
+_NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A campaign, and what its checks open of it.
+
+    What cannot be opened is missing here: 'files', 'recordings', 'tracks' and 'crs' say why, once.
+    """
+
+    campaign: Campaign
+
+    @property
+    def waveform(self) -> OfdmWaveform | None:
+        """What was transmitted; None: phase history, without recordings and logs."""
+        stated = self.campaign.settings.waveform
+        return stated if isinstance(stated, OfdmWaveform) else None
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Every flight and node of which samples and a log are needed."""
+        flights = self.campaign.flights if self.waveform else ()
+        return tuple((flight.name, node) for flight in flights for node in participants(flight))
+
+    @property
+    def recordings(self) -> dict[Key, "Recording"]:
+        """Recordings that open."""
+        return self._recordings[0]
+
+    @property
+    def unopened(self) -> list[CampaignError]:
+        """What is wrong with the others."""
+        return self._recordings[1]
+
+    @property
+    def tracks(self) -> dict[Key, "xr.Dataset"]:
+        """Flight logs that can be read, as `track` stages."""
+        return self._tracks[0]
+
+    @property
+    def unread(self) -> list[CampaignError]:
+        """What is wrong with the others."""
+        return self._tracks[1]
+
+    @cached_property
+    def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
+        return self._each(self.campaign.recording_files, lambda files, _: open_recording(files))
+
+    @cached_property
+    def _tracks(self) -> tuple[dict[Key, "xr.Dataset"], list[CampaignError]]:
+        def files(flight: str, node: str) -> tuple[Path, ...]:
+            return (self.campaign.track_file(flight, node),)
+
+        return self._each(files, lambda logs, node: read_track(logs[0], node=node))
+
+    def _each(
+        self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], str], T]
+    ) -> tuple[dict[Key, T], list[CampaignError]]:
+        """Open what lies there and is not empty; the others are for 'files' to name."""
+        found: dict[Key, T] = {}
+        wrong: list[CampaignError] = []
+        for flight, node in self.keys:
+            try:
+                paths = files(flight, node)
+            except CampaignError:
+                continue
+            if not all(path.stat().st_size for path in paths):
+                continue
+            try:
+                found[flight, node] = opened(paths, node)
+            except CampaignError as problem:
+                wrong.append(problem)
+        return found, wrong
+
+    @cached_property
+    def geodetic(self) -> dict[Key, NDArray[np.float64]]:
+        """Flight and node → (epoch, 3) float64: latitude, longitude (deg), ellipsoidal height (m) of its log."""
+        return {key: geodetic_from_ecef(track.position.values) for key, track in self.tracks.items()}
+
+    @cached_property
+    def crs(self) -> str | None:
+        """CRS of the scene; `auto` is the zone of the first image flight; None where nobody can tell."""
+        asked = self.campaign.settings.scene.crs
+        if asked != "auto":
+            return asked
+        from apertura.scene.auto_grid import utm_crs
+
+        middle = self.middle_m
+        return None if middle is None else utm_crs(middle)
+
+    @cached_property
+    def middle_m(self) -> NDArray[np.float64] | None:
+        """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
+        first = {flight.name for flight in self.campaign.image_flights[:1]}
+        logs = [track.position.values for (flight, _), track in self.tracks.items() if flight in first]
+        return np.median(np.concatenate(logs), axis=0) if logs else None
+
+    @cached_property
+    def grid(self) -> "SceneGrid | None":
+        """The scene's pixels, coarser ones where the spacing is `auto`; None where bounds are, or the CRS is wrong."""
+        from apertura.scene.grid import SceneGrid
+
+        asked = self.campaign.settings.scene
+        if self.crs is None or asked.bounds_m == "auto" or (self.crs == LOCAL) is bool(self.waveform):
+            return None
+        xmin, ymin, xmax, ymax = asked.bounds_m
+        spacing = min(xmax - xmin, ymax - ymin) / _NODES if asked.spacing_m == "auto" else asked.spacing_m
+        try:
+            return SceneGrid.from_bounds(self.crs, asked.bounds_m, spacing_m=spacing)
+        except CampaignError:
+            return None
+
+    @property
+    def ground(self) -> "Ground | None":
+        """The ground as the config states it, opened; None where it cannot be, or nobody knows in which CRS."""
+        return self._ground[0]
+
+    @property
+    def no_ground(self) -> list[CampaignError]:
+        """Why it cannot be opened."""
+        return self._ground[1]
+
+    @property
+    def level_m(self) -> float:
+        """Height of flat ground under the grid, metres above the ellipsoid; of the track, where a DEM says it."""
+        return self._ground[2]
+
+    @cached_property
+    def _ground(self) -> "tuple[Ground | None, list[CampaignError], float]":
+        from apertura.load.ground import Ground
+
+        flown_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
+        asked = self.campaign.settings.scene
+        try:
+            files = self.campaign.height_files()
+        except CampaignError:
+            return None, [], flown_m
+        if self.crs is None or not all(path.is_file() and path.stat().st_size for path in files.values()):
+            return None, [], flown_m
+        try:
+            ground = Ground.of(asked, files, crs=self.crs)
+            return ground, [], flown_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
+        except CampaignError as problem:
+            return None, [problem], flown_m
+
+
+def participants(flight: Flight) -> tuple[str, ...]:
+    """Return the nodes of a flight, the transmitter first, each once.
+
+    Examples
+    --------
+    >>> participants(Flight("f01", "image", "a", ("b", "a")))
+    ('a', 'b')
+    """
+    return tuple(dict.fromkeys((flight.transmitter, *flight.nodes)))

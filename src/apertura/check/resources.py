@@ -1,0 +1,96 @@
+"""Whether memory and disk are enough for what is certain to be needed."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from apertura.check.inspected import Inspected
+from apertura.errors import CampaignError
+from apertura.ingest.recording import Recording
+
+_BASE_BYTES = 150_000_000  # the interpreter and its libraries
+_READ_BYTES = 3  # per byte of a recording while it is read in; measured: 4.4 at ingest, 6.9 where a pair becomes echo
+_RAW_SHARE = 0.85  # of the bytes recorded stay in the stage raw, compressed; measured: 0.88
+_ECHO_SHARE = 0.5  # of 8 bytes per pulse and subcarrier; measured: 0.65
+_PIXEL_BYTES = 24  # per pixel and pair: image, its part of the cube, three rasters, compressed; 60 before
+_SMALL_BYTES = 1_000_000_000  # what every machine has
+
+MEMINFO = Path("/proc/meminfo")
+
+
+def check_memory(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield a problem where the largest recording does not fit into memory while it is read in."""
+    if not inspected.recordings:
+        return
+    key, largest = max(inspected.recordings.items(), key=lambda item: _bytes(item[1]))
+    needed = _BASE_BYTES + _READ_BYTES * _bytes(largest)
+    if largest.framing is None and needed > _SMALL_BYTES and needed > (free := free_memory()):
+        yield CampaignError(
+            f"{_bytes(largest) / 1e9:.1f} GB recorded by {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of "
+            "memory",
+            where=largest.files[-1],
+            expected=f"at most the {free / 1e9:.1f} GB that this process may use now",
+            remedy="Run on a machine with more memory, end other work, or cut the recording into several flights.",
+        )
+
+
+def free_memory(meminfo: Path = MEMINFO) -> int:
+    """Return the bytes of memory that are free for this process: the machine's, or what its control group allows.
+
+    Examples
+    --------
+    >>> 0 < free_memory() <= free_memory(Path("none"))
+    True
+    """
+    from apertura.planning.memory import memory_limit
+
+    lines = meminfo.read_text(encoding="utf-8").splitlines() if meminfo.is_file() else []
+    stated = [int(line.split()[1]) * 1024 for line in lines if line.startswith(("MemAvailable:", "SwapFree:"))]
+    return min(memory_limit(), sum(stated)) if stated else memory_limit()
+
+
+def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield a problem where the file system of the results has less left than the stages still to be made."""
+    campaign = inspected.campaign
+    needed = sum(disk_bytes(inspected).values())
+    folder = campaign.results if campaign.results.is_dir() else campaign.root
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        parts = ", ".join(f"{name} {size / 1e9:.2f} GB" for name, size in disk_bytes(inspected).items() if size)
+        yield CampaignError(
+            f"results take at least {needed / 1e9:.2f} GB more ({parts})",
+            where=folder,
+            expected=f"at most the {free / 1e9:.2f} GB that are free",
+            remedy="Free some space, put results on another disk, or make the scene smaller.",
+        )
+
+
+def disk_bytes(inspected: Inspected) -> dict[str, int]:
+    """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
+    campaign, waveform = inspected.campaign, inspected.waveform
+    raw = sum(
+        round(_RAW_SHARE * _bytes(recording))
+        for key, recording in inspected.recordings.items()
+        if recording.framing is None and not _made(inspected, "raw", *key)
+    )
+    pixels = inspected.grid.shape[0] * inspected.grid.shape[1] if inspected.grid else 0
+    if campaign.settings.scene.spacing_m == "auto":
+        pixels = 0
+    echo = images = 0
+    for flight in campaign.flights:
+        sent = inspected.recordings.get((flight.name, flight.transmitter))
+        pulses = len(sent.captures.time) if sent and sent.framing is None else 0
+        for pair in flight.pairs:
+            if waveform and not _made(inspected, "echo", flight.name, pair):
+                echo += round(_ECHO_SHARE * 8 * pulses * waveform.subcarriers)
+            if flight.kind == "image" and not _made(inspected, "image", flight.name, pair):
+                images += _PIXEL_BYTES * pixels
+    return {"raw": raw, "echo": echo, "images": images}
+
+
+def _bytes(recording: Recording) -> int:
+    return int(recording.samples.nbytes)
+
+
+def _made(inspected: Inspected, stage: str, *where: str) -> bool:
+    return (inspected.campaign.root / inspected.campaign.manifest(stage, *where)).is_file()

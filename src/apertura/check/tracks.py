@@ -1,0 +1,82 @@
+"""Flight logs by themselves: whether they can be read, and whether a node can have flown so."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.check.inspected import Inspected, Key
+from apertura.check.tags import span
+from apertura.errors import CampaignError
+from apertura.settings import CONFIG
+
+FASTEST_M_S = 340.0
+"""No node flies faster than sound: times or positions are in another unit."""
+
+_NOWHERE_DEG = 1e-7
+"""A receiver without a fix logs latitude 0 and longitude 0; within a centimetre of there nobody flies."""
+
+
+_ABOUT_S = 10.0  # of the recording: positions further off matter to no pulse
+
+
+def check_tracks(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield logs that cannot be read, epochs at 0° 0° while pulses were sent, no heights, speeds beyond sound."""
+    yield from inspected.unread
+    for key, track in inspected.tracks.items():
+        geodetic, during = inspected.geodetic[key], _during(inspected, key)
+        nowhere = int((np.abs(geodetic[during, :2]) < _NOWHERE_DEG).all(axis=1).sum())
+        seconds = np.diff(track.time.values) / np.timedelta64(1, "s")
+        steps_m = np.linalg.norm(np.diff(track.position.values, axis=0), axis=1)
+        speed = float(np.median(steps_m / seconds))
+        expected, remedy = "positions of a flight", "Drop those lines, or export the log again."
+        found = ""
+        if nowhere:
+            found = f"{nowhere} of {len(geodetic)} epochs at latitude 0, longitude 0: the receiver had no fix"
+        elif np.abs(geodetic[:, 2]).max() < 1e-3:
+            found, expected = "height 0 at every epoch", "metres above the ellipsoid"
+            remedy = "Export the log with its heights."
+        elif speed > FASTEST_M_S:
+            found, expected = f"a median speed of {speed:.0f} m/s", f"less than {FASTEST_M_S:.0f} m/s"
+            remedy = "Check the units of times (seconds) and positions (decimal degrees)."
+        if found:
+            yield CampaignError(found, where=inspected.campaign.track_file(*key), expected=expected, remedy=remedy)
+
+
+def _during(inspected: Inspected, key: Key) -> NDArray[np.bool_]:
+    """Return (epoch,) bool: which epochs positions of pulses rest on; all, where it is not known when it recorded."""
+    times = inspected.tracks[key].time.values
+    if key not in inspected.recordings:
+        return np.ones(len(times), bool)
+    first, last = span(inspected.recordings[key])
+    about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
+    return np.asarray((times >= first - about) & (times <= last + about))
+
+
+def check_attitude(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield nodes whose attitude the config takes from a log that holds none, where an arm or a beam needs it."""
+    campaign = inspected.campaign
+    for (flight, node), track in inspected.tracks.items():
+        stated = campaign.settings.nodes[node].attitude == "log"
+        if stated and _turned(campaign, flight, node) and not np.isfinite(track.attitude.values).any():
+            yield CampaignError(
+                "no roll, pitch and yaw",
+                where=campaign.track_file(flight, node),
+                expected=f"an attitude at every epoch, as {CONFIG}: nodes.{node}.attitude is log",
+                remedy="Log attitude, set the node's attitude to course, or its lever arms to zero and antennas to "
+                "null.",
+            )
+
+
+def _turned(campaign: Campaign, flight: str, node: str) -> bool:
+    """Return whether a node has an antenna in this flight that its attitude moves or turns."""
+    arms = campaign.settings.nodes[node].lever_arms_m
+    for pair in campaign.flight(flight).pairs:
+        legs = dict(zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True))
+        used = [point for point, name in legs.items() if name == node]
+        beams = [point for point, (name, _) in campaign.antennas(pair).items() if name == node]
+        used += ["sidelink"] if used and len(set(legs.values())) > 1 else []
+        if beams or any(any(getattr(arms, point)) for point in used):
+            return True
+    return False

@@ -1,0 +1,413 @@
+"""Before anything runs: logs against recordings, scene against track, ground, calibration, memory and disk."""
+
+import shutil
+from collections import namedtuple
+
+import numpy as np
+import pytest
+import rasterio
+from folders import edit_config, edit_track
+from rasterio.transform import from_origin
+
+from apertura.check import as_line, problems, resources
+from apertura.check.clocks import likely_cause
+from apertura.check.dem import needles
+from apertura.geometry.geodesy import projected_from_ecef
+from apertura.simulation.presets import DEMO_ORIGIN
+
+Usage = namedtuple("Usage", "total used free")
+TX, RX = "raw/f01/uav1.track.csv", "raw/f01/uav2.track.pos"
+
+
+def told(root, **options):
+    return [as_line(problem).replace(f"{root}/", "") for problem in problems(root, **options)]
+
+
+def only(root):
+    """The one problem there is."""
+    lines = told(root)
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def state(root, section, **keys):
+    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
+
+
+def shift_times(root, seconds):
+    """Move the CSV log in time."""
+
+    def moved(line):
+        time, rest = line.split(",", 1)
+        return f"{np.datetime64(time.rstrip('Z'), 'ns') + np.timedelta64(round(seconds * 1e9), 'ns')}Z,{rest}"
+
+    edit_track(root, "uav1", lambda lines: [lines[0], *map(moved, lines[1:])])
+
+
+def edit_place(root, change, node="uav1"):
+    """Change latitude, longitude and height in a node's log."""
+    separator, first = (",", 1) if node == "uav1" else (None, 2)
+
+    def changed(line):
+        cells = line.split(separator)
+        if not cells[0][:1].isdigit():
+            return line
+        cells[first : first + 3] = map(str, change(*map(float, cells[first : first + 3])))
+        return (separator or " ").join(cells)
+
+    edit_track(root, node, lambda lines: list(map(changed, lines)))
+
+
+def test_a_log_18_seconds_late_is_asked_about_gpst(tiny):
+    edit_track(tiny, "uav2", lambda lines: [line.replace("GPST", "UTC ") for line in lines])
+    line = only(tiny)
+    assert line.startswith(f"{RX}: the log begins 1")
+    assert "pulses without a position; log and recording are 18." in line
+    assert "s apart: GPST taken for UTC?" in line
+
+
+@pytest.mark.parametrize(
+    ("shift_s", "cause"),
+    [(18.9, "GPST taken"), (-18.0, "GPST taken off"), (3600 * 9.5, "local time"), (5e5, "another day"), (400.0, "")],
+)
+def test_a_shift_in_time_looks_like_what_makes_it(shift_s, cause):
+    assert cause in likely_cause(shift_s)
+    assert bool(likely_cause(shift_s)) is bool(cause)
+
+
+def test_a_log_may_end_with_the_last_pulse_and_not_before(tiny):
+    shift_times(tiny, -1.9)
+    assert told(tiny) == []
+    shift_times(tiny, -0.2)
+    line = only(tiny)
+    assert line.startswith(f"{TX}: the log ends 0.")
+    assert "of 40 pulses without a position; expected a log that covers the pulses" in line
+
+
+def test_a_log_that_ends_with_poor_solutions_is_left_to_what_is_asked_of_it(tiny):
+    def single(lines):  # the pulses after its last fixed solution are dropped by the echo, and flagged
+        cut = [line for line in lines if line.startswith("%") or line.split()[1] < "09:30:19"]
+        return [*cut[:-3], *(line.replace("   1  18", "   5  18") for line in cut[-3:])]
+
+    edit_track(tiny, "uav2", single)
+    assert told(tiny) == []
+    edit_track(tiny, "uav2", lambda lines: [line.replace("   5  18", "   1  18") for line in lines])
+    assert only(tiny).startswith(f"{RX}: the log ends ")
+
+
+def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
+    edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
+    assert "the same time as the epoch before" in only(tiny)
+
+
+def test_epochs_at_no_place_are_told_while_pulses_are_sent(tiny):
+    edit_track(tiny, "uav1", lambda lines: [*lines[:30], zero(lines[30]), *lines[31:]])
+    assert "1 of 61 epochs at latitude 0, longitude 0: the receiver had no fix" in only(tiny)
+
+
+def test_epochs_at_no_place_long_before_are_not_told(tiny):
+    def early(line):
+        return line.replace("2025-05-14T09:29:58.000000Z", "2025-05-14T09:29:30.000000Z")
+
+    edit_track(tiny, "uav1", lambda lines: [lines[0], zero(early(lines[1])), *lines[2:]])
+    assert told(tiny) == []
+
+
+def zero(line):
+    time, _, _, rest = line.split(",", 3)
+    return f"{time},0.0,0.0,{rest}"
+
+
+def test_a_log_without_heights_is_told_of(tiny):
+    edit_place(tiny, lambda latitude, longitude, _: (latitude, longitude, 0.0))
+    lines = told(tiny)
+    assert lines[0].startswith(f"{TX}: height 0 at every epoch")
+
+
+def test_nobody_flies_faster_than_sound(tiny):
+    edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto"))
+    for stretched, told_of in ((500, False), (3, True)):  # from half a metre per second
+        edit_place(tiny, lambda latitude, *rest, by=stretched: (48.4226 + by * (latitude - 48.4226), *rest))
+        assert any(line.startswith(f"{TX}: a median speed of") for line in told(tiny)) is told_of
+
+
+def test_an_attitude_is_missed_where_an_arm_needs_it(tiny):
+    edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
+    line = only(tiny)
+    assert line.startswith(f"{TX}: no roll, pitch and yaw")
+    assert "nodes.uav1.attitude is log" in line
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
+    assert told(tiny) == []
+
+
+def test_latitude_and_longitude_swapped_in_one_log_puts_the_earth_between_nodes(tiny):
+    edit_place(tiny, lambda latitude, longitude, up: (longitude, latitude, up), node="uav2")
+    lines = told(tiny)
+    assert f"{RX}: 5393 km from uav1: latitude 9.95" in "\n".join(lines)
+    assert "expected nodes in sight of each other" in "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (lambda lat, lon, up: (lon, lat, up), "Are latitude and longitude swapped in the logs?"),
+        (lambda lat, lon, up: (lat, -lon, up), "Has longitude the wrong sign in the logs"),
+        (lambda lat, lon, up: (-lat, lon, up), "Has latitude the wrong sign in the logs"),
+        (lambda lat, lon, up: (np.radians(lat), np.radians(lon), up), "Are the logs in radians?"),
+        (
+            lambda lat, lon, up: (lat, lon, up / 0.3048),
+            "m above the ground: check heights in the logs (metres, not feet",
+        ),
+    ],
+)
+def test_logs_far_from_the_scene_are_asked_about_what_would_bring_them_there(tiny, change, remedy):
+    for node in ("uav1", "uav2"):
+        edit_place(tiny, change, node=node)
+    line = only(tiny)
+    assert "from the track of f01 uav1-uav1, uav1-uav2: no echo travels less than" in line
+    assert remedy in line
+
+
+def bounds_of(root):
+    found = []
+    edit_config(root, lambda document: found.extend(document["scene"]["bounds_m"]))
+    return found
+
+
+def test_a_scene_in_the_neighbouring_zone_is_444_km_away(tiny):
+    state(tiny, "scene", crs="EPSG:32633")
+    line = only(tiny)
+    assert "the scene lies 444 km from the track" in line
+    assert "Is scene.crs EPSG:32632, the zone of the track, instead of EPSG:32633?" in line
+
+
+def test_bounds_in_degrees_look_like_degrees(tiny):
+    state(tiny, "scene", bounds_m=[9.9545, 48.4225, 9.9555, 48.4235], spacing_m=0.0001)
+    assert "These look like degrees: give scene.bounds_m in metres of EPSG:32632." in only(tiny)
+    state(tiny, "scene", crs="EPSG:25832")
+    line = only(tiny)
+    assert line.startswith("config/config.yaml: scene.bounds_m: bounds_m [9.9545, 48.4225, 9.9555, 48.4235] are not in")
+    assert "These look like degrees" in line
+
+
+def test_bounds_with_northing_first_are_told_so(tiny):
+    xmin, ymin, xmax, ymax = bounds_of(tiny)
+    state(tiny, "scene", bounds_m=[ymin, xmin, ymax, xmax])
+    assert "easting before northing" in only(tiny)
+
+
+def test_a_scene_is_far_where_no_echo_of_it_arrives_inside_the_prefix(tiny):
+    xmin, ymin, xmax, ymax = bounds_of(tiny)
+    for north_m, far in ((90.0, False), (130.0, True)):  # 234 m of total path
+        state(tiny, "scene", bounds_m=[xmin, ymin + north_m, xmax, ymax + north_m])
+        assert bool(told(tiny)) is far
+    state(tiny, "waveform", cyclic_prefix_s=1.4e-6)
+    assert told(tiny) == []
+
+
+@pytest.mark.parametrize(
+    ("crs", "found"),
+    [
+        ("EPSG:4326", "EPSG:4326 (WGS 84) counts in degrees"),
+        ("EPSG:2225", "counts in US survey foot"),
+        ("EPSG:4978", "EPSG:4978 (WGS 84) is not projected"),
+        ("EPSG:99999", "'EPSG:99999' is unknown to PROJ"),
+        ("local", "local for recordings whose logs hold latitude and longitude"),
+    ],
+)
+def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
+    state(tiny, "scene", crs=crs)
+    line = only(tiny)
+    assert line.startswith("config/config.yaml: scene.crs: ")
+    assert found in line
+    if crs in {"EPSG:4326", "EPSG:2225", "EPSG:4978"}:
+        assert "Set scene.crs to EPSG:32632, the zone of the place" in line
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"crs": "auto"},
+        {"crs": "auto", "bounds_m": "auto", "spacing_m": "auto"},
+        {"bounds_m": "auto"},
+        {"spacing_m": "auto"},
+        {"crs": "EPSG:25832"},
+    ],
+    ids=str,
+)
+def test_what_is_auto_and_what_is_near_is_no_problem(tiny, keys):
+    state(tiny, "scene", **keys)
+    assert told(tiny) == []
+
+
+def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
+    (tmp_path / "config").mkdir()
+    (tmp_path / "raw/f01").mkdir(parents=True)
+    for number, file in enumerate(sorted((shared / "gotcha_afrl").glob("*.mat"))):
+        shutil.copyfile(file, tmp_path / f"raw/f01/radar.{number}.mat")
+    config = (
+        "campaign: gotcha\nwaveform: {kind: phase_history, format: afrl_mat}\nnodes: {radar: {}}\n"
+        "scene: {crs: local, bounds_m: [-50, -50, 50, 50], spacing_m: 0.2}\n"
+    )
+    (tmp_path / "config/config.yaml").write_text(config)
+    (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tradar\tradar\n")
+    assert told(tmp_path) == []
+    state(tmp_path, "scene", crs="EPSG:32616")
+    assert "EPSG:32616 for phase history in metres of its own frame; expected local" in only(tmp_path)
+
+
+def test_a_track_must_be_above_the_ground(tiny):
+    state(tiny, "scene", height_m=624.0)
+    assert told(tiny) == []
+    state(tiny, "scene", height_m=626.0)
+    line = only(tiny)
+    assert line.startswith("config/config.yaml: scene.height_m: flight f01, uav1, uav2: -1.")
+    assert "logs may count from the geoid" in line
+
+
+def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
+    """A DEM about the middle of the scene; heights (row, column)."""
+    east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
+    rows, columns = heights.shape
+    place = from_origin(east + east_m - columns * post_m / 2, north + rows * post_m / 2, post_m, post_m)
+    kind = {"width": columns, "height": rows, "count": 1, "dtype": "float64", "crs": "EPSG:32632"}
+    with rasterio.open(root / "dem.tif", "w", "GTiff", transform=place, **kind) as raster:
+        raster.write(heights, 1)
+    state(root, "scene", dem="dem.tif", dem_datum="ellipsoid")
+
+
+FLAT = np.full((60, 60), 600.0)
+
+
+def with_post(height_m, row=30, column=30):
+    return np.where((np.arange(60)[:, None] == row) & (np.arange(60) == column), height_m, FLAT)
+
+
+@pytest.mark.parametrize(
+    ("heights", "spike"),
+    [
+        (FLAT, False),
+        (FLAT + 500.0 * (np.arange(60) > 30) - 490, False),  # a cliff through the scene
+        (with_post(900.0), False),
+        (with_post(3600.0), True),
+        (with_post(-400.0), True),
+        (with_post(3600.0, row=5), False),  # beside the scene
+    ],
+    ids=["flat", "cliff", "mast", "spike", "pit", "beside"],
+)
+def test_a_post_that_stands_out_by_kilometres_is_told_and_a_cliff_is_not(tiny, heights, spike):
+    write_dem(tiny, heights)
+    lines = [line for line in told(tiny) if "stand out so" in line]
+    assert bool(lines) is spike
+    assert all(line.startswith("dem.tif: ") and "where the land about it has 600 m" in line for line in lines)
+
+
+def test_needles_are_narrower_than_a_window_and_higher_than_asked():
+    x, y = np.meshgrid(np.arange(80.0), np.arange(80.0))
+    rough = 1000 * np.abs(x - 40) / 40 + 400 * np.sin(x / 9) * np.cos(y / 7) + 3000.0 * (y > x)  # hills and a cliff
+    assert not needles(rough, taller_than_m=500.0).any()
+    for width, found in ((1, True), (5, True), (8, False)):
+        spiked = rough * 0
+        spiked[40 : 40 + width, 40 : 40 + width] = 600.0
+        assert needles(spiked, taller_than_m=500.0).any() == found
+        assert not needles(spiked, taller_than_m=601.0).any()
+    spiked[:] = np.where(x < 2, 3000.0, 0.0)  # a cliff at the edge of what is known
+    assert not needles(spiked, taller_than_m=500.0).any()
+
+
+def test_a_dem_that_ends_inside_the_scene_is_told(tiny):
+    write_dem(tiny, FLAT, east_m=28.0)
+    assert "% of the scene lies outside the DEM, to the west" in only(tiny)
+
+
+def test_heights_that_are_not_on_earth_matter_under_the_scene_alone(tiny):
+    write_dem(tiny, with_post(-32767.0, row=25))  # 5 m north of the middle of 6 m
+    assert told(tiny) == []
+    write_dem(tiny, with_post(-32767.0))
+    assert "have no height on Earth" in only(tiny)
+
+
+def test_a_track_below_the_dem_is_told(tiny):
+    write_dem(tiny, FLAT + 27)
+    edit_place(tiny, lambda *place: (DEMO_ORIGIN.latitude_deg, DEMO_ORIGIN.longitude_deg, place[2]))
+    assert only(tiny).startswith("config/config.yaml: scene.dem: flight f01, uav1: -2.")
+
+
+def test_a_dem_that_is_none_is_told(tiny):
+    write_dem(tiny, FLAT)
+    (tiny / "dem.tif").write_bytes(b"no raster")
+    assert "dem.tif: not readable" in only(tiny)
+
+
+CALIBRATION = {"flight": "c01", "reflector_m": [570660.0, 5363700.0, 620.0]}
+
+
+def fly_calibration(root, kind="calibration", nodes="uav1,uav2"):
+    shutil.copytree(root / "raw/f01", root / "raw/c01")
+    lines = f"f01\timage\tuav1\tuav1,uav2\nc01\t{kind}\tuav1\t{nodes}\n"
+    (root / "config/flights.tsv").write_text(f"flight\tkind\ttransmitter\tnodes\n{lines}")
+
+
+def test_a_calibration_flight_calibrates_every_pair(tiny):
+    fly_calibration(tiny)
+    assert "no section calibration" in only(tiny)
+    edit_config(tiny, lambda document: document.update(calibration=CALIBRATION))
+    assert told(tiny) == []
+    fly_nodes = (tiny / "config/flights.tsv").read_text().replace("c01\tcalibration\tuav1\tuav1,uav2", "{}")
+    (tiny / "config/flights.tsv").write_text(fly_nodes.format("c01\tcalibration\tuav1\tuav1"))
+    assert "flight f01 has pairs uav1-uav2, which c01 did not calibrate" in only(tiny)
+    (tiny / "config/flights.tsv").write_text(fly_nodes.format("c01\timage\tuav1\tuav1,uav2"))
+    assert "calibration.flight: flight c01 is of kind image" in only(tiny)
+    (tiny / "config/flights.tsv").write_text(fly_nodes.replace("{}\n", ""))
+    assert "calibration.flight: flight c01 is not in the table" in only(tiny)
+
+
+def test_a_reflector_out_of_reach_is_told(tiny):
+    fly_calibration(tiny)
+    swapped = CALIBRATION | {"reflector_m": [5363700.0, 570660.0, 620.0]}
+    edit_config(tiny, lambda document: document.update(calibration=swapped))
+    line = only(tiny)
+    assert line.startswith("config/config.yaml: calibration.reflector_m: [5363700.0, 570660.0, 620.0] is ")
+
+
+def test_a_beam_pattern_that_is_none_is_told(tiny):
+    (tiny / "config/horn.csv").write_text("cut,angle_deg,gain_db\nazimuth,0,0\n")
+    antenna = {"boresight_deg": [90, -20], "pattern": "config/horn.csv"}
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(antennas={"radar_rx": antenna}))
+    assert only(tiny).startswith("config/horn.csv: ")
+
+
+def swell(root, size):
+    """Make a recording larger than it is: a sparse file, whose last capture is long."""
+    with (root / "raw/f01/uav1.sigmf-data").open("r+b") as stream:
+        stream.truncate(size)
+
+
+def test_memory_must_hold_three_times_the_largest_recording(tiny, monkeypatch):
+    swell(tiny, 400_000_000)
+    monkeypatch.setattr(resources, "free_memory", lambda: 1_400_000_000)
+    assert told(tiny, without=["disk"]) == []
+    monkeypatch.setattr(resources, "free_memory", lambda: 1_300_000_000)
+    line = told(tiny, without=["disk"])
+    assert "0.4 GB recorded by uav1 in f01 take at least 1.4 GB of memory; expected at most the 1.3 GB" in line[0]
+    assert told(tiny, without=["disk", "memory"]) == []
+
+
+def test_free_memory_is_what_is_available_and_no_more_than_the_limit(tmp_path):
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:    1000 kB\nSwapFree:  24 kB\n")
+    assert resources.free_memory(tmp_path / "meminfo") == 1024 * 1024
+
+
+def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):
+    swell(tiny, 400_000_000)
+    free = {"bytes": 400_000_000}
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, free["bytes"]))
+    assert told(tiny) == []
+    free["bytes"] = 300_000_000
+    line = only(tiny)
+    assert "results take at least 0.34 GB more (raw 0.34 GB, echo 0.00 GB, images 0.00 GB)" in line
+    assert "expected at most the 0.30 GB that are free" in line
+    manifest = tiny / "results/f01/uav1/raw.manifest.json"
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text("{}")
+    assert told(tiny) == []
