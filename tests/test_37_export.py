@@ -16,11 +16,12 @@ from rasterio import Affine
 
 from apertura.errors import CampaignError, ContractError
 from apertura.export import exports_in
-from apertura.export.cog import READ, write_power, write_slc
+from apertura.export.cog import write_power, write_slc
 from apertura.export.db import write_db
 from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
 from apertura.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.export.quicklook import below_peak, shrink, write_quicklook
+from apertura.export.writing import READ
 from apertura.geometry.geodesy import local_crs
 
 ROOT = Path(__file__).parents[1]

@@ -6,6 +6,7 @@ Commands import what they run when they run: help and mistakes in the command li
 import os
 import pkgutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ import typer
 
 from apertura import __version__
 from apertura.atlas.commands import app as study
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, explained
 from apertura.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
 
 if TYPE_CHECKING:
@@ -55,15 +56,25 @@ def main() -> None:
         except CampaignError as error:
             from apertura.settings import located
 
-            print(f"error: {located(str(error))}", file=sys.stderr)
+            _say(located(str(error)))
             leave_status(2)
             raise SystemExit(2) from None
         except Interrupted as signalled:
-            print(signalled.code, file=sys.stderr)
+            _say(str(signalled.code))
             raise SystemExit(INTERRUPTED) from None
-        except Exception:
-            leave_status(1)
-            raise
+        except Exception as error:
+            message = explained(error)
+            leave_status(2 if message else 1)
+            if message is None:
+                raise
+            _say(message)
+            raise SystemExit(2) from None
+
+
+def _say(message: str) -> None:
+    """Print an error where the reader of the output may have gone."""
+    with suppress(OSError):
+        print(f"error: {message}", file=sys.stderr, flush=True)
 
 
 def _print_version(asked: bool) -> None:

@@ -19,15 +19,12 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
-from apertura.atomic import replacement
 from apertura.errors import CampaignError, ContractError
+from apertura.export.writing import Block, added, blocks_of, check_written, gdal_replacement
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
-READ = 4 * BLOCK  # pixels along a side of what is held in memory at once
-GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no .aux.xml beside the file
 
 Pixels = NDArray[Any]
-Block = tuple[slice, slice]
 
 
 class Raster(Protocol):
@@ -156,10 +153,10 @@ def write_cog(
         As `write_slc`.
     """
     place = placed(image, transform, crs)
-    with replacement(path) as temporary, rasterio.Env(**GDAL):
+    with gdal_replacement(path) as temporary:
         source = temporary.with_name("source.tif")
-        fill(source, lambda block: value(np.asarray(image[block])), band, place, described(tags, title))
-        finish(source, temporary, band)
+        checksum = fill(source, lambda block: value(np.asarray(image[block])), band, place, described(tags, title))
+        finish(source, temporary, band, checksum)
 
 
 def power(image: Pixels) -> NDArray[np.float32]:
@@ -207,8 +204,9 @@ def described(tags: Mapping[str, str], title: str) -> dict[str, str]:
 
 def fill(
     path: Path, read: Callable[[Block], Pixels], band: Band, place: Mapping[str, Any], tags: Mapping[str, str]
-) -> None:
-    """Write a plain tiled GeoTIFF block by block, tags included."""
+) -> int:
+    """Write a plain tiled GeoTIFF block by block, tags included; return a sum over its pixels."""
+    checksum = 0
     layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "BIGTIFF": "IF_SAFER"}
     form = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata}
     with warnings.catch_warnings():
@@ -218,14 +216,15 @@ def fill(
         raster.update_tags(**tags)
         raster.set_band_description(1, band.meaning)
         raster.set_band_unit(1, band.unit)
-        for top in range(0, raster.height, READ):
-            for left in range(0, raster.width, READ):
-                block = slice(top, min(top + READ, raster.height)), slice(left, min(left + READ, raster.width))
-                raster.write(read(block), 1, window=Window.from_slices(*block))
+        for block in blocks_of(raster.shape):
+            pixels = read(block).astype(band.dtype, copy=False)
+            checksum = added(checksum, pixels)
+            raster.write(pixels, 1, window=Window.from_slices(*block))
+    return checksum
 
 
-def finish(source: Path, target: Path, band: Band) -> None:
-    """Turn a GeoTIFF into a COG; overviews that `source` has are kept."""
+def finish(source: Path, target: Path, band: Band, checksum: int) -> None:
+    """Turn a GeoTIFF into a COG that reads back as it was filled; overviews that `source` has are kept."""
     rasterio.shutil.copy(
         source,
         target,
@@ -236,3 +235,4 @@ def finish(source: Path, target: Path, band: Band) -> None:
         BIGTIFF="IF_SAFER",
         OVERVIEW_RESAMPLING=band.overviews,
     )
+    check_written(target, checksum)

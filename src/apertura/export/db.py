@@ -10,8 +10,8 @@ from rasterio import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window
 
-from apertura.atomic import replacement
-from apertura.export.cog import BLOCK, GDAL, POWER, Band, Block, Pixels, Raster, described, fill, finish, placed, power
+from apertura.export.cog import BLOCK, POWER, Band, Pixels, Raster, described, fill, finish, placed, power
+from apertura.export.writing import Block, check_written, gdal_replacement
 
 DB = Band("float32", np.nan, "dB", "power of the focused scene, 10 log10", "AVERAGE")
 
@@ -39,9 +39,10 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
-    with replacement(path) as temporary, rasterio.Env(**GDAL):
+    with gdal_replacement(path) as temporary:
         linear = temporary.with_name("power.tif")
-        fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {})
+        check_written(linear, fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {}))
+        checksums = []
         levels = max(0, int(np.ceil(np.log2(max(image.shape) / BLOCK))))
         with rasterio.open(linear, "r+") as raster:
             raster.build_overviews([2**level for level in range(1, levels + 1)], Resampling.average)
@@ -49,14 +50,16 @@ def write_db(
         for level in range(levels + 1):
             with rasterio.open(linear, **({"OVERVIEW_LEVEL": level - 1} if level else {})) as mean:
                 size = {"height": mean.height, "width": mean.width}
-                fill(
-                    temporary.with_name("source.tif" + level * ".ovr"),
-                    partial(_read_decibels, mean),
-                    DB,
-                    size if level else place,
-                    {} if level else described(tags, title),
+                checksums.append(
+                    fill(
+                        temporary.with_name("source.tif" + level * ".ovr"),
+                        partial(_read_decibels, mean),
+                        DB,
+                        size if level else place,
+                        {} if level else described(tags, title),
+                    )
                 )
-        finish(temporary.with_name("source.tif"), temporary, DB)
+        finish(temporary.with_name("source.tif"), temporary, DB, checksums[0])
 
 
 def _read_decibels(mean: rasterio.DatasetReader, block: Block) -> Pixels:

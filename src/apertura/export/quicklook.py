@@ -13,9 +13,10 @@ from rasterio import Affine
 from rasterio.transform import array_bounds
 
 from apertura.atomic import replacement
-from apertura.export.cog import READ, Raster, placed, power
+from apertura.export.cog import Raster, placed, power
 from apertura.export.db import decibels
 from apertura.export.map_layout import DPI, PICTURE_DOTS, MapLayout, Marker
+from apertura.export.writing import READ
 
 
 def write_quicklook(

@@ -1,13 +1,16 @@
 """Work in progress: who may write a stage, its arrays written chunk by chunk, and the rename that finishes it."""
 
+import errno
 import fcntl
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
+import json
+import logging
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from apertura.atomic import rename
+from apertura.atomic import naming, remove, rename, write_beside
 from apertura.contracts import Window
 from apertura.provenance import canonical_json, sha256_tree
 from apertura.store.manifest import manifest_of, write_manifest
@@ -15,6 +18,7 @@ from apertura.store.manifest import manifest_of, write_manifest
 if TYPE_CHECKING:
     import xarray as xr
 
+_LOG = logging.getLogger(__name__)
 _PROVENANCE = ("runspec", "inputs", "code_sha256")
 
 
@@ -55,7 +59,7 @@ def sharing(
     """
     with _opened(folder) as (wip, lock):
         fcntl.flock(lock, fcntl.LOCK_SH)
-        if not is_work_on(wip, stage):
+        if not (is_work_on(wip, stage) and _is_intact(wip, _skeleton(stage, name, windows))):
             _take(lock, folder, wip)
             resume(wip, stage, name, windows)
             fcntl.flock(lock, fcntl.LOCK_SH)  # not atomic: another writer may come between
@@ -87,6 +91,8 @@ def _lock_of(folder: Path) -> Path:
 def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> list[Window]:
     """Return the windows of array `name` that `wip` does not hold yet; create `wip` if it is absent or other work.
 
+    Nothing found in `wip` is trusted: what is damaged is made again, and a notice says so.
+
     Parameters
     ----------
     wip
@@ -102,29 +108,92 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
     -----
     Work in progress is other work when its settings, inputs or code differ.
     """
-    if not is_work_on(wip, stage):
-        create(wip, stage, {name: _chunk(windows)})
+    files = _skeleton(stage, name, windows)
+    if is_work_on(wip, stage):
+        _repair(wip, files, {f"{name}/{_key(window, windows)}" for window in windows})
+    else:
+        _begin(wip, files)
     return missing(wip, name, windows)
 
 
 def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
     """Return whether `wip` was begun with the settings, inputs and code of the stamped `stage`."""
-    expected = {key: stage.attrs[key] for key in _PROVENANCE}
     try:
-        begun = writable_zarr().open_group(wip, mode="r").attrs
-        return {key: begun[key] for key in expected} == expected
-    except (FileNotFoundError, KeyError, ValueError):
+        begun = json.loads((wip / "zarr.json").read_bytes())["attributes"]
+        return {key: begun[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (ValueError, TypeError, KeyError, RecursionError, IsADirectoryError) as error:
+        _notice(wip / "zarr.json", error, "all of it is begun anew")
         return False
 
 
 def missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` whose chunks `wip` does not hold; a chunk file that exists is complete."""
-    chunks, (rows, columns) = wip / name / "c", _chunk(windows)
-    return [
-        window
-        for window in windows
-        if not (chunks / str(window[0].start // rows) / str(window[1].start // columns)).is_file()
-    ]
+    """Return the windows of array `name` whose chunks `wip` does not hold as they were written.
+
+    A chunk that is damaged is removed, and a notice says so.
+    """
+    array = open_array(wip, name, "r")
+    return [window for window in windows if not _is_whole(wip / name / _key(window, windows), array, window)]
+
+
+def _is_whole(path: Path, array: Any, window: Window) -> bool:
+    if not path.is_file():
+        remove(path)
+        return False
+    try:
+        array[window]
+    except MemoryError:
+        raise
+    except Exception as error:  # a codec may raise anything
+        if isinstance(error, OSError) and error.errno != errno.EIO:
+            raise
+        _notice(path, error, "it is formed again")
+        remove(path)
+        return False
+    return True
+
+
+def _notice(path: Path, error: BaseException, what: str) -> None:
+    """Tell on stderr, where nothing else is set up, that something in work in progress is made again."""
+    _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, what)
+
+
+def _skeleton(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> dict[str, bytes]:
+    from apertura.store.chunks import skeleton
+
+    return skeleton(stage, {name: _chunk(windows)})
+
+
+def _begin(wip: Path, files: Mapping[str, bytes]) -> None:
+    remove(wip)
+    for name in sorted(files, reverse=True):  # zarr.json of the stage, by which it is known, comes last
+        write_beside(wip / name, files[name])
+
+
+def _is_intact(wip: Path, files: Mapping[str, bytes]) -> bool:
+    """Return whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
+    paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
+    return all(path.is_file() and path.read_bytes() == content for path, content in paths)
+
+
+def _repair(wip: Path, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
+    """Bring metadata and coordinates of work in progress back to how it was begun; remove what does not belong."""
+    for path in [path for path in wip.rglob("*") if not path.is_dir()]:
+        if (name := path.relative_to(wip).as_posix()) not in files and name not in chunks:
+            path.unlink()
+    for name, content in files.items():
+        path = wip / name
+        if not path.is_file() or path.read_bytes() != content:
+            if name != "zarr.json":  # of a finished stage it also says what was measured
+                _notice(path, ValueError("not as it was written"), "it is written again")
+            remove(path)
+            write_beside(path, content)
+
+
+def _key(window: Window, windows: Sequence[Window]) -> str:
+    """Return where the chunk of a window lies in its array."""
+    return "/".join(["c", *(str(part.start // size) for part, size in zip(window, _chunk(windows), strict=True))])
 
 
 def _chunk(windows: Sequence[Window]) -> tuple[int, ...]:
@@ -144,34 +213,18 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
     chunks
         Array name → shape of its chunks. One process at a time may write a chunk.
     """
-    zarr = writable_zarr()
-    shutil.rmtree(wip, ignore_errors=True)
-    stage.drop_vars(list(chunks)).to_zarr(wip, mode="w", consolidated=False, zarr_format=3)
-    group = zarr.open_group(wip, mode="r+")
-    for name, shape in chunks.items():
-        array = stage[name]
-        group.create_array(
-            name,
-            shape=array.shape,
-            chunks=shape,
-            dtype=array.dtype,
-            fill_value=array.values.flat[0],  # what a chunk that nobody writes holds
-            dimension_names=[str(dim) for dim in array.dims],
-            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
-        )
+    from apertura.store.chunks import skeleton
+
+    _begin(wip, skeleton(stage, chunks))
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
     """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
-    return writable_zarr().open_array(folder / name, mode=mode)
-
-
-def writable_zarr() -> Any:
-    """Return module zarr, imported when it is needed, set to write chunks of zeros: no chunk means not computed yet."""
     import zarr
 
-    zarr.config.set({"array.write_empty_chunks": True})
-    return zarr
+    from apertura.store.chunks import StageStore
+
+    return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
 
 
 def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None, **attributes: Any) -> None:
@@ -187,11 +240,18 @@ def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None,
         Attributes of the stage that are known only now, such as what was measured on it.
     """
     if attributes:
-        writable_zarr().open_group(wip, mode="r+").attrs.update(attributes)
+        import zarr
+
+        from apertura.store.chunks import StageStore
+
+        zarr.open_group(StageStore(wip), mode="r+").attrs.update(attributes)
     for partial in wip.rglob("*.partial"):  # what a killed writer left
         partial.unlink()
     files = sha256_tree(wip)
-    _lock_of(folder).write_text(canonical_json(files), encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
+    with naming(_lock_of(folder)), _lock_of(folder).open("w", encoding="utf-8") as lock:
+        lock.write(canonical_json(files))
+        lock.flush()
+        os.fsync(lock.fileno())
+    remove(folder)
     rename(wip, folder)
     write_manifest(manifest_of(folder), {f"{folder.name}/{name}": digest for name, digest in files.items()}, lineage)

@@ -1,13 +1,13 @@
 """Stages saved at once, and opened after checking."""
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from apertura.atomic import naming, remove
 from apertura.contracts import check
 from apertura.store.manifest import check_files
-from apertura.store.progress import finish, writable_zarr, writing
+from apertura.store.progress import finish, writing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -33,19 +33,11 @@ def save_stage(
     lineage
         What it was made from, as `apertura.store.manifest.write_manifest` takes it.
     """
-    writable_zarr()
-    with writing(folder) as wip:
-        shutil.rmtree(wip, ignore_errors=True)
-        encoding: dict[Any, dict[str, Any]] = {
-            name: {"chunks": tuple((chunks or {}).get(str(dim), size) for dim, size in array.sizes.items())}
-            for name, array in dataset.variables.items()
-            if array.ndim and array.size
-        }
-        for name in set(encoding) & {"time"}:
-            encoding[name] |= {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
-        for name, array in dataset.data_vars.items():
-            if "spatial_ref" in dataset.variables and {"y", "x"} <= set(array.dims):
-                encoding[name]["grid_mapping"] = "spatial_ref"
+    from apertura.store.chunks import encoding_of
+
+    with writing(folder) as wip, naming(folder):
+        remove(wip)
+        encoding = encoding_of(dataset, chunks or {})
         dataset.to_zarr(wip, mode="w", consolidated=False, zarr_format=3, encoding=encoding)
         finish(wip, folder, lineage=lineage)
 
@@ -56,11 +48,13 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
     Raises
     ------
     CampaignError
-        If the folder is missing, or is not what the manifest describes.
+        If the folder is missing, or is not what the manifest describes; later, if a chunk that is read is damaged.
     ContractError
         If its arrays break the contract.
     """
     import xarray as xr
 
+    from apertura.store.chunks import StageStore
+
     check_files(folder)
-    return check(xr.open_zarr(folder, consolidated=False, chunks=None), stage)
+    return check(xr.open_zarr(StageStore(folder, read_only=True), consolidated=False, chunks=None), stage)

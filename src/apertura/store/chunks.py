@@ -1,0 +1,130 @@
+"""Chunks on disk: brought to the disk before they have their name, and checked by their sum when they are read."""
+
+import asyncio
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import google_crc32c
+import zarr
+from zarr.abc.store import ByteRequest
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore, MemoryStore
+
+from apertura.atomic import write_beside
+from apertura.errors import CampaignError
+from apertura.store.manifest import manifest_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+zarr.config.set({"array.write_empty_chunks": True})  # no chunk means not computed yet: zeros are written too
+
+CODECS = (ZstdCodec(), Crc32cCodec())
+"""How the bytes of a chunk are packed; the sum comes last, so that it is over the bytes on the disk."""
+
+_SUM_BYTES = 4
+
+
+class StageStore(LocalStore):
+    """A folder of a stage, as zarr reads and writes it.
+
+    A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out.
+    """
+
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """Return a file of the folder; `CampaignError` if it is a chunk and not what was written."""
+        return self._checked(key, await super().get(key, prototype, byte_range), byte_range)
+
+    def get_sync(
+        self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """As `get`."""
+        return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write a file of the folder."""
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """As `set`."""
+        self._check_writable()
+        write_beside(self.root / key, value.to_bytes())
+
+    def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
+        if value is None or byte_range is not None or key.endswith("zarr.json"):
+            return value
+        content = value.as_numpy_array()
+        if google_crc32c.value(content[:-_SUM_BYTES].tobytes()) == int.from_bytes(
+            content[-_SUM_BYTES:].tobytes(), "little"
+        ):
+            return value
+        raise damaged(self.root, key)
+
+
+def damaged(folder: Path, key: str) -> CampaignError:
+    """Return the error that a chunk of a stage, finished or in work, is not what was written."""
+    finished = folder.suffix == ".zarr"
+    return CampaignError(
+        "damaged since it was written",
+        where=folder / key,
+        expected="bytes that agree with their sum",
+        remedy=f"Delete {manifest_of(folder)} and run the workflow again." if finished else "Run the workflow again.",
+    )
+
+
+def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashable, dict[str, Any]]:
+    """Return how each variable of a stage is written.
+
+    Parameters
+    ----------
+    dataset
+        The stage.
+    chunks
+        Dimension → chunk length; a dimension not named is one chunk.
+    """
+    encoding: dict[Hashable, dict[str, Any]] = {}
+    for name, array in dataset.variables.items():
+        encoding[name] = {"compressors": CODECS}
+        if array.ndim and array.size:
+            encoding[name]["chunks"] = tuple(chunks.get(str(dim), size) for dim, size in array.sizes.items())
+    if "time" in encoding:
+        encoding["time"] |= {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
+    if "spatial_ref" in dataset.variables:
+        for name, values in dataset.data_vars.items():
+            if {"y", "x"} <= set(values.dims):
+                encoding[name]["grid_mapping"] = "spatial_ref"
+    return encoding
+
+
+def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> dict[str, bytes]:
+    """Return the files of a stage before anything is computed: its metadata and coordinates, path → bytes.
+
+    Parameters
+    ----------
+    stage
+        The stamped stage; of the arrays in `chunks` only dims, dtype, fill value and attributes count, so they may be
+        broadcast.
+    chunks
+        Array that is written chunk by chunk → shape of its chunks.
+    """
+    files: dict[str, Buffer] = {}
+    rest, store = stage.drop_vars(list(chunks)), MemoryStore(files)
+    rest.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(rest, {}))
+    group = zarr.open_group(store, mode="r+")
+    for name, shape in chunks.items():
+        array = stage[name]
+        group.create_array(
+            name,
+            shape=array.shape,
+            chunks=shape,
+            dtype=array.dtype,
+            compressors=CODECS,
+            fill_value=array.values.flat[0],  # what a chunk that nobody writes holds
+            dimension_names=[str(dim) for dim in array.dims],
+            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
+        )
+    return {path: content.to_bytes() for path, content in files.items()}
