@@ -4,7 +4,6 @@ Commands import what they run when they run: help and mistakes in the command li
 """
 
 import os
-import pkgutil
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -16,19 +15,18 @@ from apertura import __version__
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError, explained
 from apertura.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
+from apertura.step_commands import Threads
+from apertura.step_commands import app as step
 
 if TYPE_CHECKING:
     from apertura.campaign import Campaign
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="SAR images from campaign folders.")
-step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
-Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
 Cores = Annotated[int, typer.Option(help="cores to use")]
-Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
@@ -40,12 +38,6 @@ def _opened(campaign: Path) -> "Campaign":
     from apertura.campaign import Campaign
 
     return Campaign.load(campaign)
-
-
-def _run(function: str, campaign: Path, *arguments: str, **options: object) -> None:
-    """Run ``module:function`` on a campaign and print the paths that it wrote."""
-    written = pkgutil.resolve_name(function)(_opened(campaign), *arguments, **options)
-    print(*([written] if isinstance(written, Path) else written), sep="\n")
 
 
 def main() -> None:
@@ -185,87 +177,3 @@ def simulate(
         raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
     chosen = paths[0] if len(paths) > 1 else simulation.preset(preset or "demo")
     print(simulation.simulate(paths[-1], chosen, seed=seed))
-
-
-@step.command()
-def ingest(flight: str, node: str, campaign: Directory = HERE) -> None:
-    """Read a node's recording and flight log into raw.zarr and track.zarr."""
-    _run("apertura.steps.ingest:ingest", campaign, flight, node)
-
-
-@step.command()
-def echo(flight: str, pair: str, campaign: Directory = HERE) -> None:
-    """Turn recordings of a pair into calibrated transfer functions, echo.zarr."""
-    _run("apertura.steps.echo:echo", campaign, flight, pair)
-
-
-@step.command()
-def calibrate(flight: str, campaign: Directory = HERE) -> None:
-    """Estimate the path offsets of a calibration flight's pairs, calibration.json."""
-    _run("apertura.steps.calibration:calibrate", campaign, flight)
-
-
-@step.command()
-def scene(campaign: Directory = HERE) -> None:
-    """Settle the campaign's grid, scene.json."""
-    _run("apertura.steps.scene:scene", campaign)
-
-
-@step.command()
-def terrain(campaign: Directory = HERE) -> None:
-    """Bring the DEM onto the campaign's grid, terrain.zarr."""
-    _run("apertura.steps.terrain:terrain", campaign)
-
-
-@step.command()
-def layers(campaign: Directory = HERE, threads: Threads = 1) -> None:
-    """Write incidence, bistatic angle and the mask of shadow and layover as GeoTIFFs."""
-    _run("apertura.steps.layers:layers", campaign, threads=threads)
-
-
-@step.command()
-def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
-    """Compress a pair in range over the scene, profile.zarr."""
-    _run("apertura.steps.profile:profile", campaign, flight, pair)
-
-
-@step.command()
-def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
-    """Focus a pair's image, image.zarr."""
-    _run("apertura.steps.image:image", campaign, flight, pair, threads=threads)
-
-
-@step.command()
-def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
-    """Form one job's share of a pair's tiles, '2-of-8'; step image finishes them."""
-    _run("apertura.steps.image:tiles", campaign, flight, pair, share, threads=threads)
-
-
-@step.command("chart")
-def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
-    """Time and measure every engine and setting on a pair, for at most so many seconds."""
-    _run("apertura.study.chart.speed_accuracy:speed_accuracy", campaign, flight, pair, seconds=seconds)
-
-
-@step.command()
-def whole_chart(campaign: Directory = HERE, repeats: Annotated[int, typer.Option(min=1)] = 3) -> None:
-    """Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png."""
-    _run("apertura.study.chart.whole:whole_chart", campaign, repeats=repeats)
-
-
-@step.command()
-def assess(flight: str, campaign: Directory = HERE) -> None:
-    """Compare the images of a flight with each other, and choose what is added up, assessment.json."""
-    _run("apertura.steps.assess:assess", campaign, flight)
-
-
-@step.command()
-def cube(campaign: Directory = HERE) -> None:
-    """Stack and add up every image, cube.zarr."""
-    _run("apertura.steps.cube:cube", campaign)
-
-
-@step.command()
-def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
-    """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
-    _run("apertura.steps.export:export", campaign, flight, pair)

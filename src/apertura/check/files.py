@@ -9,6 +9,7 @@ from apertura.campaign import Campaign
 from apertura.check.inspected import Inspected, participants
 from apertura.errors import CampaignError
 from apertura.ingest import RECORDERS
+from apertura.paths import inside
 from apertura.settings import CONFIG, FLIGHTS, Flight, OfdmWaveform
 
 
@@ -49,6 +50,11 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
         for path in promised_recording(campaign.root / "raw" / flight.name, node):
+            try:
+                inside(campaign.root, campaign.relative(path), where=campaign.root)
+            except CampaignError as problem:  # a link
+                yield problem
+                continue
             yield from _readable(path, expected, remedy)
         yield from _found(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 
@@ -71,9 +77,7 @@ def _found(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
 
 
 def _readable(path: Path, expected: str, remedy: str) -> Iterator[CampaignError]:
-    if path.is_symlink():
-        yield CampaignError("a symbolic link", where=path, expected=expected, remedy="Copy the file itself there.")
-    elif not path.is_file():
+    if not path.is_file():
         yield CampaignError("no such file", where=path, expected=expected, remedy=remedy)
     elif path.stat().st_size == 0:
         yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")

@@ -1,0 +1,105 @@
+"""`apertura step`: one command per rule of the workflow, for a person to paste."""
+
+import pkgutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
+
+Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
+Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
+HERE = Path()
+
+
+def _run(function: str, campaign: Path, *arguments: str, **options: object) -> None:
+    """Run ``module:function`` on a campaign and print the paths that it wrote."""
+    from apertura.campaign import Campaign
+
+    written = pkgutil.resolve_name(function)(Campaign.load(campaign), *arguments, **options)
+    print(*([written] if isinstance(written, Path) else written), sep="\n")
+
+
+@app.command()
+def ingest(flight: str, node: str, campaign: Directory = HERE) -> None:
+    """Read a node's recording and flight log into raw.zarr and track.zarr."""
+    _run("apertura.steps.ingest:ingest", campaign, flight, node)
+
+
+@app.command()
+def echo(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Turn recordings of a pair into calibrated transfer functions, echo.zarr."""
+    _run("apertura.steps.echo:echo", campaign, flight, pair)
+
+
+@app.command()
+def calibrate(flight: str, campaign: Directory = HERE) -> None:
+    """Estimate the path offsets of a calibration flight's pairs, calibration.json."""
+    _run("apertura.steps.calibration:calibrate", campaign, flight)
+
+
+@app.command()
+def scene(campaign: Directory = HERE) -> None:
+    """Settle the campaign's grid, scene.json."""
+    _run("apertura.steps.scene:scene", campaign)
+
+
+@app.command()
+def terrain(campaign: Directory = HERE) -> None:
+    """Bring the DEM onto the campaign's grid, terrain.zarr."""
+    _run("apertura.steps.terrain:terrain", campaign)
+
+
+@app.command()
+def layers(campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Write incidence, bistatic angle and the mask of shadow and layover as GeoTIFFs."""
+    _run("apertura.steps.layers:layers", campaign, threads=threads)
+
+
+@app.command()
+def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Compress a pair in range over the scene, profile.zarr."""
+    _run("apertura.steps.profile:profile", campaign, flight, pair)
+
+
+@app.command()
+def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Focus a pair's image, image.zarr."""
+    _run("apertura.steps.image:image", campaign, flight, pair, threads=threads)
+
+
+@app.command()
+def tiles(flight: str, pair: str, share: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Form one job's share of a pair's tiles, '2-of-8'; step image finishes them."""
+    _run("apertura.steps.image:tiles", campaign, flight, pair, share, threads=threads)
+
+
+@app.command("chart")
+def step_chart(flight: str, pair: str, campaign: Directory = HERE, seconds: float = 60.0) -> None:
+    """Time and measure every engine and setting on a pair, for at most so many seconds."""
+    _run("apertura.study.chart.speed_accuracy:speed_accuracy", campaign, flight, pair, seconds=seconds)
+
+
+@app.command()
+def whole_chart(campaign: Directory = HERE, repeats: Annotated[int, typer.Option(min=1)] = 3) -> None:
+    """Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png."""
+    _run("apertura.study.chart.whole:whole_chart", campaign, repeats=repeats)
+
+
+@app.command()
+def assess(flight: str, campaign: Directory = HERE) -> None:
+    """Compare the images of a flight with each other, and choose what is added up, assessment.json."""
+    _run("apertura.steps.assess:assess", campaign, flight)
+
+
+@app.command()
+def cube(campaign: Directory = HERE) -> None:
+    """Stack and add up every image, cube.zarr."""
+    _run("apertura.steps.cube:cube", campaign)
+
+
+@app.command()
+def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
+    _run("apertura.steps.export:export", campaign, flight, pair)
