@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run bench paper stability test test-slow lint format lock clean
+.PHONY: setup demo run bench paper stability test test-slow attack lint format lock clean
 
 setup: $(SETUP)
 
@@ -44,6 +44,12 @@ test: $(SETUP)
 
 test-slow: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m slow $(TESTS)
+
+# Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed: an hour.
+attack: $(SETUP)
+	$(BIN)/python -m tests.attack.fuzz --inputs 5000
+	$(BIN)/python -m tests.attack.faults --kills 300 --errors 50 --full 10
+	$(BIN)/python benchmarks/kills.py --kills 100
 
 lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks

@@ -51,8 +51,10 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 17
-    for _, result in results:
+    assert len(results) == 17 + 2
+    for name, result in results:
+        if name in {"speed_accuracy", "whole"}:  # made when they are asked for
+            continue
         recorded = json.loads((finished_tiny.root / result.manifest).read_text())
         assert set(recorded) == {"files", "sources", "settings", "code"}
         assert set(recorded["sources"]) == set(result.sources)

@@ -11,6 +11,10 @@ import pytest
 import yaml
 from folders import copy_writable
 
+from apertura.campaign import Campaign
+from apertura.check.stale import stale_results
+from apertura.lock import hold
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -30,10 +34,11 @@ def finished(process, timeout=600):
 def contents(root):
     """Every product and every chunk, without logs, timings and Snakemake's own records."""
     results = root / "results"
+    files = {path.relative_to(results): path for path in sorted(results.rglob("*")) if path.is_file()}
     return {
-        path.relative_to(results).as_posix(): path.read_bytes()
-        for path in sorted(results.rglob("*"))
-        if path.is_file() and not path.is_relative_to(results / "logs") and path.suffix != ".tsv"
+        name.as_posix(): path.read_bytes()
+        for name, path in files.items()
+        if name.parts[0] != "logs" and path.suffix != ".tsv" and not name.parts[0].startswith(".")
     }
 
 
@@ -158,3 +163,95 @@ def test_an_installed_apertura_runs_a_campaign_from_any_folder_and_any_path(tiny
     done = subprocess.run(command, cwd=tmp_path, env=plain, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
+
+
+def apertura(*words, **popen):
+    command = [str(Path(sys.executable).parent / "apertura"), *map(str, words)]
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen)
+
+
+def replaced_keeping_times(path):
+    """What `rsync -a` and `cp -p` do: other bytes, the old times."""
+    before = path.stat()
+    path.write_text(path.read_text() + "\n")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("road", ["snakemake", "apertura"])
+def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_no_more(finished_tiny, tmp_path, road):
+    """From results that came without Snakefile's own records: what they were made from is told by hashes alone."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+
+    def run(*options):
+        return finished(snakemake(root, *options) if road == "snakemake" else apertura("run", root, *options))
+
+    code, output = run("-n")
+    assert code == 0
+    assert "Nothing to be done" in output
+    replaced_keeping_times(root / "raw/f01/uav2.track.pos")
+    untouched = (root / "results/f01/uav1-uav1/image.zarr/zarr.json").stat().st_mtime_ns
+    code, output = run()
+    assert code == 0, output
+    assert "results/f01/uav2/track.manifest.json: stale, raw/f01/uav2.track.pos has changed" in output
+    assert (root / "results/f01/uav1-uav1/image.zarr/zarr.json").stat().st_mtime_ns == untouched
+    assert stale_results(Campaign.load(root)) == {}
+    assert "Nothing to be done" in run("-n")[1]
+
+
+@pytest.mark.slow
+def test_a_clock_set_back_a_day_makes_nothing_stale_and_nothing_again(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    tomorrow = time.time() + 86400
+    for path in root.rglob("*"):
+        os.utime(path, (tomorrow, tomorrow))
+    path = root / "config" / "config.yaml"
+    path.write_text(path.read_text() + "processing:\n  window: none\n")
+    code, output = finished(apertura("run", root))
+    assert code == 0, output
+    assert stale_results(Campaign.load(root)) == {}
+    assert "Nothing to be done" in finished(apertura("run", root, "-n"))[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number):
+    larger(tiny)
+    run = apertura("run", tiny, "--cores", 2)
+    wait_for_tiles(tiny, run, count=2)
+    asked = time.monotonic()
+    run.send_signal(number)
+    output = run.communicate(timeout=60)[0]
+    assert time.monotonic() - asked < 5
+    assert run.returncode == 130
+    assert f"interrupted by {number.name}" in output
+    running = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
+    assert not [line for line in running if str(tiny).encode() in line]
+    hold(tiny).close()
+
+
+@pytest.mark.slow
+def test_a_second_run_says_who_holds_the_campaign(tiny):
+    larger(tiny)
+    run = apertura("run", tiny, "--cores", 2)
+    wait_for_tiles(tiny, run, count=1)
+    for second in (apertura("run", tiny), snakemake(tiny)):
+        code, output = finished(second)
+        assert code != 0
+        assert "another run holds this campaign: process" in output
+        assert "Traceback" not in output
+    assert "Building DAG" in finished(snakemake(tiny, "-n"))[1]
+    run.terminate()
+    run.communicate(timeout=60)
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_2_where_the_campaign_is_wrong_also_if_a_step_finds_it(tiny):
+    path = tiny / "raw" / "f01" / "uav1.sigmf-data"
+    data = bytearray(path.read_bytes())
+    data[4000] ^= 1
+    path.write_bytes(data)
+    code, output = finished(apertura("run", tiny))
+    assert code == 2, output
+    assert "sha512" in output
+    assert "Traceback" not in output

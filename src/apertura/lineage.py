@@ -14,6 +14,9 @@ from apertura.digests import Sources
 from apertura.provenance import canonical_json, code_sha256, sha256_text
 from apertura.settings import OfdmWaveform
 
+STUDY = "study"
+"""Folder of results that are made when they are asked for, and not with the images."""
+
 
 @dataclass(frozen=True)
 class Result:
@@ -84,7 +87,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `RESULTS`.
     *where
         Flight and node (raw, track), flight and pair (echo, profile, image, export), flight (calibration, assessment,
-        fused), nothing (scene, terrain, layers, cube).
+        fused), nothing (scene, terrain, layers, cube, speed_accuracy, whole).
     """
     return RESULTS[result](campaign, *where)
 
@@ -114,12 +117,12 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from (("export", flight.name, pair) for pair in flight.pairs)
     yield ("cube",)
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield from (("speed_accuracy",), ("whole",))
 
 
 def _raw(campaign: Campaign, flight: str, node: str) -> Result:
     files = tuple(campaign.relative(path) for path in campaign.recording_files(flight, node))
-    settings = campaign.relevant("raw")
-    return Result(campaign.manifest("raw", flight, node), files, settings)
+    return Result(campaign.manifest("raw", flight, node), files, campaign.relevant("raw"))
 
 
 def _track(campaign: Campaign, flight: str, node: str) -> Result:
@@ -143,8 +146,7 @@ def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
 
 def _calibration(campaign: Campaign, flight: str) -> Result:
     echoes = tuple(campaign.manifest("echo", flight, pair) for pair in campaign.flight(flight).pairs)
-    settings = campaign.relevant("calibration")
-    return Result(campaign.manifest("calibration", flight), echoes, settings)
+    return Result(campaign.manifest("calibration", flight), echoes, campaign.relevant("calibration"))
 
 
 def _scene(campaign: Campaign) -> Result:
@@ -169,8 +171,7 @@ def _layers(campaign: Campaign) -> Result:
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
     sources = (campaign.manifest("echo", flight, pair), *_ground(campaign))
-    settings = campaign.relevant("profile")
-    return Result(campaign.manifest("profile", flight, pair), sources, settings)
+    return Result(campaign.manifest("profile", flight, pair), sources, campaign.relevant("profile"))
 
 
 def _image(campaign: Campaign, flight: str, pair: str) -> Result:
@@ -181,12 +182,10 @@ def _image(campaign: Campaign, flight: str, pair: str) -> Result:
 
 
 def _assessment(campaign: Campaign, flight: str) -> Result:
-    stages = [
-        campaign.manifest(stage, flight, pair) for pair in campaign.flight(flight).pairs for stage in ("echo", "image")
-    ]
+    pairs = campaign.flight(flight).pairs
+    stages = [campaign.manifest(stage, flight, pair) for pair in pairs for stage in ("echo", "image")]
     sources = (*stages, *_ground(campaign))
-    settings = campaign.relevant("assess")
-    return Result(campaign.manifest("assessment", flight), sources, settings)
+    return Result(campaign.manifest("assessment", flight), sources, campaign.relevant("assess"))
 
 
 def _cube(campaign: Campaign) -> Result:
@@ -209,6 +208,25 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     sources = (*images, campaign.manifest("assessment", flight), campaign.manifest("cube"), campaign.manifest("scene"))
     settings = {"campaign": campaign.settings.campaign, "tile_px": campaign.settings.processing.tile_px}
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
+
+
+def _speed_accuracy(campaign: Campaign) -> Result:
+    flight, pair = charted(campaign)
+    sources = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
+    settings = {"pair": [flight, pair], **campaign.relevant("image", pair)}
+    return Result(campaign.manifest("speed_accuracy", STUDY), (*sources, *_ground(campaign)), settings)
+
+
+def _whole(campaign: Campaign) -> Result:
+    nodes = [(flight.name, node) for flight in campaign.flights for node in flight.nodes]
+    recorded = [campaign.relative(path) for at in nodes for path in campaign.raw_files(*at).values()]
+    settings = campaign.settings.model_dump(mode="json")
+    return Result(campaign.manifest("whole", STUDY), (*recorded, *_heights(campaign)), settings)
+
+
+def charted(campaign: Campaign) -> tuple[str, str]:
+    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is."""
+    return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
 
 
 def _heights(campaign: Campaign) -> list[str]:
@@ -234,5 +252,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "cube": _cube,
     "export": _export,
     "fused": _fused,
+    "speed_accuracy": _speed_accuracy,
+    "whole": _whole,
 }
 """Name → what it is made from."""

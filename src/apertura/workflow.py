@@ -12,6 +12,7 @@ from pathlib import Path
 from apertura.campaign import Campaign
 from apertura.check import print_problems
 from apertura.check.stale import forms_results, stale_results
+from apertura.lineage import STUDY
 from apertura.lock import hold
 from apertura.signals import STATUS_FILE
 
@@ -50,7 +51,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     if forms_results(["", *arguments]):
         hold(root).close()
     stale = stale_results(campaign, paranoid=paranoid)
-    forced = ["--forcerun", *stale] if stale else []  # in time for a dry run; the workflow says why
+    overtaken = [manifest for manifest in stale if not manifest.startswith(f"results/{STUDY}/")]
+    forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
     folder = _workflow_folder()
     command = [
         sys.executable,

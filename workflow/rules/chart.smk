@@ -1,10 +1,6 @@
 rule speed_accuracy:
     input:
-        [
-            campaign.manifest(stage, campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1])
-            for stage in ("echo", "profile")
-        ],
-        "results/scene.manifest.json",
+        lambda wildcards: result_of(campaign, "speed_accuracy").sources,
     output:
         "results/study/speed_accuracy.csv",
         report(
@@ -13,6 +9,7 @@ rule speed_accuracy:
             category="study",
         ),
         "results/study/speed_accuracy.html",
+        "results/study/speed_accuracy.manifest.json",
     log:
         "results/logs/study/speed_accuracy.log",
     benchmark:
@@ -23,28 +20,22 @@ rule speed_accuracy:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        code=code_sha256("apertura.study.chart.speed_accuracy"),
-        flight=campaign.image_flights[0].name,
-        pair=campaign.image_flights[0].pairs[-1],
+        code=code_of("speed_accuracy"),
+        charted=" ".join(charted(campaign)),
     message:
         "timing and measuring every engine and setting"
     shell:
-        "apertura step chart {params.flight} {params.pair} > {log} 2>&1"
+        "apertura step chart {params.charted} > {log} 2>&1"
 
 
 # Everything from raw samples on, under several settings: works in results/study/whole, which it removes.
 rule whole_chart:
     input:
-        [
-            path
-            for flight in campaign.flights
-            for node in flight.nodes
-            for path in campaign.raw_files(flight.name, node).values()
-        ],
-        list(campaign.height_files().values()),
+        lambda wildcards: result_of(campaign, "whole").sources,
     output:
         "results/study/whole.csv",
         report("results/study/whole.png", caption="../report/whole.rst", category="study"),
+        "results/study/whole.manifest.json",
     log:
         "results/logs/study/whole.log",
     benchmark:
@@ -55,8 +46,8 @@ rule whole_chart:
     resources:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
-        settings=campaign.relevant("image", campaign.image_flights[0].pairs[-1]),
-        code=code_sha256("apertura.study.chart.whole"),
+        settings=result_of(campaign, "whole").settings,
+        code=code_of("whole"),
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"
     shell:

@@ -4,7 +4,14 @@ from apertura.export import export_modules
 from apertura.focus.engines import ENGINES
 from apertura.provenance import code_sha256
 
-_STEPS = {"raw": "ingest", "track": "ingest", "assessment": "assess", "fused": "export"}
+_MODULES = {
+    "raw": "apertura.steps.ingest",
+    "track": "apertura.steps.ingest",
+    "assessment": "apertura.steps.assess",
+    "fused": "apertura.steps.export",
+    "speed_accuracy": "apertura.study.chart.speed_accuracy",
+    "whole": "apertura.study.chart.whole",
+}
 """Results that are called otherwise than the module of `apertura.steps` that makes them."""
 
 
@@ -18,4 +25,4 @@ def code_of(result: str) -> str:
     """
     tables = {"image": ENGINES.values(), "export": export_modules("pair")}
     tables |= {kind: export_modules(kind) for kind in ("fused", "layers")}
-    return code_sha256(f"apertura.steps.{_STEPS.get(result, result)}", *tables.get(result, ()))
+    return code_sha256(_MODULES.get(result, f"apertura.steps.{result}"), *tables.get(result, ()))

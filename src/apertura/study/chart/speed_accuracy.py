@@ -16,6 +16,7 @@ from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
 from apertura.imaging.stages import profiles_of
+from apertura.lineage import STUDY, result_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import asked_accuracy, job_of, plan_job
 from apertura.load.scene import OpenScene, open_scene
@@ -23,12 +24,11 @@ from apertura.planning.plan import Plan
 from apertura.planning.search import Search
 from apertura.quality.error_bound import error_bound
 from apertura.quality.error_check import Brightness, random_pixels
-from apertura.store import open_stage
+from apertura.store import open_stage, record_files
 from apertura.study.chart.interactive import write_page
 from apertura.study.chart.pareto import Point, draw_points, with_front
 from apertura.study.tables import write_table
 
-FOLDER = Path("results/study")
 PULSES, SIDE_PX = 1024, 256
 LEAST_ROWS = 32
 """Rows of the window that every setting forms: the pixels whose exact values are known lie in them."""
@@ -83,6 +83,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
     adds to the planned error is added to that of every setting.
     """
+    lineage = result_of(campaign, "speed_accuracy").begin(campaign.root, [__name__])
     opened = open_pair(campaign, flight, pair)
     scene = open_scene(campaign)
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
@@ -106,10 +107,11 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     ]
     size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
-    paths = [campaign.root / FOLDER / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
+    paths = [campaign.result(STUDY) / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     write_table(paths[0], points, digits=6)
     draw_points(points, paths[1], title=title, accuracy_db=accuracy_db)
     write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=accuracy_db)
+    record_files(campaign.root / lineage.result.manifest, paths, lineage.record())
     return paths
 
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
+from apertura.lineage import STUDY, result_of
 from apertura.settings import Flight
 from apertura.steps import assess, calibration, cube, echo, export, image, ingest, profile, scene, terrain
+from apertura.store import record_files
 from apertura.study.chart.whole_picture import Whole, draw_whole
 from apertura.study.tables import write_table
-
-FOLDER = Path("results/study")
 
 _SETTINGS: Mapping[str, dict[str, Any]] = {
     "as configured": {},
@@ -60,7 +60,8 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
         Of every setting, taken in turn, so that what else the machine does touches all alike; one before them, which
         is not counted, opens libraries and files.
     """
-    work = campaign.root / FOLDER / "whole"
+    lineage = result_of(campaign, "whole").begin(campaign.root, [__name__])
+    work = campaign.result(STUDY) / "whole"
     choices = {
         name: _chosen(campaign, work, changes) for name, changes in _SETTINGS.items() if _applies(campaign, name)
     }
@@ -75,9 +76,10 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
                 refused.append(name)
     shutil.rmtree(work)
     rows = [_whole(name, some) for name, some in runs.items() if name not in refused]
-    paths = [campaign.root / FOLDER / f"whole.{suffix}" for suffix in ("csv", "png")]
+    paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
     write_table(paths[0], rows, digits=6)
     draw_whole(rows, paths[1], title=_title(campaign, rows, repeats), refused=refused)
+    record_files(campaign.root / lineage.result.manifest, paths, lineage.record())
     return paths
 
 
@@ -90,7 +92,7 @@ def _applies(campaign: Campaign, name: str) -> bool:
 
 
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
-    """Return the campaign with changed settings, its inputs, by hard links, in another folder."""
+    """Return the campaign with changed settings, its inputs copied into another folder: no link leads out of one."""
     work.mkdir(parents=True, exist_ok=True)
     for path in campaign.root.resolve().iterdir():
         if (
@@ -99,7 +101,7 @@ def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign
             and path.name != "results"
             and not (work / path.name).exists()
         ):
-            shutil.copytree(path, work / path.name, copy_function=os.link)
+            shutil.copytree(path, work / path.name, copy_function=shutil.copyfile)
     processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
     return replace(campaign, root=work, settings=campaign.settings.model_copy(update={"processing": processing}))
 
