@@ -49,7 +49,7 @@ test-slow: $(SETUP)
 attack: $(SETUP)
 	$(BIN)/python -m tests.attack.fuzz --inputs 5000
 	$(BIN)/python -m tests.attack.faults --kills 300 --errors 50 --full 10
-	$(BIN)/python benchmarks/kills.py --kills 100
+	$(BIN)/python benchmarks/kills.py - 100
 
 lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks
