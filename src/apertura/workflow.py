@@ -17,6 +17,7 @@ from apertura.lock import hold
 from apertura.signals import STATUS_FILE
 
 _GRACE_S = 3.0
+_COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
 
@@ -69,9 +70,27 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     path = f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     with tempfile.TemporaryDirectory() as scratch:
         said = Path(scratch) / "status"
+        killed = _killed_for_memory()
         status = _supervised(command, {**os.environ, "PATH": path, STATUS_FILE: str(said)})
         told = set(said.read_text(encoding="utf-8").split()) if said.is_file() else set()
-    return 2 if status == 1 and told == {"2"} else status
+        killed = _killed_for_memory() - killed
+    if status and killed:
+        message = (
+            f"out of memory: meanwhile the kernel has ended {killed} processes of this machine or job for lack of it"
+        )
+        print(
+            f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.", file=sys.stderr
+        )
+    return 2 if status == 1 and (told == {"2"} or (killed and "1" not in told)) else status
+
+
+def _killed_for_memory() -> int:
+    """Return how many processes the kernel has ended for lack of memory since it started; 0 where it does not say."""
+    try:
+        counters = dict(line.split() for line in _COUNTERS.read_text(encoding="ascii").splitlines())
+        return int(counters.get("oom_kill", 0))
+    except (OSError, ValueError):
+        return 0
 
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
