@@ -95,6 +95,19 @@ def test_a_log_that_ends_with_poor_solutions_is_left_to_what_is_asked_of_it(tiny
     assert only(tiny).startswith(f"{RX}: the log ends ")
 
 
+def test_a_log_that_is_poor_while_pulses_are_sent_is_told_unless_that_is_allowed(tiny):
+    def single(lines, first):
+        late = [not line.startswith("%") and line.split()[1] > first for line in lines]
+        return [line.replace("   1  18", "   2  18") if out else line for line, out in zip(lines, late, strict=True)]
+
+    edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:19"))  # pulses from 09:30:18 to 09:30:20 GPST
+    assert told(tiny) == []
+    edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:17"))
+    assert "epochs while pulses were sent have a solution poorer than fix" in only(tiny)
+    edit_config(tiny, lambda document: document["nodes"]["uav2"].update(worst_fix="float"))
+    assert told(tiny) == []
+
+
 def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     assert "the same time as the epoch before" in only(tiny)
