@@ -234,7 +234,14 @@ def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
     assert line.startswith("config/config.yaml: scene.crs: ")
     assert found in line
     if crs in {"EPSG:4326", "EPSG:2225", "EPSG:4978"}:
-        assert "Set scene.crs to EPSG:32632, the zone of the place" in line
+        assert "Set scene.crs to EPSG:32632, and scene.bounds_m in metres of it" in line
+
+
+def test_a_zone_that_the_track_is_not_in_is_told_where_bounds_are_auto(tiny):
+    state(tiny, "scene", crs="EPSG:32633", bounds_m="auto")  # 2° outside: of use there
+    assert told(tiny) == []
+    state(tiny, "scene", crs="EPSG:32635")
+    assert "EPSG:32635 (WGS 84 / UTM zone 35N) is not made for where the track lies" in only(tiny)
 
 
 @pytest.mark.parametrize(
@@ -276,6 +283,14 @@ def test_a_track_must_be_above_the_ground(tiny):
     line = only(tiny)
     assert line.startswith("config/config.yaml: scene.height_m: flight f01, uav1, uav2: -1.")
     assert "logs may count from the geoid" in line
+
+
+def test_a_track_is_not_30_km_above_the_ground(tiny):
+    for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
+        state(tiny, "scene", height_m=height_m)
+        lines = told(tiny)
+        assert any("m above the ground: check heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("expected a node above the ground, by at most 30 km" in line for line in lines) is high
 
 
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
@@ -381,6 +396,8 @@ def test_a_reflector_out_of_reach_is_told(tiny):
     edit_config(tiny, lambda document: document.update(calibration=swapped))
     line = only(tiny)
     assert line.startswith("config/config.yaml: calibration.reflector_m: [5363700.0, 570660.0, 620.0] is ")
+    state(tiny, "scene", crs="EPSG:99999")
+    assert "unknown to PROJ" in only(tiny)
 
 
 def test_a_beam_pattern_that_is_none_is_told(tiny):
