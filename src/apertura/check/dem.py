@@ -21,8 +21,6 @@ _WINDOW = 7  # samples: three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
 _MARGIN = _WINDOW - 1  # samples about the scene, of which nothing is said
-    _WINDOW + 1
-)  # samples about the scene: six at an edge are not judged, two are a post that the scene still touches
 
 
 def check_dem(inspected: Inspected) -> Iterator[CampaignError]:
