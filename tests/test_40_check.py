@@ -210,9 +210,15 @@ def test_tags_of_another_spacing_are_told(prf_hz, ratio):
 
 def test_every_second_pulse_missing_is_said_so(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(prf_hz=40.0))
-    line = told(tiny)[0]
+    line = only(tiny)
+    assert line.startswith("raw/f01/uav1.sigmf-meta")  # the receiver may take every second one
     assert "time tags 0.05 s apart, 20 Hz: only every second pulse was recorded, or waveform.prf_hz is 2 times" in line
     assert "expected 0.025 s, 1/waveform.prf_hz (40 Hz)" in line
+
+
+def test_a_receiver_whose_tags_fit_no_pulses_is_told(tiny):
+    edit_config(tiny, lambda document: document["waveform"].update(prf_hz=27.0))
+    assert [line.split(":")[0] for line in told(tiny)] == ["raw/f01/uav1.sigmf-meta", "raw/f01/uav2.sigmf-meta"]
 
 
 def test_nodes_an_hour_apart_are_told_of_and_half_a_second_is_left_to_a_flag(tiny):

@@ -95,6 +95,19 @@ def test_a_log_that_ends_with_poor_solutions_is_left_to_what_is_asked_of_it(tiny
     assert only(tiny).startswith(f"{RX}: the log ends ")
 
 
+def test_a_log_that_is_poor_while_pulses_are_sent_is_told_unless_that_is_allowed(tiny):
+    def single(lines, first):
+        late = [not line.startswith("%") and line.split()[1] > first for line in lines]
+        return [line.replace("   1  18", "   2  18") if out else line for line, out in zip(lines, late, strict=True)]
+
+    edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:19"))  # pulses from 09:30:18 to 09:30:20 GPST
+    assert told(tiny) == []
+    edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:17"))
+    assert "epochs while pulses were sent have a solution poorer than fix" in only(tiny)
+    edit_config(tiny, lambda document: document["nodes"]["uav2"].update(worst_fix="float"))
+    assert told(tiny) == []
+
+
 def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     assert "the same time as the epoch before" in only(tiny)
@@ -105,11 +118,13 @@ def test_epochs_at_no_place_are_told_while_pulses_are_sent(tiny):
     assert "1 of 61 epochs at latitude 0, longitude 0: the receiver had no fix" in only(tiny)
 
 
-def test_epochs_at_no_place_long_before_are_not_told(tiny):
-    def early(line):
-        return line.replace("2025-05-14T09:29:58.000000Z", "2025-05-14T09:29:30.000000Z")
+@pytest.mark.parametrize(("epoch", "time"), [(1, "09:29:30"), (-1, "09:30:30")])
+def test_epochs_at_no_place_long_before_or_after_are_not_told(tiny, epoch, time):
+    def moved(lines):
+        lines[epoch] = zero(f"2025-05-14T{time}.000000Z,{lines[epoch].split(',', 1)[1]}")
+        return lines
 
-    edit_track(tiny, "uav1", lambda lines: [lines[0], zero(early(lines[1])), *lines[2:]])
+    edit_track(tiny, "uav1", moved)
     assert told(tiny) == []
 
 
@@ -221,7 +236,14 @@ def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
     assert line.startswith("config/config.yaml: scene.crs: ")
     assert found in line
     if crs in {"EPSG:4326", "EPSG:2225", "EPSG:4978"}:
-        assert "Set scene.crs to EPSG:32632, the zone of the place" in line
+        assert "Set scene.crs to EPSG:32632, and scene.bounds_m in metres of it" in line
+
+
+def test_a_zone_that_the_track_is_not_in_is_told_where_bounds_are_auto(tiny):
+    state(tiny, "scene", crs="EPSG:32633", bounds_m="auto")  # 2° outside: of use there
+    assert told(tiny) == []
+    state(tiny, "scene", crs="EPSG:32635")
+    assert "EPSG:32635 (WGS 84 / UTM zone 35N) is not made for where the track lies" in only(tiny)
 
 
 @pytest.mark.parametrize(
@@ -265,6 +287,14 @@ def test_a_track_must_be_above_the_ground(tiny):
     assert "logs may count from the geoid" in line
 
 
+def test_a_track_is_not_30_km_above_the_ground(tiny):
+    for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
+        state(tiny, "scene", height_m=height_m)
+        lines = told(tiny)
+        assert any("m above the ground: check heights in the logs" in line for line in lines)  # no echo comes back
+        assert any("expected a node above the ground, by at most 30 km" in line for line in lines) is high
+
+
 def write_dem(root, heights, *, post_m=1.0, east_m=0.0):
     """A DEM about the middle of the scene; heights (row, column)."""
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
@@ -288,12 +318,13 @@ def with_post(height_m, row=30, column=30):
     [
         (FLAT, False),
         (FLAT + 500.0 * (np.arange(60) > 30) - 490, False),  # a cliff through the scene
-        (with_post(900.0), False),
+        (with_post(1050.0), False),
         (with_post(3600.0), True),
         (with_post(-400.0), True),
-        (with_post(3600.0, row=5), False),  # beside the scene
+        (with_post(3600.0, row=5), False),
+        (with_post(3600.0, row=25), False),  # two metres beside the scene
     ],
-    ids=["flat", "cliff", "mast", "spike", "pit", "beside"],
+    ids=["flat", "cliff", "mast", "spike", "pit", "far beside", "beside"],
 )
 def test_a_post_that_stands_out_by_kilometres_is_told_and_a_cliff_is_not(tiny, heights, spike):
     write_dem(tiny, heights)
@@ -368,6 +399,8 @@ def test_a_reflector_out_of_reach_is_told(tiny):
     edit_config(tiny, lambda document: document.update(calibration=swapped))
     line = only(tiny)
     assert line.startswith("config/config.yaml: calibration.reflector_m: [5363700.0, 570660.0, 620.0] is ")
+    state(tiny, "scene", crs="EPSG:99999")
+    assert "unknown to PROJ" in only(tiny)
 
 
 def test_a_beam_pattern_that_is_none_is_told(tiny):

@@ -9,10 +9,11 @@ from apertura.check.inspected import Inspected, Key
 from apertura.check.tags import Times, paired, span
 from apertura.errors import CampaignError
 from apertura.ingest.track import FIXES
+from apertura.settings import CONFIG
 
 
 def check_coverage(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield logs that begin after the first pulse they must place or end before the last; each log once.
+    """Yield logs that begin after the first pulse they must place, end before the last, or are poor throughout.
 
     Both nodes of a pulse are placed at the transmitter's tag. Pulses beyond an end of the log whose solution is poorer
     than fixed may be left out by what is asked of it, and are none of this check's.
@@ -25,11 +26,14 @@ def check_coverage(inspected: Inspected) -> Iterator[CampaignError]:
             rx = inspected.recordings.get((flight.name, node))
             if tx is None or rx is None or waveform is None:
                 continue
-            for key in {(flight.name, flight.transmitter), (flight.name, node)} - told:
-                problem = key in inspected.tracks and (
+            pulses = paired(tx, rx, waveform.prf_hz)
+            for key in ((flight.name, flight.transmitter), (flight.name, node)):
+                if key in told or key not in inspected.tracks:
+                    continue
+                problem = (
                     _apart(inspected, key)
                     if tx.framing is not None
-                    else _uncovered(inspected, key, paired(tx, rx, waveform.prf_hz))
+                    else _uncovered(inspected, key, pulses) or _all_poor(inspected, key, pulses)
                 )
                 if problem:
                     told.add(key)
@@ -66,6 +70,27 @@ def _uncovered(inspected: Inspected, key: Key, pulses: Times) -> CampaignError |
     apart = f"; log and recording are {abs(shift):.1f} s apart{cause}" if cause else ""
     found = f"the log {' and '.join(ends)}: {lost} of {len(pulses)} pulses without a position{apart}"
     return _problem(inspected, key, found, recorded)
+
+
+def _all_poor(inspected: Inspected, key: Key, pulses: Times) -> CampaignError | None:
+    """Return what is wrong where every epoch between the first and the last pulse is poorer than the config allows."""
+    track, worst = inspected.tracks[key], inspected.campaign.settings.nodes[key[1]].worst_fix
+    if "fix" not in track or not pulses.size or worst == "any":
+        return None
+    times, fixes = track.time.values, track.fix.values
+    during = (times >= pulses[0]) & (times <= pulses[-1])
+    if not during.any() or np.isin(fixes[during], (0, FIXES["fix"])).any():
+        return None
+    from apertura.load.acquisition import poorer_fix
+
+    if not poorer_fix(fixes, worst)[during].all():
+        return None
+    return CampaignError(
+        f"all {int(during.sum())} epochs while pulses were sent have a solution poorer than {worst}",
+        where=inspected.campaign.track_file(*key),
+        expected=f"solutions that {CONFIG}: nodes.{key[1]}.worst_fix allows",
+        remedy="Process the log again, or allow poorer solutions by that key.",
+    )
 
 
 def _problem(

@@ -12,12 +12,12 @@ from apertura.scene.clearance import clearance
 from apertura.scene.terrain import FlatGround, Terrain
 from apertura.settings import CONFIG
 
-HIGHEST_M = 20e3
+HIGHEST_M = 30e3
 """Above the ground of the scene no node flies higher."""
 
 
 def check_ground(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield image flights of which a node is below the ground at most of its pulses, or higher than 20 km above it."""
+    """Yield image flights of which a node is below the ground at most of its pulses, or higher than 30 km above it."""
     waveform, grid, ground = inspected.waveform, inspected.grid, inspected.ground
     if waveform is None or grid is None or ground is None:
         return

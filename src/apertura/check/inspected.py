@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
@@ -107,10 +109,10 @@ class Inspected:
 
     @cached_property
     def crs(self) -> str | None:
-        """CRS of the scene; `auto` is the zone of the first image flight; None where nobody can tell."""
+        """CRS of the scene; `auto` is the zone of the first image flight; None where nobody can tell, or it is none."""
         asked = self.campaign.settings.scene.crs
         if asked != "auto":
-            return asked
+            return asked if asked == LOCAL or in_metres(asked) else None
         from apertura.scene.auto_grid import utm_crs
 
         middle = self.middle_m
@@ -170,6 +172,21 @@ class Inspected:
             return ground, [], flown_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
         except CampaignError as problem:
             return None, [problem], flown_m
+
+
+def in_metres(crs: str) -> bool:
+    """Return whether PROJ knows a CRS and it is projected in metres.
+
+    Examples
+    --------
+    >>> [in_metres(crs) for crs in ("EPSG:32632", "EPSG:4326", "EPSG:2225", "EPSG:99999")]
+    [True, False, False, False]
+    """
+    try:
+        system = CRS(crs)
+    except CRSError:
+        return False
+    return system.is_projected and all(axis.unit_name == "metre" for axis in system.axis_info)
 
 
 def participants(flight: Flight) -> tuple[str, ...]:

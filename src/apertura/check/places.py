@@ -18,7 +18,10 @@ _TAGS = 256  # of a pair at which distances are taken
 _POINTS = 9  # along each side of the scene
 _CURVATURE = 0.99  # of a straight path: ground under a scene of unknown height bends away from the track
 _MOSTLY = 0.9  # of the distance: then it is one of heights
-_CHECK = "Check scene.crs and scene.bounds_m (easting before northing), and the place in the logs."
+_CHECK = (
+    "Check scene.crs and scene.bounds_m (easting before northing), the place in the logs, waveform.cyclic_prefix_s and "
+    "nodes.<node>.path_offset_m."
+)
 _HORIZON_M = 4.12e3
 """Radio horizon over a smooth Earth with refraction, metres per square root of the height in metres."""
 

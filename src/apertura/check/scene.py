@@ -9,12 +9,11 @@ from pyproj.exceptions import CRSError
 from apertura.check.hints import likely_place
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
-from apertura.geometry.geodesy import LOCAL, ecef_from_geodetic
+from apertura.geometry.geodesy import LOCAL, ecef_from_geodetic, projected_from_ecef
 from apertura.scene.auto_grid import utm_crs
 from apertura.scene.map_crs import check_crs
 from apertura.settings import CONFIG
 
-_METRE = "metre"
 _WHERE = f"{CONFIG}: scene.crs"
 
 
@@ -23,26 +22,42 @@ def check_scene_crs(inspected: Inspected) -> Iterator[CampaignError]:
     asked = inspected.campaign.settings.scene
     if (asked.crs == LOCAL) is bool(inspected.waveform):
         yield _other_frame(asked.crs)
-        return
-    if asked.crs in {LOCAL, "auto"} and (asked.crs == LOCAL or asked.bounds_m == "auto"):
-        return
-    if asked.crs != "auto" and (problem := _not_in_metres(inspected, asked.crs)):
-        yield problem
-        return
-    if inspected.crs is None or asked.bounds_m == "auto":
-        return
-    try:
-        check_crs(inspected.crs, asked.bounds_m)
-    except CampaignError as problem:
-        hint = likely_place(inspected)
-        if not hint:
-            raise
-        raise CampaignError(
-            f"bounds_m {list(asked.bounds_m)} are not in {inspected.crs}",
-            where=f"{CONFIG}: scene.bounds_m",
-            expected=f"[xmin, ymin, xmax, ymax], metres in {inspected.crs}",
-            remedy=hint,
-        ) from problem
+    elif asked.crs not in {LOCAL, "auto"} and inspected.crs is None:
+        yield _not_in_metres(inspected, asked.crs)
+    elif inspected.crs not in {LOCAL, None}:
+        yield from _elsewhere(inspected, str(inspected.crs))
+
+
+def _elsewhere(inspected: Inspected, crs: str) -> Iterator[CampaignError]:
+    """Yield bounds, or where they are `auto` a track, that lie beyond where the CRS is of use."""
+    bounds = inspected.campaign.settings.scene.bounds_m
+    if bounds != "auto":
+        try:
+            check_crs(crs, bounds)
+        except CampaignError as problem:
+            hint = likely_place(inspected)
+            yield (
+                problem
+                if not hint
+                else CampaignError(
+                    f"bounds_m {list(bounds)} are not in {crs}",
+                    where=f"{CONFIG}: scene.bounds_m",
+                    expected=f"[xmin, ymin, xmax, ymax], metres in {crs}",
+                    remedy=hint,
+                )
+            )
+    elif inspected.middle_m is not None:
+        east, north = projected_from_ecef(crs, inspected.middle_m)[:2].tolist()
+        try:
+            check_crs(crs, (east - 1, north - 1, east + 1, north + 1))
+        except CampaignError:
+            zone, name = utm_crs(inspected.middle_m), CRS(crs).name
+            yield CampaignError(
+                f"{crs} ({name}) is not made for where the track lies",
+                where=_WHERE,
+                expected="a CRS that is of use there, such as the UTM zone of the place",
+                remedy=f"Set scene.crs to {zone}, or to auto.",
+            )
 
 
 def _other_frame(crs: str) -> CampaignError:
@@ -52,7 +67,7 @@ def _other_frame(crs: str) -> CampaignError:
     return CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
 
 
-def _not_in_metres(inspected: Inspected, crs: str) -> CampaignError | None:
+def _not_in_metres(inspected: Inspected, crs: str) -> CampaignError:
     """Return what is wrong with a CRS wherever it is used, with the UTM zone that would do."""
     try:
         system = CRS(crs)
@@ -63,20 +78,14 @@ def _not_in_metres(inspected: Inspected, crs: str) -> CampaignError | None:
             expected="an EPSG code such as EPSG:32632, auto, or local",
             remedy="Correct scene.crs.",
         )
-    units = sorted({axis.unit_name for axis in system.axis_info})
-    if system.is_projected and units == [_METRE]:
-        return None
-    kind = "counts in degrees" if system.is_geographic else f"counts in {', '.join(units)}"
-    kind = kind if units != [_METRE] else "is not projected"
-    zone = _zone(inspected, degrees=system.is_geographic)
-    bounds = "and scene.bounds_m in metres of it"
+    units = {axis.unit_name for axis in system.axis_info} - {"metre"}
+    kind = "counts in degrees" if system.is_geographic else f"counts in {', '.join(sorted(units))}"
+    zone = _zone(inspected, degrees=system.is_geographic) or "the UTM zone of the place"
     return CampaignError(
-        f"{crs} ({system.name}) {kind}",
+        f"{crs} ({system.name}) {kind if units else 'is not projected'}",
         where=_WHERE,
         expected="a projected CRS in metres",
-        remedy=f"Set scene.crs to {zone}, the zone of the place, {bounds}; or both to auto."
-        if zone
-        else f"Set scene.crs to the UTM zone of the place {bounds}; or both to auto.",
+        remedy=f"Set scene.crs to {zone}, and scene.bounds_m in metres of it; or both to auto.",
     )
 
 

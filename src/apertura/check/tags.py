@@ -55,20 +55,24 @@ def _numbers(recording: Recording) -> NDArray[np.int64]:
 
 
 def check_intervals(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield recordings whose tags have another spacing than 1/prf_hz, unless pulses in between were missed."""
+    """Yield recordings whose tags have another spacing than 1/prf_hz, unless pulses in between were missed.
+
+    A receiver may take every second or third pulse; each still finds its partner.
+    """
     waveform = inspected.waveform
-    for recording in inspected.recordings.values() if waveform else ():
+    sent = {(flight.name, flight.transmitter) for flight in inspected.campaign.flights}
+    for key, recording in inspected.recordings.items() if waveform else ():
         found = waveform and odd_interval_s(recording.captures.time, waveform.prf_hz)
         if not found or not waveform:
             continue
         ratio = found * waveform.prf_hz
-        whole = max(round(ratio), 1)
-        why = f"{1 / found:.6g} Hz"
-        if whole > 1 and abs(ratio - whole) <= _OFF:
-            ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
-            why += f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
+        whole = round(ratio) if ratio > 1 + _OFF and abs(ratio - round(ratio)) <= _OFF else 0
+        if whole and key not in sent:
+            continue
+        ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
+        why = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
         yield CampaignError(
-            f"time tags {found:.6g} s apart, {why}",
+            f"time tags {found:.6g} s apart, {1 / found:.6g} Hz{why if whole else ''}",
             where=recording.files[0],
             expected=f"{1 / waveform.prf_hz:.6g} s, 1/waveform.prf_hz ({waveform.prf_hz:g} Hz)",
             remedy=f"Correct waveform.prf_hz in {CONFIG}, or the recorder's trigger.",
