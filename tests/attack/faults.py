@@ -104,7 +104,7 @@ def _campaign_of_faults(asked: argparse.Namespace) -> int:
 
 def _kill(bench: Bench, step: str, count: int, table: "Table") -> None:
     for number in range(count):
-        at = 1 + (2 * number + 1) * bench.calls[step] // (2 * count)
+        at = 1 + (2 * number + 1) * (bench.calls[step] - 1) // (2 * count)
         killed, wrong = bench.killed(step, at)
         table.add(step, "kill" if killed or wrong else "not met", f"killed at call {at}", wrong)
 

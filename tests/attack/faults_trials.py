@@ -159,14 +159,16 @@ class Bench:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Return path → bytes of all files but hidden ones, those in hidden folders, and receipts of shares of tiles.
+    """Return path → bytes of what a run makes: all files but hidden ones and those in hidden folders.
 
-    A receipt says how many tiles its run formed, which after a kill are fewer.
+    Left out are receipts of shares of tiles, which say how many tiles their run formed, fewer after a kill; and what a
+    killed writer left in work in progress, which finishing it removes.
     """
     found = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
-        if path.is_file() and path.parent.name != "tiles" and not any(part.startswith(".") for part in name.parts):
+        left = path.parent.name == "tiles" or (path.suffix == ".partial" and ".wip/" in name.as_posix())
+        if path.is_file() and not left and not any(part.startswith(".") for part in name.parts):
             found[name.as_posix()] = path.read_bytes()
     return found
 
