@@ -1,4 +1,4 @@
-"""Some of the trials of `faults.py`: kills, errors and full disks at steps of each kind; the rest by its command line."""
+"""Some of the trials of `faults.py`: kills, errors and full disks; the rest by its command line."""
 
 import re
 import subprocess
