@@ -1,10 +1,12 @@
 """Kill whole runs at random moments, resume each, and compare every product of the finished campaign.
 
-    python benchmarks/kills.py CAMPAIGN [KILLS] [SEED]
+    python benchmarks/kills.py [CAMPAIGN] [KILLS] [SEED]
 
-A run's whole process group gets SIGKILL after a random share of the time that an undisturbed run takes; what resumes
-it is killed too, until KILLS (16) are spent. Whenever a run gets through, its results are compared byte for byte with
-the undisturbed ones, logs and timings left out, and the next begins from nothing. Ends with an error where they differ.
+Without a folder, or with '-', the campaign is a small simulated one: 48 x 48 pixels in nine tiles of two pairs. A run's
+whole process group gets SIGKILL after a random share of the time that an undisturbed run takes; what resumes it is
+killed too, until KILLS (16) are spent. Whenever a run gets through, its results are compared byte for byte with the
+undisturbed ones, logs, timings and hidden files left out, and the next begins from nothing. Ends with an error where
+they differ.
 """
 
 import os
@@ -15,29 +17,45 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
+
+import yaml
 
 APERTURA = Path(sys.executable).parent / "apertura"
 
 
+def small(folder):
+    """Simulate the campaign that is killed by default."""
+    from apertura.simulation import ImageGrid, preset, simulate
+
+    plan = replace(preset("demo", pulses=24), scene=ImageGrid("EPSG:32632", half_width_m=1.2, spacing_m=0.05))
+    root = simulate(folder / "small", plan, seed=3)
+    config = root / "config" / "config.yaml"
+    config.write_text(config.read_text() + yaml.safe_dump({"processing": {"tile_px": 16}}))
+    return root
+
+
 def start(root):
     command = [APERTURA, "run", root, "--cores", "2"]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
+    with root.with_suffix(".log").open("w") as log:
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
 
 
-def finish(process):
-    output = process.communicate()[0]
-    if process.returncode:
-        sys.exit(f"the run failed:\n{output}")
+def finish(process, root):
+    if process.wait():
+        sys.exit(f"the run failed:\n{root.with_suffix('.log').read_text()}")
 
 
 def products(root):
-    """Return path → bytes of all results but logs and timings."""
-    results = root / "results"
-    files = (path for path in results.rglob("*") if path.is_file() and not path.is_relative_to(results / "logs"))
-    return {path.relative_to(results): path.read_bytes() for path in files if path.suffix != ".tsv"}
+    """Return path → bytes of all results but logs, timings, and hidden files and folders."""
+    results, found = root / "results", {}
+    for path in results.rglob("*"):
+        name = path.relative_to(results)
+        hidden = any(part.startswith(".") for part in name.parts)
+        if path.is_file() and not hidden and name.parts[0] not in {"logs", "benchmarks"}:
+            found[name] = path.read_bytes()
+    return found
 
 
 def compare(root, expected):
@@ -52,35 +70,44 @@ def copy(campaign, root):
     return root
 
 
+def killed(process, wait_s):
+    """Kill a run after some time; return whether it still ran."""
+    try:
+        process.wait(wait_s)
+        return False
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return True
+
+
 def main():
-    campaign, kills, seed = Path(sys.argv[1]), *(int(word) for word in [*sys.argv[2:], "16", "1"][:2])
-    moment = random.Random(seed)
+    campaign, kills, seed = [*sys.argv[1:], *("-", "16", "1")[len(sys.argv) - 1 :]]
+    moment, spent, through, began = random.Random(int(seed)), 0, 0, time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
+        campaign = small(Path(folder)) if campaign == "-" else Path(campaign)
         root = copy(campaign, Path(folder) / "campaign")
-        began = time.perf_counter()
-        finish(start(root))
-        whole_s = time.perf_counter() - began
+        first = time.perf_counter()
+        finish(start(root), root)
+        whole_s = time.perf_counter() - first
         expected = products(root)
         print(f"undisturbed: {len(expected)} files in {whole_s:.1f} s", flush=True)
         shutil.rmtree(root)
-        spent = 0
-        while spent < kills:
+        while spent < int(kills):
             copy(campaign, root)
-            while spent < kills:
-                process = start(root)
-                wait_s = moment.uniform(0.1, 0.6) * whole_s
-                try:
-                    process.wait(wait_s)
+            while killed(process := start(root), wait_s := moment.uniform(0.1, 0.6) * whole_s):
+                spent += 1
+                print(f"kill {spent} after {wait_s:.1f} s: {len(products(root))} files", flush=True)
+                if spent == int(kills):
+                    process = start(root)
                     break
-                except subprocess.TimeoutExpired:
-                    os.killpg(process.pid, signal.SIGKILL)
-                    process.communicate()
-                    spent += 1
-                    print(f"kill {spent} after {wait_s:.1f} s: {len(products(root))} files", flush=True)
-            finish(start(root))
+            finish(process, root)
             compare(root, expected)
+            through += 1
             print("resumed to identical bytes", flush=True)
             shutil.rmtree(root)
+    seconds = time.perf_counter() - began
+    print(f"{spent} kills of {through} runs, identical bytes after all; {seconds / max(1, spent):.1f} s a kill")
 
 
 if __name__ == "__main__":

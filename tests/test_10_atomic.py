@@ -1,5 +1,6 @@
 """A file or folder is complete or absent, whoever writes it and whoever is killed."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -11,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apertura.atomic import replacement, write_json, write_text
+from apertura.atomic import remove, replacement, write_beside, write_json, write_text
+from apertura.errors import explained
 
 
 def names(folder):
@@ -114,3 +116,66 @@ def test_a_file_reaches_the_disk_before_it_has_its_name_and_its_name_after(tmp_p
 def test_numbers_and_arrays_of_numpy_are_json(tmp_path):
     write_json(tmp_path / "x.json", {"b": np.float32(0.5), "a": np.arange(2)})
     assert (tmp_path / "x.json").read_text() == '{\n "a": [\n  0,\n  1\n ],\n "b": 0.5\n}\n'
+
+
+def test_a_file_written_beside_reaches_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    path, synchronised = tmp_path / "c" / "0", []
+    monkeypatch.setattr(os, "fsync", lambda _: synchronised.append(path.exists()))
+    write_beside(path, b"all of it")
+    assert synchronised == [False]
+    assert path.read_bytes() == b"all of it"
+
+
+def test_a_write_that_fails_leaves_what_was_there_and_names_its_file(tmp_path, monkeypatch):
+    path = tmp_path / "0"
+    write_beside(path, b"before")
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    for write in (lambda: write_beside(path, b"after"), lambda: write_text(path, "after")):
+        with pytest.raises(OSError, match="No space left on device") as caught:
+            write()
+        assert caught.value.filename.endswith("0")
+    assert names(tmp_path) == ["0"]
+    assert path.read_bytes() == b"before"
+
+
+def test_removing_a_link_keeps_what_it_points_to(tmp_path):
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "kept")
+    for name in ("link", "absent"):
+        remove(tmp_path / name)
+    assert names(tmp_path) == ["kept"]
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "MB free there. Make room there"),
+        (errno.EDQUOT, "a larger quota"),
+        (errno.EFBIG, "ulimit -f"),
+        (errno.EROFS, "to where it may be written"),
+        (errno.EACCES, "its folder writable"),
+        (errno.EIO, "Check the disk"),
+        (errno.EMFILE, "ulimit -n"),
+    ],
+)
+def test_an_error_of_the_machine_says_what_it_was_where_and_what_to_do(tmp_path, number, remedy):
+    message = explained(OSError(number, os.strerror(number), str(tmp_path / "absent" / "x.tif")))
+    assert message.startswith(f"{tmp_path}/absent/x.tif: {os.strerror(number)} ({errno.errorcode[number]})")
+    assert remedy in message
+    assert message.endswith("run again: it goes on where it was.")
+
+
+def test_memory_that_is_gone_and_a_reader_that_is_gone_are_no_defects():
+    with pytest.raises(MemoryError) as caught:
+        np.empty(1 << 62, np.uint8)
+    assert explained(caught.value).startswith("out of memory: Unable to allocate")
+    assert explained(BrokenPipeError(errno.EPIPE, "Broken pipe")).startswith("output: Broken pipe (EPIPE)")
+
+
+@pytest.mark.parametrize("defect", [KeyError("x"), FileNotFoundError(errno.ENOENT, "no"), ValueError("No space left")])
+def test_a_defect_is_not_explained_away(defect):
+    assert explained(defect) is None

@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -14,7 +15,7 @@ import zarr
 
 from apertura.contracts import STAGES, check, stamp
 from apertura.errors import CampaignError, ContractError
-from apertura.store import finish, manifest_of, open_stage, resume, save_stage, sharing, writing
+from apertura.store import finish, manifest_of, open_array, open_stage, resume, save_stage, sharing, writing
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -165,3 +166,104 @@ def test_a_second_writer_waits_for_the_first(tmp_path):
         with writing(tmp_path / "image.zarr"):
             waited = time.monotonic() - began
     assert waited > 0.5
+
+
+def half_done(folder):
+    """Work in progress that holds all tiles but the last; what it holds is 1."""
+    with writing(folder) as wip:
+        resume(wip, empty_image(), "image", WINDOWS)
+        target = open_array(wip, "image")
+        for window in WINDOWS[:-1]:
+            target[window] = 1
+    return wip
+
+
+def flipped(content):
+    return content[:20] + bytes([content[20] ^ 1]) + content[21:]
+
+
+DAMAGE = {
+    "truncated": lambda content: content[:-7],
+    "empty": lambda _: b"",
+    "zeroed": lambda content: bytes(len(content)),
+    "flipped": flipped,
+    "another file": lambda _: b'{"zarr_format": 3}',
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+@pytest.mark.parametrize("shared", [False, True], ids=["one job", "many jobs"])
+def test_a_damaged_tile_in_work_in_progress_is_formed_again_with_a_notice(tmp_path, caplog, damage, shared):
+    tile = half_done(tmp_path / "image.zarr") / "image" / "c" / "0" / "1"
+    tile.write_bytes(damage(tile.read_bytes()))
+    if shared:
+        with sharing(tmp_path / "image.zarr", empty_image(), "image", WINDOWS) as (_, missing):
+            assert missing == [WINDOWS[1], WINDOWS[3]]
+    else:
+        with writing(tmp_path / "image.zarr") as wip:
+            assert resume(wip, empty_image(), "image", WINDOWS) == [WINDOWS[1], WINDOWS[3]]
+    assert [record.getMessage().split(" is damaged")[0] for record in caplog.records] == [str(tile)]
+    assert "formed again" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"\xff\xfe", b"[]", b'{"attributes": 1}', b"[" * 100_000],
+    ids=["empty", "cut", "no text", "a list", "other attributes", "very deep"],
+)
+def test_work_in_progress_that_cannot_say_what_it_is_is_begun_anew_with_a_notice(tmp_path, caplog, content):
+    wip = half_done(tmp_path / "image.zarr")
+    (wip / "zarr.json").write_bytes(content)
+    with writing(tmp_path / "image.zarr") as wip:
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
+    assert "begun anew" in caplog.text
+
+
+def test_damaged_metadata_of_an_array_is_written_again_and_its_tiles_are_kept(tmp_path, caplog):
+    wip = half_done(tmp_path / "image.zarr")
+    metadata = wip / "image" / "zarr.json"
+    content = metadata.read_bytes()
+    metadata.write_bytes(content.replace(b"complex64", b"complex32"))
+    (wip / "image" / "c" / "7").mkdir()
+    (wip / "image" / "c" / "7" / "7").write_bytes(b"no chunk of it")
+    with sharing(tmp_path / "image.zarr", empty_image(), "image", WINDOWS) as (_, missing):
+        assert missing == WINDOWS[3:]
+    assert metadata.read_bytes() == content
+    assert not (wip / "image" / "c" / "7" / "7").exists()
+    assert "image/zarr.json is damaged" in caplog.text
+
+
+def test_undamaged_work_is_resumed_without_a_word(tmp_path, caplog):
+    half_done(tmp_path / "image.zarr")
+    with writing(tmp_path / "image.zarr") as wip:
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS[3:]
+    assert caplog.records == []
+
+
+def test_a_tile_reaches_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    with writing(tmp_path / "image.zarr") as wip:
+        resume(wip, empty_image(), "image", WINDOWS)
+        tile, synchronised = wip / "image" / "c" / "0" / "0", []
+        monkeypatch.setattr(os, "fsync", lambda _: synchronised.append(tile.exists()))
+        open_array(wip, "image")[WINDOWS[0]] = 1
+        assert synchronised == [False]
+        assert tile.is_file()
+
+
+def test_every_chunk_of_every_array_carries_a_sum(tmp_path):
+    save_stage(track(), tmp_path / "track.zarr")
+    finished_image(tmp_path / "image.zarr")
+    arrays = [json.loads(path.read_text()) for path in tmp_path.glob("*.zarr/*/zarr.json")]
+    assert len(arrays) == 4
+    assert {array["codecs"][-1]["name"] for array in arrays} == {"crc32c"}
+
+
+def test_a_chunk_damaged_after_its_stage_was_opened_is_one_message_with_the_manifest_to_delete(tmp_path):
+    finished_image(tmp_path / "image.zarr")
+    opened = open_stage(tmp_path / "image.zarr", "image")
+    chunk = tmp_path / "image.zarr" / "image" / "c" / "1" / "1"
+    chunk.write_bytes(flipped(chunk.read_bytes()))
+    assert opened.image[0, 0].item() == 1
+    with pytest.raises(CampaignError, match=r"image/c/1/1: damaged.*Delete .*image\.manifest\.json and run") as caught:
+        opened.image.load()
+    assert str(caught.value).count(str(tmp_path)) == 2

@@ -20,7 +20,7 @@ from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
 from apertura.errors import CampaignError, ContractError
-from apertura.export.writing import Block, added, blocks_of, check_written, gdal_replacement
+from apertura.export.writing import IN_MEMORY_BYTES, Block, added, blocks_of, check_written, gdal_replacement
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
 
@@ -153,10 +153,18 @@ def write_cog(
         As `write_slc`.
     """
     place = placed(image, transform, crs)
-    with gdal_replacement(path) as temporary:
+    words = described(tags, title)
+    with gdal_replacement(path, size=(size := size_of(image, band))) as temporary:
         source = temporary.with_name("source.tif")
-        checksum = fill(source, lambda block: value(np.asarray(image[block])), band, place, described(tags, title))
-        finish(source, temporary, band, checksum)
+        checksum = fill(source, lambda block: value(np.asarray(image[block])), band, place, words)
+        finish(source, temporary, band)
+        if size > IN_MEMORY_BYTES:
+            check_written(temporary, checksum, words)
+
+
+def size_of(image: Raster, band: Band) -> int:
+    """Return the bytes of the pixels of a file."""
+    return int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
 
 
 def power(image: Pixels) -> NDArray[np.float32]:
@@ -223,8 +231,8 @@ def fill(
     return checksum
 
 
-def finish(source: Path, target: Path, band: Band, checksum: int) -> None:
-    """Turn a GeoTIFF into a COG that reads back as it was filled; overviews that `source` has are kept."""
+def finish(source: Path, target: Path, band: Band) -> None:
+    """Turn a GeoTIFF into a COG; overviews that `source` has are kept."""
     rasterio.shutil.copy(
         source,
         target,
@@ -235,4 +243,3 @@ def finish(source: Path, target: Path, band: Band, checksum: int) -> None:
         BIGTIFF="IF_SAFER",
         OVERVIEW_RESAMPLING=band.overviews,
     )
-    check_written(target, checksum)

@@ -10,8 +10,8 @@ from rasterio import Affine
 from rasterio.enums import Resampling
 from rasterio.windows import Window
 
-from apertura.export.cog import BLOCK, POWER, Band, Pixels, Raster, described, fill, finish, placed, power
-from apertura.export.writing import Block, check_written, gdal_replacement
+from apertura.export.cog import BLOCK, POWER, Band, Pixels, Raster, described, fill, finish, placed, power, size_of
+from apertura.export.writing import IN_MEMORY_BYTES, Block, check_written, gdal_replacement
 
 DB = Band("float32", np.nan, "dB", "power of the focused scene, 10 log10", "AVERAGE")
 
@@ -39,27 +39,24 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
-    with gdal_replacement(path) as temporary:
+    words, size = described(tags, title), size_of(image, POWER)
+    with gdal_replacement(path, size=size) as temporary:
         linear = temporary.with_name("power.tif")
-        check_written(linear, fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {}))
-        checksums = []
+        checksums = [fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {})]
+        if size > IN_MEMORY_BYTES:
+            check_written(linear, checksums[0], {})
         levels = max(0, int(np.ceil(np.log2(max(image.shape) / BLOCK))))
         with rasterio.open(linear, "r+") as raster:
             raster.build_overviews([2**level for level in range(1, levels + 1)], Resampling.average)
         # GDAL finds the first overview of source.tif in source.tif.ovr, the next in source.tif.ovr.ovr, …
         for level in range(levels + 1):
             with rasterio.open(linear, **({"OVERVIEW_LEVEL": level - 1} if level else {})) as mean:
-                size = {"height": mean.height, "width": mean.width}
-                checksums.append(
-                    fill(
-                        temporary.with_name("source.tif" + level * ".ovr"),
-                        partial(_read_decibels, mean),
-                        DB,
-                        size if level else place,
-                        {} if level else described(tags, title),
-                    )
-                )
-        finish(temporary.with_name("source.tif"), temporary, DB, checksums[0])
+                smaller = {"height": mean.height, "width": mean.width}
+                file, read = temporary.with_name("source.tif" + level * ".ovr"), partial(_read_decibels, mean)
+                checksums.append(fill(file, read, DB, smaller if level else place, {} if level else words))
+        finish(temporary.with_name("source.tif"), temporary, DB)
+        if size > IN_MEMORY_BYTES:
+            check_written(temporary, checksums[1], words)
 
 
 def _read_decibels(mean: rasterio.DatasetReader, block: Block) -> Pixels:

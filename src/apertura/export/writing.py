@@ -3,16 +3,18 @@
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import google_crc32c
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
 from apertura.atomic import replacement
@@ -20,16 +22,27 @@ from apertura.atomic import replacement
 READ = 2048  # pixels along a side of what is held in memory at once: four tiles of a COG
 GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no .aux.xml beside the file
 
+IN_MEMORY_BYTES = 1 << 27
+"""Pixels of a raster that GDAL writes in memory: 4096 x 4096 complex."""
+
 _FULL_BYTES = 1 << 20  # less than this free, and the disk counts as full
 
 Block = tuple[slice, slice]
 
 
 @contextmanager
-def gdal_replacement(path: Path) -> Iterator[Path]:
-    """Yield where GDAL writes what becomes `path`; what it cannot write or read back is an `OSError`.
+def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
+    """Yield where GDAL writes what becomes `path`; what cannot be written is an `OSError`.
 
-    GDAL's own errors do not say why a write failed, and some, at the closing of a file, it keeps to itself.
+    GDAL keeps some errors of writing to itself. What is small it writes in memory, and Python brings it to the disk;
+    what is larger it writes on the disk, where `check_written` reads it again.
+
+    Parameters
+    ----------
+    path
+        Complete or absent.
+    size
+        Bytes of the raster's pixels.
 
     Raises
     ------
@@ -37,10 +50,16 @@ def gdal_replacement(path: Path) -> Iterator[Path]:
         With a number and `path`: `ENOSPC` where the disk is full, `EIO` where GDAL does not say what it was.
     """
     with replacement(path) as temporary, rasterio.Env(**GDAL):
+        if size <= IN_MEMORY_BYTES:
+            with MemoryFile(dirname=uuid4().hex, filename=path.name) as memory:
+                yield Path(memory.name)
+                temporary.write_bytes(memory.getbuffer())
+            return
         try:
             yield temporary
         except Exception as error:
-            if not type(error).__module__.startswith("rasterio") or getattr(error, "errno", None):
+            told = isinstance(error, OSError) and error.errno
+            if told or not type(error).__module__.startswith("rasterio"):
                 raise
             number = errno.ENOSPC if shutil.disk_usage(temporary.parent).free < _FULL_BYTES else errno.EIO
             raise OSError(number, f"{os.strerror(number)}: GDAL says: {error}", str(path)) from error
@@ -64,8 +83,8 @@ def added(checksum: int, pixels: NDArray[Any]) -> int:
     return total
 
 
-def check_written(path: Path, checksum: int) -> None:
-    """Read a raster back, overviews too, and compare its pixels with what was written.
+def check_written(path: Path, checksum: int, tags: Mapping[str, str]) -> None:
+    """Read a raster back, overviews too, and compare its pixels and tags with what was written.
 
     Raises
     ------
@@ -74,11 +93,11 @@ def check_written(path: Path, checksum: int) -> None:
     """
     with rasterio.open(path) as raster:
         levels = len(raster.overviews(1))
-        found = _checksum(raster)
+        found, told = _checksum(raster), raster.tags()
     for level in range(levels):
         with rasterio.open(path, OVERVIEW_LEVEL=level) as overview:
             _checksum(overview)  # its tiles carry sums of their own, which GDAL compares
-    if found != checksum:
+    if found != checksum or not tags.items() <= told.items():
         raise OSError(errno.EIO, "what was written does not read back", str(path))
 
 

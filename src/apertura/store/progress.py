@@ -166,9 +166,14 @@ def _skeleton(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> dict
 
 
 def _begin(wip: Path, files: Mapping[str, bytes]) -> None:
+    """Write metadata and coordinates; that of the stage, by which it is known, last. Resuming checks all of it."""
     remove(wip)
-    for name in sorted(files, reverse=True):  # zarr.json of the stage, by which it is known, comes last
-        write_beside(wip / name, files[name])
+    for name, content in files.items():
+        if name != "zarr.json":
+            (wip / name).parent.mkdir(parents=True, exist_ok=True)
+            with naming(wip / name):
+                (wip / name).write_bytes(content)
+    write_beside(wip / "zarr.json", files["zarr.json"])
 
 
 def _is_intact(wip: Path, files: Mapping[str, bytes]) -> bool:

@@ -1,0 +1,62 @@
+"""What GDAL writes is what it was given, or an error says so: in memory, and on the disk."""
+
+import errno
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio import Affine
+
+from apertura.export import cog, db, writing
+from apertura.export.cog import power, write_power, write_slc
+from apertura.export.db import write_db
+from apertura.export.writing import added, check_written
+
+UTM = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {"APERTURA_RUNSPEC": "{}"}}
+
+
+def image():
+    return np.random.default_rng(0).standard_normal((700, 600, 2)).astype(np.float32).view(np.complex64)[..., 0]
+
+
+@pytest.fixture
+def on_disk(monkeypatch):
+    """Nothing is small enough for memory."""
+    for module in (cog, db, writing):
+        monkeypatch.setattr(module, "IN_MEMORY_BYTES", 0)
+
+
+@pytest.mark.parametrize("write", [write_slc, write_power, write_db])
+def test_a_large_image_and_a_small_one_are_written_to_the_same_bytes(tmp_path, request, write):
+    write(tmp_path / "x.tif", image(), **UTM)
+    in_memory = (tmp_path / "x.tif").read_bytes()
+    request.getfixturevalue("on_disk")
+    write(tmp_path / "x.tif", image(), **UTM)
+    assert (tmp_path / "x.tif").read_bytes() == in_memory
+    assert [path.name for path in tmp_path.iterdir()] == ["x.tif"]
+
+
+@pytest.fixture
+def written(tmp_path):
+    write_power(tmp_path / "x.tif", image(), **UTM)
+    return tmp_path / "x.tif"
+
+
+def test_a_raster_that_reads_back_passes_and_one_that_lacks_pixels_or_tags_does_not(written):
+    checksum = added(0, power(image()))
+    check_written(written, checksum, UTM["tags"])
+    with pytest.raises(OSError, match="does not read back"):
+        check_written(written, checksum + 1, UTM["tags"])
+    with pytest.raises(OSError, match="does not read back"):
+        check_written(written, checksum, {"APERTURA_FLAGS": "{}"})
+
+
+def test_what_gdal_cannot_write_is_an_error_of_the_machine_that_names_the_file(tmp_path, monkeypatch, on_disk):
+    def breaks(*_):
+        raise rasterio.errors.RasterioIOError("Write failed. See previous exception for details.")
+
+    monkeypatch.setattr(cog, "check_written", breaks)
+    with pytest.raises(OSError, match="Write failed") as caught:
+        write_slc(tmp_path / "x.tif", image(), **UTM)
+    assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(tmp_path / "x.tif"))
+    assert list(tmp_path.iterdir()) == []
