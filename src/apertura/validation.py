@@ -52,8 +52,8 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
         wrong.setdefault(quoted(key)[1:-1], []).append(line)
     lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
     lines.sort(key=lambda line: "unknown key" not in line)
-    more = len(lines) - _MOST_COMPLAINTS
-    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and {more} more" if more > 0 else "")
+    more = len(lines) > _MOST_COMPLAINTS or error.error_count() > 10 * _MOST_COMPLAINTS
+    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in all" if more else "")
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:

@@ -56,16 +56,16 @@ def kinds(before: dict[str, object], after: dict[str, object]) -> set[str]:
 
 _ENDINGS = {
     "(shape)": "more or fewer values",
-    "(values)": "values of an array",
+    "(values)": "values of",
     "(keys)": "more or fewer keys, or another name or order",
     "(length)": "more or fewer entries",
 }
 
 
 def _kind(way: str, before: Any, after: Any) -> str:
-    ending = way.rpartition(" ")[2]
+    name, _, ending = way.rpartition(" ")
     if ending in _ENDINGS:
-        return _ENDINGS[ending]
+        return _ENDINGS[ending] + (f" {name.rpartition('.')[2]}" if ending == "(values)" else "")
     if before is None or after is None or isinstance(before, bool) or isinstance(after, bool):
         return "a choice, or a key left out"
     if isinstance(before, str) and isinstance(after, str):

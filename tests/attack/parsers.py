@@ -16,7 +16,8 @@ from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
 from apertura.load.transmitted import read_codes, read_framing
 from apertura.scene.dem_file import open_dem
-from apertura.scene.geoid import geoid_file, undulation
+from apertura.scene.geoid import geoid_file
+from apertura.scene.geoid_grid import undulation
 from apertura.scene.grid import SceneGrid
 from apertura.settings import Flight, read_flights, read_segments, read_settings
 from apertura.simulation.specification import read_specification
@@ -149,7 +150,7 @@ PARSERS: dict[str, Parser] = {
         (mutators.cells(" "),),
         f"{_TIMES} % GPST UTC JST latitude(deg) Q sdn(m) /geodetic 99999999999",
     ),
-    "beam pattern": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
+    "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
     "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),
     "preamble.npy": Parser("preamble.npy", seeds.preambles, _preamble, (), _NPY),
     "afrl.mat": Parser(

@@ -67,7 +67,7 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
         _check(fields, path)
     first = passes[0]["freq"]
     for path, fields in zip(paths, passes, strict=True):
-        if fields["freq"].shape != first.shape or np.abs(fields["freq"] - first).max() > 1e-6 * first[0]:
+        if fields["freq"].shape != first.shape or np.abs(fields["freq"] - first).max() > 1e-6 * abs(first[0]):
             raise _error("other frequencies than the first file", path)
     antenna = np.concatenate([np.stack([f["x"], f["y"], f["z"]], -1) for f in passes])
     reference = 2 * np.concatenate([f["r0"] for f in passes]) / SPEED_OF_LIGHT_M_S

@@ -141,6 +141,7 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
     with undamaged(path, expected=expected, remedy=DAMAGED):
         read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
         fusion, pairs = document["fusion"], document["pairs"]
-        read["fusion"] = {**fusion, "left_out": {**fusion["left_out"]}, "phases_rad": {**fusion["phases_rad"]}}
+        phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
+        read["fusion"] = {**fusion, "left_out": {**fusion["left_out"]}, "phases_rad": phases}
         read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
     return {**document, **read}

@@ -104,8 +104,14 @@ def settled_scene(campaign: Campaign) -> OpenScene:
         grid, level = document["grid"], FlatGround(_number(document["height_m"]))
         places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
         shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
-        whole = SceneGrid(f"{grid['crs']}", **places, shape=shape, first=first, name=f"{grid['name']}")
+        whole = SceneGrid(_text(grid["crs"]), **places, shape=shape, first=first, name=_text(grid["name"]))
         return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{quoted(value)} is no text")
+    return value
 
 
 def _number(value: object) -> float:
