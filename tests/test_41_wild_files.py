@@ -1,24 +1,16 @@
 """Files of a campaign that no person would write: each is one message where a traceback, or nothing, used to be."""
 
 import io
-import json
 import struct
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, edit_meta, edit_track
+from folders import complaint, edit_meta
 
 from apertura.campaign import Campaign
-from apertura.ingest import read_track
-from apertura.load.results import assessment_of, open_campaign
-from apertura.load.scene import settled_scene
 from apertura.load.transmitted import read_codes, read_framing
 from apertura.settings import read_segments
 from apertura.steps import ingest
-from apertura.steps.calibration import calibrated
-from apertura.steps.summary import print_summary
-from apertura.steps.verify import verify
 
 # Tables of the config
 
@@ -185,145 +177,3 @@ def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "uav1.sigmf-meta: apertura:framing.preamble: path" in message
     assert "inside the campaign folder" in message
-
-
-# Flight logs
-
-
-def csv_log(tmp_path, *lines, heading="time_utc,latitude_deg,longitude_deg,height_m,yaw_deg"):
-    path = tmp_path / "a.track.csv"
-    path.write_text("\n".join([heading, *lines]) + "\n")
-    return lambda: read_track(path, node="a")
-
-
-GOOD = "2025-05-14T09:30:00Z,48,9,600,1"
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("2025-05-14T09:30:01Z,48,9,1e308,1", "the height between -1000 and 100000 m"),
-        ("2025-05-14T09:30:01Z,48,9,inf,1", "epochs without a position"),
-        ("2025-05-14T09:30:01Z,48,1e9,600,1", "epochs without a position"),
-        ("99999-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
-        ("2500-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
-        ("0001-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
-        (",48,9,600,1", "epoch 1 is at NaT"),
-        ("2025-05-14T09:30:01Z,48,9,600,1,7", "more cells than"),
-        ("2025-05-14T09:30:01Z,48,9,\x1b[2J,1", r"column height_m: '\x1b[2J'"),
-        ("2025-05-14T09:30:01Z,48,9,6_00,1", "column height_m: '6_00'"),
-        ("2025-05-14T09:30:01Z,48,True,600,1", "column longitude_deg: 'True'"),
-        ('"2025-05-14T09:30:01Z,48', "a.track.csv: "),
-    ],
-)
-def test_a_line_that_no_flight_logs_is_one_message(tmp_path, line, expected):
-    message = complaint(csv_log(tmp_path, GOOD, line))
-    assert expected in message
-    assert message.isprintable()
-    assert len(message) < 800
-
-
-def test_a_column_that_stands_twice_is_named(tmp_path):
-    heading = "time_utc,latitude_deg,longitude_deg,height_m,height_m"
-    assert "column height_m a second time" in complaint(csv_log(tmp_path, GOOD, GOOD, heading=heading))
-
-
-def test_a_standard_deviation_below_zero_is_refused(tmp_path):
-    heading = "time_utc,latitude_deg,longitude_deg,height_m,std_north_m,std_east_m,std_up_m"
-    lines = [f"2025-05-14T09:30:0{n}Z,48,9,600,1,{-n},1" for n in range(3)]
-    assert "a standard deviation of -1 in epoch 1" in complaint(csv_log(tmp_path, *lines, heading=heading))
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("inf 5.0 48.0 9.0 600.0 1", "line 3 is"),
-        ("99999999999999999999 5.0 48.0 9.0 600.0 1", "line 3 is"),
-        ("2366 1e300 48.0 9.0 600.0 1", "line 3 is"),
-        ("9999/01/01 00:00:00 48.0 9.0 600.0 1", "is not between 1980 and 2199"),
-        ("2025/05/14 09:30:01 48.0 9.0 600.0 257", "Q 257"),
-        ("2025/05/14 09:30:01 48.0 9.0 60_0.0 1", "line 3 is"),
-        ("2025/05/14 09:30:01 48.0 9.0 \x1b[2J 1", r"\\x1b[2J"),
-    ],
-)
-def test_a_solution_that_no_receiver_writes_is_one_message(tmp_path, line, expected):
-    path = tmp_path / "a.track.pos"
-    path.write_text(f"% (lat/lon/height=WGS84/ellipsoidal)\n% UTC latitude(deg) longitude(deg) height(m) Q\n{line}\n")
-    message = complaint(lambda: read_track(path, node="a"))
-    assert expected in message
-    assert message.isprintable()
-
-
-def test_logs_of_windows_are_read_as_those_of_unix(tiny):
-    for node in ("uav1", "uav2"):
-        path = next((tiny / "raw" / "f01").glob(f"{node}.track.*"))
-        track = read_track(path, node=node)
-        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
-        assert read_track(path, node=node).identical(track)
-
-
-def test_a_log_that_is_not_utf8_is_refused(tiny):
-    edit_track(tiny, "uav1", lambda lines: [*lines[:5], lines[5] + "é"])
-    for node in ("uav1", "uav2"):
-        path = next((tiny / "raw" / "f01").glob(f"{node}.track.*"))
-        path.write_bytes(path.read_text().encode("latin-1") + b"\xe9")
-        assert path.name in complaint(lambda path=path, node=node: read_track(path, node=node))
-
-
-# Results
-
-
-DAMAGE = [b"", b"{", b"[]", b"{}", b'{"grid": 3}', b"\xff", b"null", b'{"pairs": 3}', b'{"pairs": {"uav1-uav2": {}}}']
-
-
-@pytest.mark.parametrize("content", DAMAGE)
-def test_a_damaged_result_is_named_and_to_be_deleted(tiny, content):
-    edit_config(
-        tiny,
-        lambda document: document.update(calibration={"flight": "c01", "reflector_m": [570660.0, 5363700.0, 620.0]}),
-    )
-    (tiny / "config" / "flights.tsv").write_text(
-        "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1,uav2\nc01\tcalibration\tuav1\tuav1,uav2\n"
-    )
-    campaign, results = Campaign.load(tiny), tiny / "results"
-    readers = {
-        "scene.json": lambda: settled_scene(campaign),
-        "c01/calibration.json": lambda: calibrated(campaign, "f01", "uav1-uav2"),
-        "f01/assessment.json": lambda: assessment_of(campaign, "f01"),
-        "f01/uav1-uav1/image.json": lambda: print_summary(campaign),
-    }
-    for name, read in readers.items():
-        assert "no such file" in complaint(read)
-        (results / name).parent.mkdir(parents=True, exist_ok=True)
-        (results / name).write_bytes(content)
-        message = complaint(read)
-        assert f"results/{name}: " in message
-        assert "Delete it and run the workflow again" in message or content == b"\xff"
-    if content in {b"", b"{", b"[]", b"null"}:
-        assert "image.json: damaged" in complaint(lambda: open_campaign(tiny).report("f01", "uav1-uav1"))
-
-
-def test_a_scene_whose_grid_is_none_is_damaged(tmp_path):
-    grid = {
-        "crs": "EPSG:32632",
-        "west_m": 0,
-        "north_m": 0,
-        "spacing_m": 1,
-        "shape": [2, 2],
-        "first": [0, 0],
-        "name": "x",
-    }
-    document = {"grid": grid, "height_m": 1.0, "inputs": {}, "chosen": {}}
-    path = tmp_path / "results" / "scene.json"
-    path.parent.mkdir()
-    path.write_text(json.dumps(document))
-    campaign = SimpleNamespace(root=tmp_path)
-    assert settled_scene(campaign).grid.shape == (2, 2)
-    for change in ({"spacing_m": -1}, {"shape": [1e308, 2]}, {"shape": [0, 2]}, {"west_m": "x"}, {"crs": None}):
-        path.write_text(json.dumps(document | {"grid": grid | change}))
-        assert "scene.json: damaged" in complaint(lambda: settled_scene(campaign))
-
-
-def test_a_truth_that_is_none_is_one_message(tiny):
-    (tiny / "truth.json").write_text('{"targets": [{"x": "left"}]}')
-    assert "truth.json: damaged" in complaint(lambda: verify(Campaign.load(tiny)))
