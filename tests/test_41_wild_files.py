@@ -1,6 +1,7 @@
 """Files of a campaign that no person would write: each is one message where a traceback, or nothing, used to be."""
 
 import io
+import os
 import struct
 
 import numpy as np
@@ -105,6 +106,13 @@ def test_codes_that_are_no_complex_symbols_are_refused_before_anything_is_alloca
     message = complaint(codes(tmp_path, content))
     assert "codes.npy: " in message
     assert expected in message
+
+
+def test_codes_beyond_any_waveform_are_refused_by_their_header_alone(tmp_path):
+    """A sparse file as large as it says: 2 TiB that would be allocated."""
+    read = codes(tmp_path, header((1 << 38,)))
+    os.truncate(tmp_path / "codes.npy", 128 + (8 << 38))
+    assert "<c8 of shape (274877906944,)" in complaint(read)
 
 
 @pytest.mark.parametrize("kind", [np.complex64, np.complex128, ">c8"])
