@@ -99,6 +99,14 @@ def test_numbers_that_are_each_allowed_and_overflow_together_are_one_message(tmp
     assert "too large or small" in complaint(lambda: read_settings(tmp_path / "config.yaml"))
 
 
+@pytest.mark.parametrize("number", ["1.0e+16", "-1e300", "9" * 20])
+def test_a_number_that_nothing_of_ours_reaches_is_named_by_its_key(tmp_path, number):
+    (tmp_path / "config.yaml").write_text(config_template().replace("radar: 0.0", f"radar: {number}", 1))
+    message = complaint(lambda: read_settings(tmp_path / "config.yaml"))
+    assert "nodes.uav1.path_offset_m.radar is " in message
+    assert "no number beyond ±1e+15" in message
+
+
 def test_a_wrong_value_is_quoted_no_longer_than_a_line(tmp_path):
     (tmp_path / "config.yaml").write_text(config_template().replace("prf_hz: 100.0", f"prf_hz: {'long' * 9999}"))
     message = complaint(lambda: read_settings(tmp_path / "config.yaml"))

@@ -149,6 +149,8 @@ def described(meta, **changes):
         ("global", {"apertura:channels": ["radar", "radar"]}, "each its own"),
         ("global", {"core:sample_rate": float("inf")}, "core:sample_rate: "),
         ("global", {"core:sample_rate": 1e308}, "core:sample_rate: "),
+        ("global", {"core:sample_rate": 1e-3}, "core:sample_rate: "),
+        ("global", {"apertura:channels": ["radar", "\x1b[2J"]}, "apertura:channels.1: "),
         ("global", {"core:num_channels": 2**70}, "core:num_channels: "),
         ("global", {"core:datatype": "\x1b[2J"}, r"core:datatype '\x1b[2J'"),
         ("capture", {"apertura:frame": float("nan")}, "apertura:frame: "),

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -15,6 +16,9 @@ _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)
 """What pydantic adds to the way to a key where it may hold one of several types."""
 
 _MOST_COMPLAINTS = 12
+
+LARGEST_NUMBER = 1e15
+"""No length, time, frequency or count of ours is larger; beyond, sums lose what is added to them."""
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
@@ -36,13 +40,30 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     """
     adapter = TypeAdapter(model)
     try:
-        return adapter.validate_python(document)
+        value = adapter.validate_python(document)
     except ValidationError as error:
         found = _complaints(error, adapter.json_schema())
         raise CampaignError(found, where=where, expected=expected, remedy="Correct what is named.") from error
     except ArithmeticError as error:  # of numbers that are each allowed and not together
         found = f"numbers too large or small to calculate with ({error})"
         raise CampaignError(found, where=where, expected=expected, remedy="Correct the wildest.") from error
+    for key, number in _numbers(adapter.dump_python(value, warnings=False), ()):
+        if not abs(number) <= LARGEST_NUMBER:
+            found = f"{quoted(key)[1:-1]} is {quoted(number)}"
+            raise CampaignError(found, where, f"no number beyond ±{LARGEST_NUMBER:g}", "Correct what is named.")
+    return value
+
+
+def _numbers(value: object, way: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    """Yield key and absolute value of every number."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _numbers(part, (*way, str(key)))
+    elif isinstance(value, list | tuple):
+        for index, part in enumerate(value):
+            yield from _numbers(part, (*way, str(index)))
+    elif isinstance(value, int | float | complex):
+        yield ".".join(way), abs(value)
 
 
 def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:

@@ -24,6 +24,8 @@ from apertura.store import manifest_of, open_array, open_stage
 
 PATH = Path("results/scene.json")
 
+_FARTHEST_M = 1e9
+
 Bounds = tuple[float, float, float, float]
 
 
@@ -115,8 +117,8 @@ def _text(value: object) -> str:
 
 
 def _number(value: object) -> float:
-    if not isinstance(value, int | float):
-        raise TypeError(f"{quoted(value)} is no number")
+    if not isinstance(value, int | float) or not abs(value) < _FARTHEST_M:
+        raise TypeError(f"{quoted(value)} is no number of metres")
     return float(value)
 
 
