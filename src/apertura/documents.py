@@ -57,13 +57,13 @@ def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
         data = stream.read(largest + 1)
     if len(data) > largest:
         found = f"{path.stat().st_size} bytes"
-        raise CampaignError(found, path, f"{expected}, of at most {largest} bytes", "Is it the right file? Shorten it.")
+        raise CampaignError(found, path, f"a file of at most {largest} bytes", "Is it the right file? Shorten it.")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         found = f"byte {data[error.start]:#04x} in line {line} is not UTF-8"
-        raise CampaignError(found, path, f"{expected}, as UTF-8 text", "Save the file as UTF-8.") from error
+        raise CampaignError(found, path, "UTF-8 text", "Save the file as UTF-8.") from error
 
 
 def read_yaml(path: Path, *, expected: str, remedy: str) -> object:

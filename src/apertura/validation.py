@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -15,6 +16,9 @@ _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)
 """What pydantic adds to the way to a key where it may hold one of several types."""
 
 _MOST_COMPLAINTS = 12
+
+LARGEST_NUMBER = 1e15
+"""No length, time, frequency or count of ours is larger; beyond, sums lose what is added to them."""
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
@@ -36,13 +40,30 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     """
     adapter = TypeAdapter(model)
     try:
-        return adapter.validate_python(document)
+        value = adapter.validate_python(document)
     except ValidationError as error:
         found = _complaints(error, adapter.json_schema())
         raise CampaignError(found, where=where, expected=expected, remedy="Correct what is named.") from error
     except ArithmeticError as error:  # of numbers that are each allowed and not together
         found = f"numbers too large or small to calculate with ({error})"
         raise CampaignError(found, where=where, expected=expected, remedy="Correct the wildest.") from error
+    for key, number in _numbers(adapter.dump_python(value, warnings=False), ()):
+        if not abs(number) <= LARGEST_NUMBER:
+            found = f"{quoted(key)[1:-1]} is {quoted(number)}"
+            raise CampaignError(found, where, f"no number beyond ±{LARGEST_NUMBER:g}", "Correct what is named.")
+    return value
+
+
+def _numbers(value: object, way: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    """Yield key and absolute value of every number."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _numbers(part, (*way, str(key)))
+    elif isinstance(value, list | tuple):
+        for index, part in enumerate(value):
+            yield from _numbers(part, (*way, str(index)))
+    elif isinstance(value, int | float | complex):
+        yield ".".join(way), abs(value)
 
 
 def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
@@ -52,8 +73,8 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
         wrong.setdefault(quoted(key)[1:-1], []).append(line)
     lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
     lines.sort(key=lambda line: "unknown key" not in line)
-    more = len(lines) - _MOST_COMPLAINTS
-    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and {more} more" if more > 0 else "")
+    more = len(lines) > _MOST_COMPLAINTS or error.error_count() > 10 * _MOST_COMPLAINTS
+    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in all" if more else "")
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:

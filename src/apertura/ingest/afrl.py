@@ -39,10 +39,35 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     urban environment", Proc. SPIE 6568, 2007, and the data set's read-me.
     """
     paths = sorted(paths)
-    passes = _read(paths)
+    try:
+        passes = read_isolated("apertura.ingest.mat_fields:read_fields", paths)
+    except UnreadableError as error:
+        raise _error(f"not readable ({error})", error.path) from error
+    return joined(paths, passes, pair=pair)
+
+
+def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, pair: str) -> xr.Dataset:
+    """Return the `echo` stage of what `apertura.ingest.mat_fields` read of each file.
+
+    Parameters
+    ----------
+    paths
+        Files in order, for messages.
+    passes
+        Per file fp (subcarrier, pulse) complex64; freq (subcarrier,) Hz; x, y, z, r0 (pulse,) m.
+    pair
+        Transmitter-receiver.
+
+    Raises
+    ------
+    CampaignError
+        If fields do not fit each other, hold NaN or values that no radar has, or frequencies differ between files.
+    """
+    for path, fields in zip(paths, passes, strict=True):
+        _check(fields, path)
     first = passes[0]["freq"]
     for path, fields in zip(paths, passes, strict=True):
-        if fields["freq"].shape != first.shape or np.ptp(fields["freq"] - first) > 1e-6 * first[0]:
+        if fields["freq"].shape != first.shape or np.abs(fields["freq"] - first).max() > 1e-6 * abs(first[0]):
             raise _error("other frequencies than the first file", path)
     antenna = np.concatenate([np.stack([f["x"], f["y"], f["z"]], -1) for f in passes])
     reference = 2 * np.concatenate([f["r0"] for f in passes]) / SPEED_OF_LIGHT_M_S
@@ -60,16 +85,6 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
         },
         attrs={"frame": "local", "pair": pair, "flags": {}},
     )
-
-
-def _read(paths: Sequence[Path]) -> list[dict[str, NDArray[Any]]]:
-    try:
-        passes = read_isolated("apertura.ingest.mat_fields:read_fields", paths)
-    except UnreadableError as error:
-        raise _error(f"not readable ({error})", error.path) from error
-    for path, fields in zip(paths, passes, strict=True):
-        _check(fields, path)
-    return passes
 
 
 def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:

@@ -29,7 +29,7 @@ def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
     """
     try:
         table = read_table(path, _COLUMNS)
-        unknown = sorted(set(table["cut"].astype(str)) - LIMITS_RAD.keys())
+        unknown = sorted(set(table["cut"].fillna("").astype(str)) - LIMITS_RAD.keys())
         if unknown:
             raise ValueError(f"a cut called {quoted(unknown[0])}")
         azimuth, elevation = (_samples(table[table["cut"] == name], name) for name in LIMITS_RAD)

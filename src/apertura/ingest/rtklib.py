@@ -81,10 +81,10 @@ def _time(first: str, second: str) -> str | np.datetime64:
     """Return a calendar date as text, which costs less to read all at once, or what week and seconds say."""
     if "/" in first:
         return f"{first.replace('/', '-')}T{second}"
-    week, seconds = int(number(first)), number(second)
-    if not (0 <= week <= _LAST_WEEK and 0 <= seconds < _WEEK_S and week == number(first)):
+    week, seconds = number(first), number(second)
+    if not (0 <= week <= _LAST_WEEK and 0 <= seconds < _WEEK_S and week.is_integer()):
         raise ValueError(f"week {first} and second {second}")
-    return _GPS_EPOCH + np.timedelta64(7 * week, "D") + np.timedelta64(round(seconds * 1e9), "ns")
+    return _GPS_EPOCH + np.timedelta64(7 * int(week), "D") + np.timedelta64(round(seconds * 1e9), "ns")
 
 
 def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime64]:

@@ -27,6 +27,9 @@ _EXPECTED = "SigMF metadata with one capture segment per trigger, ISO 8601 UTC i
 Count = Annotated[int, Field(ge=0, le=1 << 40, strict=True)]
 """Of samples, chips or bits."""
 
+ChannelName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
+"""Shown in messages and named in stages."""
+
 Frequency = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
@@ -42,10 +45,10 @@ class _Framing(BaseModel):
 class _Global(BaseModel):
     datatype: str = Field(alias="core:datatype")
     version: str = Field(alias="core:version")
-    sample_rate_hz: float = Field(alias="core:sample_rate", gt=0, le=1e12)
+    sample_rate_hz: float = Field(alias="core:sample_rate", ge=1, le=1e12)
     num_channels: int = Field(1, alias="core:num_channels", ge=1, le=64, strict=True)
     sha512: str | None = Field(None, alias="core:sha512", pattern="^[0-9a-fA-F]{128}$")
-    channels: list[Annotated[str, Field(max_length=80)]] | None = Field(None, alias="apertura:channels")
+    channels: list[ChannelName] | None = Field(None, alias="apertura:channels")
     framing: _Framing | None = Field(None, alias="apertura:framing")
 
 

@@ -11,7 +11,8 @@ from apertura.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.provenance import sha256_file
 from apertura.scene.dem import Dem
 from apertura.scene.dem_file import open_dem
-from apertura.scene.geoid import geoid_file, undulation
+from apertura.scene.geoid import geoid_file
+from apertura.scene.geoid_grid import undulation
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround
 from apertura.settings import Scene

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
 from apertura.contracts import STAGES
-from apertura.documents import read_json
+from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
-from apertura.store import open_document, open_stage
+from apertura.store import open_document, open_stage, remake
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,4 +135,12 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
     CampaignError
         If it is not there as the step left it.
     """
-    return open_document(campaign.result(flight, "assessment.json"))
+    path = campaign.result(flight, "assessment.json")
+    document = open_document(path)
+    with undamaged(path, expected="what step assess writes", remedy=remake(path)):
+        read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
+        fusion, pairs = document["fusion"], document["pairs"]
+        phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
+        read["fusion"] = {**fusion, "left_out": {**fusion["left_out"]}, "phases_rad": phases}
+        read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
+    return {**document, **read}

@@ -1,5 +1,6 @@
 """A campaign's grid and the ground under it, opened together: from the results, or as they will be."""
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -9,6 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.documents import undamaged
+from apertura.errors import quoted
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import map_from_frame
 from apertura.load.ground import Ground
@@ -16,7 +19,9 @@ from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.dem import COVER_NODES, UncheckedDem
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, GridHeights, Terrain
-from apertura.store import manifest_of, open_array, open_document, open_stage
+from apertura.store import manifest_of, open_array, open_document, open_stage, remake
+
+_FARTHEST_M = 1e9
 
 Bounds = tuple[float, float, float, float]
 
@@ -92,10 +97,26 @@ def settled_scene(campaign: Campaign) -> OpenScene:
     CampaignError
         If the grid is not settled yet, or its file is damaged.
     """
-    document = open_document(campaign.result("scene.json"))
-    grid, level = document["grid"], FlatGround(document["height_m"])
-    grid = SceneGrid(**{**grid, "shape": tuple(grid["shape"]), "first": tuple(grid["first"])})
-    return OpenScene(grid, level, level, (), document["inputs"], document["chosen"])
+    path = campaign.result("scene.json")
+    document = open_document(path)
+    with undamaged(path, expected="the grid that the workflow settles", remedy=remake(path)):
+        grid, level = document["grid"], FlatGround(_number(document["height_m"]))
+        places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
+        shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
+        whole = SceneGrid(_text(grid["crs"]), **places, shape=shape, first=first, name=_text(grid["name"]))
+        return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{quoted(value)} is no text")
+    return value
+
+
+def _number(value: object) -> float:
+    if not isinstance(value, int | float) or not abs(value) < _FARTHEST_M:
+        raise TypeError(f"{quoted(value)} is no number of metres")
+    return float(value)
 
 
 def open_scene(campaign: Campaign) -> OpenScene:

@@ -1,35 +1,22 @@
 """From heights above a geoid to heights above the ellipsoid, through a grid file that must be there."""
 
 import os
-import struct
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
-from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
-from apertura.errors import CampaignError, quoted
-from apertura.scene.raster import opened_raster
+from apertura.errors import CampaignError
+from apertura.scene.geoid_grid import check_grid
 
 GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
 """Datum → names of its grid of undulations, as PROJ ships them."""
 
 EPSG = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
 """Vertical CRS → datum."""
-
-HIGHEST_M = 150.0
-"""No geoid lies farther above or below the ellipsoid: −107 m south of India, +86 m in New Guinea."""
-
-MOST_POSTS = 300_000_000
-"""Posts of a grid: one minute all round the Earth."""
-
-_GTX = struct.Struct(">4d2i")
-"""Latitude and longitude of the first post, steps of both, degrees; rows, columns."""
 
 _MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
 
@@ -79,83 +66,14 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
         wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
     if wrong:
         raise CampaignError(wrong, where=given, expected=wanted, remedy="Get that file, or correct scene.geoid.")
-    _check_header(given, wanted)
+    check_grid(given)
     return given
-
-
-def _check_header(path: Path, wanted: str) -> None:
-    """Raise CampaignError unless a file is as large as the grid that its header promises: PROJ trusts the header."""
-    remedy, wrong = "Get that file again, or correct scene.geoid.", None
-    if path.suffix.lower() == ".tif":
-        with opened_raster(path, expected=wanted, remedy=remedy) as raster:
-            posts = raster.width * raster.height
-        wrong = None if posts <= MOST_POSTS else f"{posts} posts"
-    elif path.suffix.lower() == ".gtx":
-        with path.open("rb") as stream:
-            header = stream.read(_GTX.size)
-        south, west, *steps, rows, columns = _GTX.unpack(header) if len(header) == _GTX.size else (np.nan,) * 4 + (0, 0)
-        size = path.stat().st_size
-        if min(rows, columns) < 2 or rows * columns > MOST_POSTS or size != _GTX.size + 4 * rows * columns:
-            wrong = f"{size} bytes for {rows} × {columns} posts"
-        elif not (abs(south) <= 90 and abs(west) <= 360 and all(1e-4 <= step <= 30 for step in steps)):
-            wrong = f"a grid that begins at latitude {south:g}, longitude {west:g} in steps of {steps} degrees"
-    else:
-        wrong = f"a file of kind {quoted(path.suffix, 20)}"
-    if wrong:
-        raise CampaignError(wrong, where=path, expected=f"{wanted}: a .gtx or .tif grid of PROJ", remedy=remedy)
 
 
 def grid_folders() -> list[Path]:
     """Return the folders in which grids of undulations are looked for: PROJ's."""
     listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
     return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
-
-
-def undulation(
-    grid: Path, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how high the geoid lies above the ellipsoid.
-
-    Parameters
-    ----------
-    grid
-        A grid that PROJ reads (.gtx, .tif).
-    longitude_deg, latitude_deg
-        (...,) float64, degrees, in the geodetic CRS of the grid.
-
-    Returns
-    -------
-    ndarray
-        (...,) float64, metres, bilinear in the grid: ellipsoidal height = height above the geoid + undulation.
-
-    Raises
-    ------
-    CampaignError
-        If PROJ cannot read the grid or it does not reach a place.
-
-    Notes
-    -----
-    Source: PROJ, operation vgridshift. The grid is named in the operation itself, because PROJ skips one that it has to
-    look for and does not find.
-    """
-    steps = f'+step +proj=vgridshift +grids="{grid.absolute()}" +multiplier=1'  # a bare name PROJ would look for
-    try:
-        shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
-    except ProjError as error:
-        raise CampaignError(
-            "not readable as a vertical grid", where=grid, expected="a .gtx or .tif of PROJ", remedy="Get it again."
-        ) from error
-    height = np.asarray(shift.transform(longitude_deg, latitude_deg, np.zeros_like(longitude_deg))[2], np.float64)
-    lost = ~(np.abs(height) <= HIGHEST_M)
-    if lost.any():
-        longitude, latitude = (np.ravel(angle)[lost.argmax()] for angle in (longitude_deg, latitude_deg))
-        raise CampaignError(
-            f"has no undulation of the Earth at longitude {longitude:.4f}, latitude {latitude:.4f}",
-            where=grid,
-            expected="a grid that reaches over the scene",
-            remedy="Get a grid of the region and name it in scene.geoid.",
-        )
-    return height
 
 
 def carried_datum(crs: CRS) -> str | None:

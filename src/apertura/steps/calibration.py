@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from apertura.campaign import Campaign
+from apertura.documents import undamaged
 from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
@@ -15,7 +16,7 @@ from apertura.lineage import result_of
 from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
 from apertura.settings import Calibration
-from apertura.store import open_document, open_stage, save_document
+from apertura.store import open_document, open_stage, remake, save_document
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:
@@ -47,7 +48,9 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     if asked is None or campaign.flight(flight).kind == "calibration":
         return None
     path = campaign.result(asked.flight, "calibration.json")
-    offsets = open_document(path)["pairs"]
+    document = open_document(path)
+    with undamaged(path, expected="what step calibrate writes", remedy=remake(path)):
+        offsets = {name: _taken(offset) for name, offset in document["pairs"].items()}
     if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",
@@ -56,6 +59,17 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
             remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
         )
     return {"flight": asked.flight, **offsets[pair]}
+
+
+def _taken(offset: dict[str, Any]) -> dict[str, Any]:
+    """Return what is taken of a pair's report; raise an error that says what is wrong with it."""
+    std_m = offset["std_m"]
+    return {
+        "offset_m": float(offset["offset_m"]),
+        "std_m": None if std_m is None else float(std_m),
+        "inputs": {str(role): str(digest) for role, digest in offset["inputs"].items()},
+        "flags": {str(name): str(text) for name, text in offset["flags"].items()},
+    }
 
 
 def _asked(campaign: Campaign) -> Calibration:

@@ -11,6 +11,7 @@ from apertura.store.manifest import (
     open_document,
     read_manifest,
     record_files,
+    remake,
     save_document,
 )
 from apertura.store.progress import create, finish, missing, open_array, resume, sharing, writing
@@ -27,6 +28,7 @@ __all__ = [
     "open_stage",
     "read_manifest",
     "record_files",
+    "remake",
     "resume",
     "save_document",
     "save_stage",

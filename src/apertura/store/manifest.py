@@ -22,6 +22,17 @@ def manifest_of(result: Path) -> Path:
     return result.with_name(f"{result.stem}.manifest.json")
 
 
+def remake(result: Path) -> str:
+    """Return what to do about a result that is not as it was written.
+
+    Examples
+    --------
+    >>> remake(Path("results/scene.json"))
+    'Delete results/scene.manifest.json and run the workflow again.'
+    """
+    return f"Delete {manifest_of(result)} and run the workflow again."
+
+
 def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Mapping[str, Any] | None = None) -> None:
     """Write the manifest of a result that is complete.
 
@@ -119,4 +130,4 @@ def open_document(path: Path) -> dict[str, Any]:
         If it is missing, or is not what the manifest describes.
     """
     check_files(path)
-    return read_json(path, expected="a result of the workflow", remedy="Run the workflow.")
+    return read_json(path, expected="a result of the workflow", remedy=remake(path))

@@ -1,0 +1,74 @@
+"""What kind of difference there is between the value of a valid file and that of a changed one that was accepted."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from pydantic import BaseModel
+
+
+def leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
+    """Yield way → leaf of a parsed value: numbers, texts, and arrays as their shape and bytes."""
+    if isinstance(value, np.memmap | np.ndarray):
+        array = np.asarray(value)
+        yield f"{way} (shape)", array.shape
+        yield f"{way} (values)", array.tobytes() if array.size < 100_000 else array[:1000].tobytes()
+    elif isinstance(value, xr.Dataset):
+        yield from leaves({name: value[name].values for name in value.variables} | dict(value.attrs), way)
+    elif isinstance(value, BaseModel):
+        yield from leaves({name: getattr(value, name) for name in type(value).model_fields}, way)
+    elif dataclasses.is_dataclass(value):
+        yield from leaves({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, way)
+    elif isinstance(value, Mapping):
+        yield f"{way} (keys)", tuple(map(str, value))
+        for key, part in value.items():
+            yield from leaves(part, f"{way}.{key}")
+    elif isinstance(value, list | tuple):
+        yield f"{way} (length)", len(value)
+        for index, part in enumerate(value):
+            yield from leaves(part, f"{way}[{index}]")
+    elif not isinstance(value, Path):
+        yield way, value
+
+
+def same(one: object, other: object) -> bool:
+    """Return whether two leaves are equal; NaN equals NaN."""
+    return type(one) is type(other) and (one == other or (one != one and other != other))  # noqa: PLR0124
+
+
+def kinds(before: dict[str, object], after: dict[str, object]) -> set[str]:
+    """Return in words how a value differs: nothing, if it does not.
+
+    Examples
+    --------
+    >>> kinds({"a": 1.0, "b": "x"}, {"a": 2.0, "b": "x"}), kinds({"a": 1}, {"a": 1})
+    ({'a number'}, set())
+    """
+    changed = [way for way in before.keys() & after.keys() if not same(before[way], after[way])]
+    found = {_kind(way, before[way], after[way]) for way in changed}
+    if not any("more or fewer" in kind for kind in found) and before.keys() != after.keys():
+        found.add("more or fewer parts")
+    return found
+
+
+_ENDINGS = {
+    "(shape)": "more or fewer values",
+    "(values)": "values of",
+    "(keys)": "more or fewer keys, or another name or order",
+    "(length)": "more or fewer entries",
+}
+
+
+def _kind(way: str, before: Any, after: Any) -> str:
+    name, _, ending = way.rpartition(" ")
+    if ending in _ENDINGS:
+        return _ENDINGS[ending] + (f" {name.rpartition('.')[2]}" if ending == "(values)" else "")
+    if before is None or after is None or isinstance(before, bool) or isinstance(after, bool):
+        return "a choice, or a key left out"
+    if isinstance(before, str) and isinstance(after, str):
+        return "a text"
+    numbers = isinstance(before, int | float) and isinstance(after, int | float)
+    return "a number" if numbers else "a value of another kind"

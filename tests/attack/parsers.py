@@ -1,0 +1,205 @@
+"""One row per parser: how its seeds are made, what its formats are made of, and how a file is read."""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.ingest import open_recording, read_track
+from apertura.ingest.afrl import joined
+from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.mat_fields import read_fields
+from apertura.load.results import OpenCampaign, assessment_of
+from apertura.load.scene import settled_scene
+from apertura.load.transmitted import read_codes, read_framing
+from apertura.scene.dem_file import open_dem
+from apertura.scene.geoid import geoid_file
+from apertura.scene.geoid_grid import undulation
+from apertura.scene.grid import SceneGrid
+from apertura.settings import Flight, read_flights, read_segments, read_settings
+from apertura.simulation.specification import read_specification
+from apertura.steps.calibration import calibrated
+from apertura.store import manifest_of, read_manifest, record_files
+
+from . import mutators, seeds
+
+GRID = SceneGrid("EPSG:32632", 500030.0, 5400060.0, 2.0, (20, 20))
+FLIGHT = Flight("f01", "image", "uav1", seeds.NODES)
+
+
+@dataclass(frozen=True)
+class Parser:
+    """A parser of one kind of file.
+
+    Attributes
+    ----------
+    file
+        Name of the file, by whose suffix formats are told apart.
+    seeds
+        Makes valid files.
+    read
+        Path → value, or CampaignError.
+    structure
+        Mutators that know the format.
+    tokens
+        What the format is made of, separated by spaces.
+    may_die
+        The file is read in a process of its own in the product: its death is a refusal.
+    """
+
+    file: str
+    seeds: Callable[[], list[bytes]]
+    read: Callable[[Path], Any]
+    structure: Sequence[mutators.Mutator] = ()
+    tokens: str = ""
+    may_die: bool = False
+
+    @functools.cached_property
+    def words(self) -> list[bytes]:
+        """Tokens as bytes."""
+        return self.tokens.encode().split()
+
+
+def _written(path: Path, data: bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+def _metadata(path: Path) -> Any:
+    return open_recording((path, _written(path.with_name("uav1.sigmf-data"), seeds.sigmf_data()[0])))
+
+
+def _samples(path: Path) -> Any:
+    recording = open_recording((_written(path.with_name("uav1.sigmf-meta"), seeds.sigmf_meta()[0]), path))
+    return recording.cut(recording.captures, node="uav1")
+
+
+def _preamble(path: Path) -> Any:
+    return read_framing(path, seeds.DESCRIBED, sample_rate_hz=1e6, where=path)
+
+
+def _history(path: Path) -> Any:
+    """As `read_afrl_mat`, in this process: whoever calls it lets it die."""
+    try:
+        fields = read_fields(path)
+    except Exception as error:  # of whatever kind: there it is the last line of a process
+        raise CampaignError(str(error), path, "a MATLAB file", "Copy it again.") from error
+    return joined([path], [fields], pair="a-a")
+
+
+def _dem(path: Path) -> Any:
+    dem = open_dem(path, GRID, datum="ellipsoid")
+    return dem.heights(GRID)
+
+
+def _geoid(path: Path) -> Any:
+    return undulation(geoid_file("egm96", path), *seeds.GEOID_AT)
+
+
+def _campaign(root: Path) -> Campaign:
+    config = _written(root / "config.yaml", seeds.configs()[1])
+    return Campaign(root, read_settings(config), (FLIGHT, Flight("c01", "calibration", "uav1", seeds.NODES)))
+
+
+def _recorded(path: Path) -> Path:
+    """Write the manifest that belongs to a document, so that what it holds is looked at."""
+    record_files(manifest_of(path), [path])
+    return path
+
+
+def _calibration(path: Path) -> Any:
+    return calibrated(_campaign(_recorded(path).parents[2]), "f01", "uav1-uav2")
+
+
+_YAML = (
+    "&a *a - : {} [] ? | > << !!python/object:os.system !!binary !!timestamp --- ... # null ~ yes 1:2:3 0b1 .inf .nan"
+)
+_JSON = '{ } [ ] , : " null true false NaN Infinity 1e999 -0 \\ud800 \\u0000'
+_NPY = (
+    "'descr': '<c8' '|O' '|V8' '<U9' '>c16' 'fortran_order': True (7,)*9 'shape': (9999999999999,) () (-1,) PK\x03\x04"
+)
+_TIFF = "II*\0 MM\0* II+\0 <VRTDataset /vsicurl/http://127.0.0.1/x <GDAL_WMS> \x00\x01\x00\x04 \x83\x0e \x87\xaf"
+_SIGMF = (
+    f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z"
+)
+_TIMES = "2025-05-14T09:30:60Z 9999-12-31 0001-01-01T00:00:00+23:59 now NaT 2025-W20-3 T Z , ; : / - ."
+_JSON_TREE = (mutators.json_tree,)
+_YAML_TREE = (mutators.yaml_tree, mutators.yaml_tree, mutators.bomb)
+_CSV = (mutators.cells(","), mutators.cells(","), mutators.quoted_cells)
+
+PARSERS: dict[str, Parser] = {
+    "config.yaml": Parser("config.yaml", seeds.configs, read_settings, _YAML_TREE, _YAML),
+    "flights.tsv": Parser(
+        "flights.tsv",
+        seeds.flights,
+        lambda path: list(read_flights(path, nodes=seeds.NODES)),
+        (mutators.cells("\t"),),
+        "\t \t\t image calibration uav1, , fused layers",
+    ),
+    "segments.tsv": Parser(
+        "segments.tsv",
+        seeds.segments,
+        lambda path: list(read_segments(path, flights=[FLIGHT])),
+        (mutators.cells("\t"),),
+        _TIMES,
+    ),
+    "sigmf-meta": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _metadata, _JSON_TREE, _SIGMF),
+    "sigmf-data": Parser("uav1.sigmf-data", seeds.sigmf_data, _samples),
+    "track.csv": Parser("uav1.track.csv", seeds.tracks, lambda path: read_track(path, node="uav1"), _CSV, _TIMES),
+    "track.pos": Parser(
+        "uav1.track.pos",
+        seeds.solutions,
+        lambda path: read_track(path, node="uav1"),
+        (mutators.cells(" "),),
+        f"{_TIMES} % GPST UTC JST latitude(deg) Q sdn(m) /geodetic 99999999999",
+    ),
+    "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
+    "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),
+    "preamble.npy": Parser("preamble.npy", seeds.preambles, _preamble, (), _NPY),
+    "afrl.mat": Parser(
+        "a.x.mat", seeds.matlab, _history, (), "MATLAB\x00 IM MI fp freq r0 x\x9c \x0e\x00 \x0f\x00", True
+    ),
+    "dem.tif": Parser("dem.tif", seeds.dems, _dem, (), _TIFF),
+    "geoid.gtx": Parser("egm96.gtx", seeds.gtx_grids, _geoid),
+    "geoid.tif": Parser("egm96.tif", seeds.tif_grids, _geoid, (), _TIFF),
+    "simulation.yaml": Parser("spec.yaml", seeds.specifications, read_specification, _YAML_TREE, f"{_YAML} 1+2j kind:"),
+    "scene.json": Parser(
+        "results/scene.json",
+        lambda: seeds.documents(seeds.SCENE),
+        lambda path: settled_scene(Campaign(_recorded(path).parents[1], None, ())),  # type: ignore[arg-type]
+        _JSON_TREE,
+        _JSON,
+    ),
+    "manifest.json": Parser(
+        "results/scene.manifest.json",
+        lambda: seeds.documents(seeds.MANIFEST),
+        read_manifest,
+        _JSON_TREE,
+        _JSON,
+    ),
+    "calibration.json": Parser(
+        "results/c01/calibration.json",
+        lambda: seeds.documents({"pairs": {"uav1-uav1": seeds.OFFSET, "uav1-uav2": seeds.OFFSET}}),
+        _calibration,
+        _JSON_TREE,
+        _JSON,
+    ),
+    "assessment.json": Parser(
+        "results/f01/assessment.json",
+        lambda: seeds.documents(seeds.ASSESSED),
+        lambda path: assessment_of(Campaign(_recorded(path).parents[2], None, (FLIGHT,)), "f01"),  # type: ignore[arg-type]
+        _JSON_TREE,
+        _JSON,
+    ),
+    "image.json": Parser(
+        "results/f01/fused/image.json",
+        lambda: seeds.documents(seeds.REPORTED),
+        lambda path: OpenCampaign(Campaign(path.parents[3], None, (FLIGHT,))).report("f01", "fused"),  # type: ignore[arg-type]
+        _JSON_TREE,
+        _JSON,
+    ),
+}

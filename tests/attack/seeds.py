@@ -1,0 +1,245 @@
+"""Small valid files of every format that a campaign brings, as bytes; real ones are added where they are at hand."""
+
+import io
+import json
+import struct
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+from scipy.io import savemat
+
+from apertura.settings.template import config_template, flights_template
+from apertura.simulation import preset
+from apertura.simulation.specification import specification_text
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+SYMBOLS, NODES, SAMPLES, CHANNELS = 64, ("uav1", "uav2"), 24, 2
+
+CALIBRATED = "calibration: {flight: c01, reflector_m: [570660.0, 5363700.0, 620.0], search_m: 2.0}\n"
+DESCRIBED = {
+    "chip_samples": 2,
+    "centre_hz": 0.0,
+    "counter_bits": 8,
+    "bit_chips": 3,
+    "guard_samples": 4,
+}
+"""What an apertura:framing says besides the preamble."""
+
+
+def real(name: str, *, lines: int = 0, most: int = 40_000) -> list[bytes]:
+    """Return a real file, or its first lines, if it is here and small."""
+    path = SHARED / name
+    if not path.is_file():
+        return []
+    data = path.read_bytes()
+    data = b"\n".join(data.split(b"\n")[:lines]) + b"\n" if lines else data
+    return [data] if len(data) <= most else []
+
+
+def configs() -> list[bytes]:
+    """Return configs: all keys commented, one with a calibration and a DEM, a real one."""
+    rest = "\n".join(line for line in config_template().splitlines() if not line.startswith("calibration"))
+    rest = rest.replace("crs: auto", "crs: EPSG:32632").replace("dem: null", "dem: config/dem.tif")
+    rest = rest.replace("dem_datum: null", "dem_datum: ellipsoid")
+    history = "campaign: g\nwaveform: {kind: phase_history, format: afrl_mat}\nnodes: {a: {}}\nscene: {crs: local}\n"
+    named = "campaign: c\nwaveform: {kind: phase_history, format: afrl_mat}\nnodes:\n  a: &a {attitude: log}\n  b: *a\n"
+    made = [config_template(), rest + "\n" + CALIBRATED, history, named]
+    return [*(text.encode() for text in made), *real("campaign-sample/config/config.yaml")]
+
+
+def flights() -> list[bytes]:
+    """Return tables of flights."""
+    more = flights_template() + "c01\tcalibration\tuav1\tuav1\r\nf02\timage\tuav2\t uav1 , uav2\n"
+    return [flights_template().encode(), b"\xef\xbb\xbf" + more.encode(), *real("campaign-sample/config/flights.tsv")]
+
+
+def segments() -> list[bytes]:
+    """Return tables of segments."""
+    heading = "flight\tpair\tstart\tend\n"
+    first = "f01\tuav1-uav2\t2025-05-14T09:30:00\t2025-05-14T09:30:10.5\n"
+    zoned = "f01\tuav1-uav1\t2025-05-14 09:30:00Z\t2025-05-14T11:30:01+02:00\n"
+    return [(heading + first).encode(), (heading + zoned + first).encode()]
+
+
+def sigmf_meta() -> list[bytes]:
+    """Return metadata of triggered captures, of a recorder that ran through, and of another maker."""
+    header = {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6, "core:num_channels": 2}
+    captures = [
+        {"core:sample_start": 6 * n, "core:frequency": 1.2e9, "core:datetime": f"2025-05-14T09:30:0{n}.25Z"}
+        for n in range(4)
+    ]
+    counted = [{**capture, "apertura:frame": n} for n, capture in enumerate(captures)]
+    framing = {"apertura:framing": {"preamble": "raw/preamble.npy", **DESCRIBED}}
+    names = {"apertura:channels": ["radar", "sidelink"]}
+    documents = (
+        {"global": header, "captures": captures, "annotations": []},
+        {"global": {**header, **names}, "captures": counted},
+        {"global": {**header, **names, **framing}, "captures": captures[:1]},
+    )
+    made = [json.dumps(document, indent=1).encode() for document in documents]
+    return [*made, *real("sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-meta")]
+
+
+def sigmf_data() -> list[bytes]:
+    """Return samples of all channels."""
+    return [np.arange(1, SAMPLES * CHANNELS * 2 + 1, dtype="<i2").tobytes()]
+
+
+def tracks() -> list[bytes]:
+    """Return CSV logs with and without attitude and quality."""
+    plain = ["time_utc,latitude_deg,longitude_deg,height_m"]
+    plain += [f"2025-05-14T09:30:0{n}.5Z,48.4225{n},9.9550{n},624.{n}" for n in range(8)]
+    full = [f"{plain[0]},roll_deg,pitch_deg,yaw_deg,std_north_m,std_east_m,std_up_m,quality"]
+    full += [
+        f"{line},1.5,-2,{350 + n},0.01,0.01,0.02,{('fix', 'float', '')[n % 3]}" for n, line in enumerate(plain[1:])
+    ]
+    texts = ["\n".join(lines) + "\n" for lines in (plain, full)]
+    return [*(text.encode() for text in texts), *real("campaign-sample/raw/f01/uav1.track.csv", lines=12)]
+
+
+def solutions() -> list[bytes]:
+    """Return RTKLIB solutions by date and by week."""
+    names = "latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
+    head = "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float)\n%  {}   " + names + "\n"
+    rest = "48.422{0} 9.955{0} 624.{0} {1} 12 0.01 0.01 0.02"
+    dates = [f"2025/05/14 09:30:0{n}.500   {rest.format(n, 1)}" for n in range(8)]
+    weeks = [f"2366 {293400 + n}.000   {rest.format(n, 2)}" for n in range(8)]
+    texts = [head.format(system) + "\n".join(lines) + "\n" for system, lines in (("GPST", weeks), ("UTC", dates))]
+    return [*(text.encode() for text in texts), *real("campaign-sample/raw/f01/uav2.track.pos", lines=40)]
+
+
+def patterns() -> list[bytes]:
+    """Return a sampled beam."""
+    rows = [f"{cut},{angle},{-(angle**2) / 100}" for cut in ("azimuth", "elevation") for angle in range(-60, 61, 20)]
+    return ["\n".join(["cut,angle_deg,gain_db", *rows, ""]).encode()]
+
+
+def _npy(array: np.ndarray) -> bytes:
+    target = io.BytesIO()
+    np.save(target, array)
+    return target.getvalue()
+
+
+def codes() -> list[bytes]:
+    """Return code symbols of both precisions."""
+    symbols = np.exp(0.5j * np.pi * np.arange(SYMBOLS))
+    return [_npy(symbols.astype(np.complex64)), _npy(symbols), _npy(symbols.astype(">c8"))]
+
+
+def preambles() -> list[bytes]:
+    """Return chips as integers and as numbers."""
+    chips = np.where(np.arange(31) % 3, 1, -1)
+    return [_npy(chips.astype(np.int8)), _npy(chips.astype(np.float64))]
+
+
+def matlab() -> list[bytes]:
+    """Return a Gotcha structure, as it is and compressed."""
+    pulses, lines = 6, 5
+    angle = np.linspace(0, 0.1, pulses)
+    data = {
+        "fp": np.exp(1j * np.arange(pulses * lines).reshape(lines, pulses)).astype(np.complex64),
+        "freq": np.linspace(9.3e9, 9.9e9, lines),
+        "x": 7000 * np.cos(angle),
+        "y": 7000 * np.sin(angle),
+        "z": np.full(pulses, 7000.0),
+        "r0": np.full(pulses, 9899.5),
+        "th": angle,
+        "af": {"r_correct": angle},
+    }
+    files = []
+    for packed in (False, True):
+        target = io.BytesIO()
+        savemat(target, {"data": data}, do_compression=packed)
+        files.append(target.getvalue())
+    return files
+
+
+def _tiff(heights: np.ndarray, place: rasterio.Affine, crs: str, **more: object) -> bytes:
+    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": heights.dtype}
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "made.tif"
+        with rasterio.open(path, "w", "GTiff", crs=crs, transform=place, **shape, **more) as raster:
+            raster.write(heights, 1)
+        return path.read_bytes()
+
+
+def dems() -> list[bytes]:
+    """Return rasters under the scene of `parsers`: plain, packed, tiled, with voids, in degrees."""
+    rows, columns = np.mgrid[:24, :24]
+    heights, corner = (600 + 0.5 * rows - 0.25 * columns).astype(np.float32), from_origin(500000, 5400100, 5, 5)
+    return [
+        _tiff(heights, corner, "EPSG:32632"),
+        _tiff(heights, corner, "EPSG:32632", compress="deflate", tiled=True, blockxsize=16, blockysize=16, nodata=-1),
+        _tiff(heights.astype(np.int16), corner, "EPSG:25832", compress="lzw", predictor=2),
+        _tiff(heights, from_origin(8.9995, 48.7545, 0.0001, 0.0001), "EPSG:4326"),
+    ]
+
+
+GEOID_AT = (np.array([9.0, 9.2]), np.array([48.5, 48.7]))
+"""Longitudes and latitudes at which undulations are asked for."""
+
+
+def _undulations() -> np.ndarray:
+    return np.linspace(40, 50, 81).reshape(9, 9).astype(">f4")
+
+
+def gtx_grids() -> list[bytes]:
+    """Return a grid of 9 × 9 posts."""
+    return [struct.pack(">4d2i", 47.0, 7.0, 0.5, 0.5, 9, 9) + _undulations().tobytes()]
+
+
+def tif_grids() -> list[bytes]:
+    """Return the same as GeoTIFF of PROJ's kind."""
+    return [_tiff(_undulations()[::-1].astype(np.float32), from_origin(6.75, 51.25, 0.5, 0.5), "EPSG:4326")]
+
+
+def specifications() -> list[bytes]:
+    """Return specifications of simulations."""
+    return [specification_text(preset(name)).encode() for name in ("demo", "continuous", "paper-uav")]
+
+
+SCENE = {
+    "grid": {
+        "crs": "EPSG:32632",
+        "west_m": 500020.0,
+        "north_m": 5400060.0,
+        "spacing_m": 0.5,
+        "shape": [40, 60],
+        "first": [0, 0],
+        "name": "x",
+    },
+    "height_m": 620.0,
+    "inputs": {"dem": "0f"},
+    "chosen": {"crs": "UTM zone"},
+}
+MANIFEST = {
+    "files": {"scene.json": "0f" * 32},
+    "sources": {"raw/dem.tif": "1e" * 32, "results/f01/uav1-uav1/echo.manifest.json": "2d" * 32},
+    "settings": "3c" * 32,
+    "code": "4b" * 32,
+}
+OFFSET = {"offset_m": 1.5, "std_m": 0.01, "inputs": {"raw/f01/uav1.sigmf-data": "0f"}, "flags": {"weak": "one line"}}
+AGREED = {"coherence": 0.9, "phase_rad": 0.1, "flags": {"apart": "one line"}}
+ASSESSED = {
+    "reference": "uav1-uav1",
+    "hypotheses": {},
+    "code_sha256": "0f",
+    "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "left_out": {"uav1-uav2": "why"}, "why": {}},
+    "pairs": {"uav1-uav1": AGREED, "uav1-uav2": AGREED},
+}
+REPORTED = {
+    "flight": "f01",
+    "engine": "native",
+    "numerical_error_db": -70.5,
+    "flags": {"noisy": "one line"},
+    "focus": {},
+}
+
+
+def documents(document: object) -> list[bytes]:
+    """Return a result as the workflow writes it."""
+    return [json.dumps(document, indent=1).encode()]

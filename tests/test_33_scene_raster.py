@@ -1,0 +1,238 @@
+"""A stranger's raster: read as GeoTIFF and nothing else, no file beside it counts, no byte goes over the network."""
+
+import socket
+import struct
+import threading
+
+import numpy as np
+import pytest
+import rasterio
+from folders import complaint
+from pyproj import Transformer
+from rasterio.transform import from_origin
+from scenes import UTM_GRID
+
+from apertura.scene.dem import MOST_POSTS
+from apertura.scene.dem_file import open_dem
+from apertura.scene.geoid import geoid_file
+from apertura.scene.geoid_grid import undulation
+
+PLACE = (500000, 5400100, 2, 2)
+
+
+def write_dem(path, heights=None, place=PLACE, crs="EPSG:32632", **profile):
+    """Posts every 2 m under `UTM_GRID`, 600 m high and sloping."""
+    rows, columns = np.mgrid[:60, :60]
+    heights = (600 + 0.1 * rows + 0.2 * columns).astype(np.float32) if heights is None else heights
+    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": heights.dtype}
+    with rasterio.open(path, "w", "GTiff", crs=crs, transform=from_origin(*place), **shape, **profile) as raster:
+        raster.write(heights, 1)
+    return path
+
+
+def heights_of(path):
+    return open_dem(path, UTM_GRID, datum="ellipsoid").heights(UTM_GRID)
+
+
+def tagged(path, tag, kind, value):
+    """Overwrite the value of a TIFF tag of little-endian bytes."""
+    data = bytearray(path.read_bytes())
+    first = struct.unpack_from("<I", data, 4)[0]
+    for entry in range(struct.unpack_from("<H", data, first)[0]):
+        at = first + 2 + 12 * entry
+        if struct.unpack_from("<H", data, at)[0] == tag:
+            struct.pack_into("<HII", data, at + 2, kind, 1, value)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.fixture
+def listener():
+    """A server that counts who connects."""
+    calls = []
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve():
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            calls.append(connection.recv(1000))
+            connection.close()
+
+    threading.Thread(target=serve, daemon=True).start()
+    yield server.getsockname()[1], calls
+    server.close()
+
+
+VRT = """<VRTDataset rasterXSize="60" rasterYSize="60"><SRS>EPSG:32632</SRS>
+<GeoTransform>500000, 2, 0, 5400100, 0, -2</GeoTransform><VRTRasterBand dataType="Float32" band="1">
+<SimpleSource><SourceFilename>{}</SourceFilename><SourceBand>1</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"""
+WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>http://127.0.0.1:{}/${{z}}</ServerUrl></Service>
+<DataWindow><UpperLeftX>500000</UpperLeftX><UpperLeftY>5400100</UpperLeftY><LowerRightX>500120</LowerRightX>
+<LowerRightY>5399980</LowerRightY><SizeX>60</SizeX><SizeY>60</SizeY></DataWindow><Projection>EPSG:32632</Projection>
+<BandsCount>1</BandsCount></GDAL_WMS>"""
+
+
+def test_a_vrt_or_wms_document_named_tif_is_refused_and_reaches_no_server(tmp_path, listener):
+    port, calls = listener
+    path = tmp_path / "dem.tif"
+    for text in (VRT.format(f"/vsicurl/http://127.0.0.1:{port}/x.tif"), WMS.format(port), VRT.format("/etc/passwd")):
+        path.write_text(text)
+        assert "dem.tif: not readable as GeoTIFF" in complaint(lambda: heights_of(path))
+    for name in (f"/vsicurl/http://127.0.0.1:{port}/x.tif", f"http://127.0.0.1:{port}/x.tif"):
+        assert "no such file" in complaint(lambda name=name: heights_of(name))
+    with socket.create_connection(("127.0.0.1", port)) as own:
+        own.sendall(b"own")
+    while not calls:
+        pass
+    assert calls == [b"own"]
+
+
+def test_a_server_would_have_been_reached_by_the_vrt_as_gdal_opens_it(tmp_path, listener):
+    """The listener of the test above can hear."""
+    port, calls = listener
+    (tmp_path / "dem.tif").write_text(VRT.format(f"/vsicurl/http://127.0.0.1:{port}/x.tif"))
+    with pytest.raises(rasterio.errors.RasterioIOError), rasterio.open(tmp_path / "dem.tif") as raster:
+        raster.read(1)
+    assert calls
+
+
+AUX = """<PAMDataset><SRS>EPSG:32633</SRS><GeoTransform>500010, 2, 0, 5400100, 0, -2</GeoTransform>
+<PAMRasterBand band="1">
+<Offset>100</Offset><Scale>2</Scale><NoDataValue>600</NoDataValue></PAMRasterBand></PAMDataset>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("dem.tif.aux.xml", AUX), ("dem.tfw", "9\n0\n0\n-9\n0\n0\n"), ("dem.wld", "9\n0\n0\n-9\n0\n0\n")]
+)
+def test_a_file_beside_a_dem_changes_nothing(tmp_path, name, text):
+    path = write_dem(tmp_path / "dem.tif")
+    alone = heights_of(path)
+    (tmp_path / name).write_text(text)
+    np.testing.assert_array_equal(heights_of(path), alone)
+    with rasterio.open(path) as raster:  # for whom the .aux.xml counts
+        assert name != "dem.tif.aux.xml" or raster.offsets[0] == 100
+
+
+def test_a_mask_or_overview_beside_a_dem_changes_nothing(tmp_path):
+    path = write_dem(tmp_path / "dem.tif")
+    alone = heights_of(path)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK="NO"), rasterio.open(path, "r+") as raster:
+        raster.write_mask(np.zeros((60, 60), bool))
+    write_dem(tmp_path / "dem.tif.ovr", np.zeros((30, 30), np.float32))
+    assert (tmp_path / "dem.tif.msk").is_file()
+    np.testing.assert_array_equal(heights_of(path), alone)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7])
+def test_a_truncated_dem_is_one_message(tmp_path, share):
+    path = write_dem(tmp_path / "dem.tif", compress="deflate", tiled=True, blockxsize=16, blockysize=16)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    message = complaint(lambda: heights_of(path))
+    assert message.startswith(str(path))
+    assert "not readable as GeoTIFF" in message
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((500000, 5400100, 0, 2), "no CRS on Earth"),  # which is how GDAL reads it
+        ((500000, 5400100, 1e-300, 1e-300), "a degenerate transform [1e-300, "),
+        ((500000, 5400100, float("nan"), 2), "a degenerate transform [nan, "),
+    ],
+)
+def test_pixels_without_an_area_are_refused(tmp_path, place, expected):
+    path = write_dem(tmp_path / "dem.tif", place=place)
+    message = complaint(lambda: heights_of(path))
+    assert expected in message
+
+
+def test_a_dem_that_claims_a_billion_rows_and_columns_costs_nothing(tmp_path):
+    path = write_dem(tmp_path / "dem.tif")
+    for tag in (256, 257, 278):  # width, height, rows of a strip
+        tagged(path, tag, 4, 10**9)
+    assert "dem.tif: " in complaint(lambda: heights_of(path))
+
+
+def test_more_posts_than_memory_should_hold_are_refused_before_they_are_read(tmp_path):
+    """Half a micrometre between posts: 120 m of scene would be 10^16 of them."""
+    side = 1 << 20
+    path = tmp_path / "dem.tif"
+    shape = {"height": side, "width": side, "count": 1, "dtype": "float32", "SPARSE_OK": True}
+    tiles = {"tiled": True, "blockxsize": 4096, "blockysize": 4096, "crs": "EPSG:32632"}
+    with rasterio.open(path, "w", "GTiff", transform=from_origin(500000, 5400100, 1e-4, 1e-4), **shape, **tiles):
+        pass
+    message = complaint(lambda: heights_of(path))
+    assert f"at most {MOST_POSTS} posts at once" in message
+
+
+def test_heights_that_are_complex_are_refused(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", np.ones((60, 60), np.complex64))
+    assert "heights of type complex64" in complaint(lambda: heights_of(path))
+
+
+# Grids of undulations
+
+
+def gtx(path, *, rows=9, values=None, header=(47.0, 7.0, 0.5, 0.5)):
+    values = np.linspace(40, 50, 81) if values is None else values
+    path.write_bytes(struct.pack(">4d2i", *header, rows, 9) + values.astype(">f4").tobytes())
+    return path
+
+
+def lifted(path):
+    return undulation(geoid_file("egm96", path), np.array([9.0]), np.array([48.5]))
+
+
+def test_a_grid_is_as_large_as_its_header_says(tmp_path):
+    path = tmp_path / "egm96.gtx"
+    assert 40 < lifted(gtx(path))[0] < 50
+    for rows in (8, 10, -9, 0, 2**31 - 1):
+        assert "bytes for" in complaint(lambda rows=rows: lifted(gtx(path, rows=rows)))
+    for header in ((np.nan, 7, 0.5, 0.5), (47, 7, 0, 0.5), (47, 7, 0.5, -1), (47, 1e300, 0.5, 0.5)):
+        assert "a grid that begins" in complaint(lambda header=header: lifted(gtx(path, header=header)))
+    path.write_bytes(b"short")
+    assert "5 bytes" in complaint(lambda: lifted(path))
+
+
+def test_an_undulation_that_no_geoid_has_is_refused(tmp_path):
+    for value in (1e30, -2000.0, np.nan):
+        path = gtx(tmp_path / "egm96.gtx", values=np.full(81, value))
+        assert "no undulation of the Earth" in complaint(lambda path=path: lifted(path))
+
+
+@pytest.mark.parametrize(
+    ("place", "shape"),
+    [((6.75, 51.25, 0.5, 0.5), (9, 9)), ((-180, 90, 10, 7.5), (24, 36)), ((0, 90, 10, 7.5), (24, 36))],
+)
+def test_a_tif_grid_says_what_proj_makes_of_it(tmp_path, place, shape):
+    """Regional, and all round the Earth, where there is a post beyond the last column."""
+    values = np.random.default_rng(1).uniform(-50, 50, shape).astype(np.float32)
+    path = write_dem(tmp_path / "egm96.tif", values, place, "EPSG:4326", nodata=-999)
+    west, south = (-179.9, -80) if shape[1] > 9 else (7.1, 47.1)
+    east, north = (179.9, 80) if shape[1] > 9 else (10.9, 50.9)
+    longitude, latitude = np.random.default_rng(2).uniform([west, south], [east, north], (500, 2)).T
+    radians = "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad"
+    shift = Transformer.from_pipeline(f"{radians} +step +proj=vgridshift +grids={path} +multiplier=1")
+    expected = shift.transform(longitude, latitude, np.zeros(500))[2]
+    np.testing.assert_allclose(undulation(path, longitude, latitude), expected, atol=1e-6)
+    values[:] = -999
+    write_dem(path, values, place, "EPSG:4326", nodata=-999)
+    assert "no undulation of the Earth" in complaint(lambda: undulation(path, longitude, latitude))
+
+
+def test_a_tif_of_which_proj_divides_by_zero_is_read_or_refused(tmp_path):
+    """Nothing says how many rows a strip has: the reader of PROJ ends the process."""
+    path = write_dem(tmp_path / "egm96.tif", np.full((9, 9), 45, np.float32), (6.75, 51.25, 0.5, 0.5), "EPSG:4326")
+    rows_of_a_strip, unknown = (struct.pack("<HHI", tag, 3, 1) for tag in (278, 30000))
+    path.write_bytes(path.read_bytes().replace(rows_of_a_strip, unknown))
+    assert lifted(path)[0] == 45
+
+
+def test_a_grid_of_another_suffix_or_format_is_refused(tmp_path):
+    assert "a file of kind '.gsb'" in complaint(lambda: lifted(gtx(tmp_path / "egm96.gsb")))
+    (tmp_path / "egm96.tif").write_text(VRT.format("/etc/passwd"))
+    assert "not readable as GeoTIFF" in complaint(lambda: lifted(tmp_path / "egm96.tif"))

@@ -1,0 +1,189 @@
+"""Files of a campaign that no person would write: each is one message where a traceback, or nothing, used to be."""
+
+import io
+import os
+import struct
+
+import numpy as np
+import pytest
+from folders import complaint, edit_meta
+
+from apertura.campaign import Campaign
+from apertura.load.transmitted import read_codes, read_framing
+from apertura.settings import read_segments
+from apertura.steps import ingest
+
+# Tables of the config
+
+
+def test_tables_that_are_not_utf8_are_refused_with_their_line(tiny):
+    path = tiny / "config" / "flights.tsv"
+    path.write_bytes(path.read_bytes() + b"f\xe9\timage\tuav1\tuav1\n")
+    assert "flights.tsv: byte 0xe9 in line 3 is not UTF-8" in complaint(lambda: Campaign.load(tiny))
+    segments = tiny / "config" / "segments.tsv"
+    segments.write_bytes(b"flight\tpair\tstart\tend\n\xff\n")
+    assert "byte 0xff in line 2" in complaint(lambda: list(read_segments(segments, flights=())))
+
+
+def test_a_table_of_windows_is_read_as_one_of_unix(tiny):
+    path = tiny / "config" / "flights.tsv"
+    flights = Campaign.load(tiny).flights
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert Campaign.load(tiny).flights == flights
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last 'more'"),
+        ('f02\timage\tuav1\t"uav1', "not readable as a table"),
+        ("f02\timage\tuav1\t" + "x" * 200_000, "field larger than field limit"),
+        ("f02\t\x1b[31mred\tuav1\tuav1", r"kind '\x1b[31mred' is neither"),
+        ("f02\timage\tuav1\t" + "x" * 2000, "xxx…' is not in"),
+    ],
+)
+def test_a_wild_line_of_flights_is_named(tiny, line, expected):
+    path = tiny / "config" / "flights.tsv"
+    path.write_text(path.read_text().rstrip("\n") + "\n" + line + "\n")
+    message = complaint(lambda: Campaign.load(tiny))
+    assert "flights.tsv: line 3" in message
+    assert expected in message
+    assert message.isprintable()
+    assert len(message) < 600
+
+
+@pytest.mark.parametrize(
+    "time", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "1066-10-14T09:00:00", "now"]
+)
+def test_a_segment_at_a_time_that_no_flight_had_is_refused(tiny, time):
+    (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{time}\t{time}\n")
+    assert "is no time" in complaint(lambda: Campaign.load(tiny))
+
+
+# Arrays
+
+
+def codes(tmp_path, content):
+    path = tmp_path / "codes.npy"
+    if isinstance(content, np.ndarray):
+        np.save(path, content)
+    else:
+        path.write_bytes(content)
+    return lambda: read_codes(path, 64)
+
+
+def header(shape):
+    text = f"{{'descr': '<c8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + bytes(512)
+
+
+def zipped():
+    target = io.BytesIO()
+    np.savez(target, codes=np.ones(64, np.complex64))
+    return target.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (np.full(64, "text"), "<U4 of shape (64,)"),
+        (np.zeros(64, "V8"), "|V8 of shape (64,)"),
+        (np.ones(64), "<f8 of shape (64,)"),
+        (np.ones(64, np.int16), "<i2 of shape (64,)"),
+        (np.ones(64, [("re", "f4"), ("im", "f4")]), "of shape (64,)"),
+        (np.ones((8, 8), np.complex64), "complex64 of shape (8, 8)"),
+        (np.full(64, 1e300 + 0j), "64 not finite"),
+        (np.full(64, np.nan, np.complex64), "64 not finite"),
+        (zipped(), "not a .npy file"),
+        (b"", "not a .npy file"),
+        (header((999_999_999_999,)), "not readable"),
+        (header("(-1,)"), "not readable"),
+        (header("(" * 90), "not readable"),
+        (header((65,))[:300], "not readable"),
+    ],
+)
+def test_codes_that_are_no_complex_symbols_are_refused_before_anything_is_allocated(tmp_path, content, expected):
+    message = complaint(codes(tmp_path, content))
+    assert "codes.npy: " in message
+    assert expected in message
+
+
+def test_codes_beyond_any_waveform_are_refused_by_their_header_alone(tmp_path):
+    """A sparse file as large as it says: 2 TiB that would be allocated."""
+    read = codes(tmp_path, header((1 << 38,)))
+    os.truncate(tmp_path / "codes.npy", 128 + (8 << 38))
+    assert "<c8 of shape (274877906944,)" in complaint(read)
+
+
+@pytest.mark.parametrize("kind", [np.complex64, np.complex128, ">c8"])
+def test_codes_of_any_precision_and_order_of_bytes_are_the_same(tmp_path, kind):
+    symbols = np.exp(0.5j * np.pi * np.arange(64)).astype(np.complex64)
+    np.testing.assert_array_equal(codes(tmp_path, symbols.astype(kind))(), symbols)
+
+
+DESCRIBED = {"chip_samples": 2, "centre_hz": 0.0, "counter_bits": 8, "bit_chips": 3, "guard_samples": 4}
+
+
+def test_a_preamble_is_chips_of_one_and_minus_one(tmp_path):
+    path = tmp_path / "preamble.npy"
+    for chips in (np.array([1, 2]), np.array([1.0, np.nan]), np.ones((2, 2)), np.zeros(0), np.array(["1"])):
+        np.save(path, chips)
+        assert "preamble.npy: " in complaint(lambda: read_framing(path, DESCRIBED, sample_rate_hz=1e6, where=path))
+    np.save(path, np.array([1.0, -1.0, 1.0]))
+    assert read_framing(path, DESCRIBED, sample_rate_hz=1e6, where=path).preamble.tolist() == [1, -1, 1]
+    endless = DESCRIBED | {"guard_samples": 1 << 39}
+    assert "samples of preamble" in complaint(lambda: read_framing(path, endless, sample_rate_hz=1e6, where=path))
+
+
+# Metadata of recordings
+
+
+def described(meta, **changes):
+    meta["global"].update({f"apertura:{name}": value for name, value in changes.items()})
+
+
+@pytest.mark.parametrize(
+    ("place", "changes", "expected"),
+    [
+        ("global", {"apertura:channels": 3}, "global.apertura:channels: "),
+        ("global", {"apertura:channels": ["radar", "radar"]}, "each its own"),
+        ("global", {"core:sample_rate": float("inf")}, "core:sample_rate: "),
+        ("global", {"core:sample_rate": 1e308}, "core:sample_rate: "),
+        ("global", {"core:sample_rate": 1e-3}, "core:sample_rate: "),
+        ("global", {"apertura:channels": ["radar", "\x1b[2J"]}, "apertura:channels.1: "),
+        ("global", {"core:num_channels": 2**70}, "core:num_channels: "),
+        ("global", {"core:datatype": "\x1b[2J"}, r"core:datatype '\x1b[2J'"),
+        ("capture", {"apertura:frame": float("nan")}, "apertura:frame: "),
+        ("capture", {"apertura:frame": "text"}, "apertura:frame: "),
+        ("capture", {"apertura:frame": 2**63}, "apertura:frame: "),
+        ("capture", {"core:sample_start": 2**63}, "core:sample_start: "),
+        ("capture", {"core:sample_start": 10**400}, "core:sample_start: "),
+        ("capture", {"core:frequency": float("nan")}, "core:frequency: "),
+        ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is no time"),
+        ("capture", {"core:datetime": "2300-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
+        ("capture", {"core:datetime": "1600-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
+        ("capture", {"core:datetime": "nowZ"}, "is no time"),
+        ("capture", {"core:datetime": "NaTZ"}, "is no time"),
+        ("capture", {"core:datetime": "2025-02-30T00:00:00Z"}, "core:datetime: "),
+    ],
+)
+def test_metadata_that_no_recorder_writes_are_refused_by_key(tiny, place, changes, expected):
+    edit_meta(tiny, "uav1", lambda meta: (meta["global"] if place == "global" else meta["captures"][3]).update(changes))
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
+    assert "uav1.sigmf-meta: " in message
+    assert expected in message
+    assert len(message) < 600
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../preamble.npy", "raw/../../x.npy", "link.npy"])
+def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
+    (tiny / "link.npy").symlink_to("/etc/passwd")
+
+    def one_capture(meta):
+        meta["captures"] = meta["captures"][:1]
+        described(meta, framing=DESCRIBED | {"preamble": name})
+
+    edit_meta(tiny, "uav1", one_capture)
+    message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
+    assert "uav1.sigmf-meta: apertura:framing.preamble: path" in message
+    assert "inside the campaign folder" in message
