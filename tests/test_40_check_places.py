@@ -118,11 +118,13 @@ def test_epochs_at_no_place_are_told_while_pulses_are_sent(tiny):
     assert "1 of 61 epochs at latitude 0, longitude 0: the receiver had no fix" in only(tiny)
 
 
-def test_epochs_at_no_place_long_before_are_not_told(tiny):
-    def early(line):
-        return line.replace("2025-05-14T09:29:58.000000Z", "2025-05-14T09:29:30.000000Z")
+@pytest.mark.parametrize(("epoch", "time"), [(1, "09:29:30"), (-1, "09:30:30")])
+def test_epochs_at_no_place_long_before_or_after_are_not_told(tiny, epoch, time):
+    def moved(lines):
+        lines[epoch] = zero(f"2025-05-14T{time}.000000Z,{lines[epoch].split(',', 1)[1]}")
+        return lines
 
-    edit_track(tiny, "uav1", lambda lines: [lines[0], zero(early(lines[1])), *lines[2:]])
+    edit_track(tiny, "uav1", moved)
     assert told(tiny) == []
 
 
@@ -316,12 +318,13 @@ def with_post(height_m, row=30, column=30):
     [
         (FLAT, False),
         (FLAT + 500.0 * (np.arange(60) > 30) - 490, False),  # a cliff through the scene
-        (with_post(900.0), False),
+        (with_post(1050.0), False),
         (with_post(3600.0), True),
         (with_post(-400.0), True),
-        (with_post(3600.0, row=5), False),  # beside the scene
+        (with_post(3600.0, row=5), False),
+        (with_post(3600.0, row=25), False),  # two metres beside the scene
     ],
-    ids=["flat", "cliff", "mast", "spike", "pit", "beside"],
+    ids=["flat", "cliff", "mast", "spike", "pit", "far beside", "beside"],
 )
 def test_a_post_that_stands_out_by_kilometres_is_told_and_a_cliff_is_not(tiny, heights, spike):
     write_dem(tiny, heights)

@@ -20,7 +20,7 @@ _PER_POST = 2  # samples
 _WINDOW = 7  # samples: three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
-_MARGIN = _WINDOW + 1  # samples about the scene: an opening asks for six on either side
+_MARGIN = _WINDOW - 1  # samples about the scene, of which nothing is said
 
 
 def check_dem(inspected: Inspected) -> Iterator[CampaignError]:
@@ -46,9 +46,6 @@ def check_spikes(inspected: Inspected) -> Iterator[CampaignError]:
     window = sampled_about(grid, post_m / _PER_POST)
     heights = _heights(dem, grid, window)
     spikes = needles(heights, taller_than_m=max(TALLEST_M, _STEEPEST_POSTS * post_m))
-    edge = _MARGIN - _PER_POST  # what stands further from the scene than a post does not touch it
-    for beside in (spikes[:edge], spikes[-edge:], spikes[:, :edge], spikes[:, -edge:]):
-        beside[:] = False
     if not spikes.any():
         return
     row, column = np.argwhere(spikes)[0]
