@@ -9,6 +9,7 @@ import yaml
 from folders import complaint, edit_config
 
 from apertura.campaign import Campaign
+from apertura.lineage import result_of
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.scene import PointTarget
 from apertura.steps import calibration, echo, ingest
@@ -77,8 +78,9 @@ def test_imaging_flights_take_the_offset_by_reference_and_say_so(calibrated):
 
 
 def test_the_workflow_knows_what_an_echo_stands_on(calibrated):
-    assert "results/c01/calibration.json" in calibrated.echo_sources("f01", "uav1-uav2")
-    assert "results/c01/calibration.json" not in calibrated.echo_sources("c01", "uav1-uav2")
+    manifest = "results/c01/calibration.manifest.json"
+    assert manifest in result_of(calibrated, "echo", "f01", "uav1-uav2").sources
+    assert manifest not in result_of(calibrated, "echo", "c01", "uav1-uav2").sources
 
 
 def test_a_flight_without_a_visible_reflector_is_refused(tmp_path):

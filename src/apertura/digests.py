@@ -105,9 +105,8 @@ def _state(path: Path) -> dict[str, int]:
     try:
         found = path.stat()
     except OSError as error:
-        raise CampaignError(
-            f"not readable ({error.strerror})", where=path, expected="a file that was there", remedy="Copy it there."
-        ) from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else f"not readable ({error.strerror})"
+        raise CampaignError(found, path, "a file that was there", "Copy it there.") from error
     return {
         "size": found.st_size,
         "inode": found.st_ino,

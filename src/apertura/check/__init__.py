@@ -113,7 +113,7 @@ def as_line(problem: CampaignError) -> str:
     Examples
     --------
     >>> as_line(CampaignError("a\nb", "scene.dem", "c", "D."))
-    'config/config.yaml: scene.dem: a b; expected c. D.'
+    'config/config.yaml: scene.dem: a\\nb; expected c. D.'
     """
     return " ".join(located(str(problem)).split())
 

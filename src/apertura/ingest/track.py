@@ -77,13 +77,15 @@ def make_track(
         for name, dims, values in (("position_std", ("epoch", "axis"), position_std_m), ("fix", ("epoch",), fix))
         if values is not None
     }
+    variables = {
+        **quality,
+        "time": (("epoch",), time_utc.astype("datetime64[ns]")),
+        "position": (("epoch", "axis"), ecef_from_geodetic(*geodetic.T)),
+        "attitude": (("epoch", "axis"), attitude),
+    }
+    # Arrays that need no look into: xarray would import dask and scipy to see whether they are theirs.
     return xr.Dataset(
-        {
-            **quality,
-            "time": ("epoch", time_utc.astype("datetime64[ns]")),
-            "position": (("epoch", "axis"), ecef_from_geodetic(*geodetic.T)),
-            "attitude": (("epoch", "axis"), attitude),
-        },
+        {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
         attrs={"node": node},
     )
 
