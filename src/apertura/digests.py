@@ -103,16 +103,16 @@ class Sources:
 
 def _state(path: Path) -> dict[str, int]:
     try:
-        found = path.stat()
+        state = path.stat()
     except OSError as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else f"not readable ({error.strerror})"
         raise CampaignError(found, path, "a file that was there", "Copy it there.") from error
     return {
-        "size": found.st_size,
-        "inode": found.st_ino,
-        "device": found.st_dev,
-        "mtime_ns": found.st_mtime_ns,
-        "ctime_ns": found.st_ctime_ns,
+        "size": state.st_size,
+        "inode": state.st_ino,
+        "device": state.st_dev,
+        "mtime_ns": state.st_mtime_ns,
+        "ctime_ns": state.st_ctime_ns,
     }
 
 
