@@ -146,9 +146,9 @@ class Table:
 
     def add(self, step: str, kind: str, what: str, wrong: list[str]) -> None:
         self.counts[step, kind] += 1
-        self.wrong += [f"{step}, {what}: {one}" for one in wrong]
+        self.wrong += wrong[:1]
         if wrong:
-            print(f"WRONG {step}, {what}: {wrong[0]}", flush=True)
+            print(f"WRONG {step}, {what}:", *wrong, sep="\n", flush=True)
         if "went on" in what:
             print(f"{step}, {what}", flush=True)
 
