@@ -336,3 +336,16 @@ def test_metadata_that_are_not_json_are_refused(tmp_path):
     (tmp_path / "a.sigmf-data").write_bytes(b"1234")
     with pytest.raises(CampaignError, match="not valid SigMF: Invalid JSON"):
         open_recording((tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"))
+
+
+def test_a_capture_at_another_carrier_is_named(tiny):
+    path = tiny / "raw/f01/uav1.sigmf-meta"
+    meta = json.loads(path.read_text())
+    for capture in meta["captures"][1:]:
+        del capture["core:frequency"]
+    path.write_text(json.dumps(meta))
+    open_recording((path, path.with_suffix(".sigmf-data")))
+    meta["captures"][3]["core:frequency"] = meta["captures"][0]["core:frequency"] + 1e6
+    path.write_text(json.dumps(meta))
+    with pytest.raises(CampaignError, match=r"uav1\.sigmf-meta: capture 3: core:frequency .* one carrier"):
+        open_recording((path, path.with_suffix(".sigmf-data")))

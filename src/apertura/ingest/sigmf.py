@@ -19,8 +19,8 @@ from apertura.ingest.times import utc_times
 _DATATYPE = "ci16_le"
 _BYTES_PER_SAMPLE = 4  # of one channel: two int16
 
-LARGEST_META = 64_000_000
-"""Bytes of a metadata file: some 400 000 captures."""
+LARGEST_META = 256_000_000
+"""Bytes of a metadata file: some 2 million captures."""
 
 _EXPECTED = "SigMF metadata with one capture segment per trigger, ISO 8601 UTC in the core:datetime of each"
 
@@ -55,7 +55,7 @@ class _Global(BaseModel):
 class _Capture(BaseModel):
     start: Count = Field(alias="core:sample_start")
     datetime: str = Field(alias="core:datetime", pattern="Z$")
-    frequency_hz: Frequency = Field(0.0, alias="core:frequency")
+    frequency_hz: Frequency | None = Field(None, alias="core:frequency")
     frame: int = Field(-1, alias="apertura:frame", ge=-1, lt=1 << 62, strict=True)
 
 
@@ -84,7 +84,7 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
         samples=samples,
         channels=channels,
         sample_rate_hz=header.sample_rate_hz,
-        frequency_hz=captures[0].frequency_hz,
+        frequency_hz=_frequency_hz(captures, meta_path),
         captures=Captures(
             np.array([capture.start for capture in captures], np.int64),
             _length(captures, len(samples), meta_path),
@@ -115,6 +115,22 @@ def _read_meta(path: Path) -> _Meta:
     if meta.header.datatype != _DATATYPE:
         raise CampaignError(f"core:datatype {quoted(meta.header.datatype)}", path, _DATATYPE, "Convert the recording.")
     return meta
+
+
+def _frequency_hz(captures: list[_Capture], path: Path) -> float:
+    """Return the RF frequency at baseband zero, which all captures share; 0 where none says."""
+    stated = [(number, one.frequency_hz) for number, one in enumerate(captures) if one.frequency_hz is not None]
+    if not stated:
+        return 0.0
+    first, other = stated[0][1], next((pair for pair in stated if pair[1] != stated[0][1]), None)
+    if other is not None:
+        raise CampaignError(
+            f"capture {other[0]}: core:frequency {other[1]:.6f}",
+            path,
+            f"{first:.6f}, as capture {stated[0][0]} says: one carrier for the whole recording",
+            "Correct the metadata, or split the recording.",
+        )
+    return first
 
 
 def _channels(header: _Global, path: Path) -> list[str]:
