@@ -1,5 +1,6 @@
 """The workflow on a campaign folder: checked first, run by one process group, and ended with all its steps."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from apertura.lock import hold
 from apertura.signals import STATUS_FILE
 
 _GRACE_S = 3.0
+_LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
@@ -100,12 +102,22 @@ def _runs_elsewhere(arguments: Sequence[str]) -> bool:
 
 def _supervised(command: Sequence[str], environment: dict[str, str]) -> int:
     """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
-    process = subprocess.Popen(command, env=environment, start_new_session=True)
+    process = subprocess.Popen(
+        command,
+        env=environment,
+        start_new_session=True,
+        preexec_fn=_die_with_parent,  # noqa: PLW1509 - this process has no other threads
+    )
     try:
         return process.wait()
     except BaseException:
         _end(process)
         raise
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel (prctl, PR_SET_PDEATHSIG) to end snakemake with this run, also where that is killed outright."""
+    _LIBC.prctl(1, signal.SIGKILL)
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

@@ -225,9 +225,7 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
     """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
-    import zarr
-
-    from apertura.store.chunks import StageStore
+    from apertura.store.chunks import StageStore, zarr
 
     return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
 
@@ -245,9 +243,7 @@ def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None,
         Attributes of the stage that are known only now, such as what was measured on it.
     """
     if attributes:
-        import zarr
-
-        from apertura.store.chunks import StageStore
+        from apertura.store.chunks import StageStore, zarr
 
         zarr.open_group(StageStore(wip), mode="r+").attrs.update(attributes)
     for partial in wip.rglob("*.partial"):  # what a killed writer left
