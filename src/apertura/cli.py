@@ -54,6 +54,11 @@ def main() -> None:
         except Interrupted as signalled:
             _say(str(signalled.code))
             raise SystemExit(INTERRUPTED) from None
+        except SystemExit as ended:
+            if isinstance(ended.__context__, BrokenPipeError):  # typer takes it for a failure of ours
+                _say(str(explained(ended.__context__)))
+                raise SystemExit(2) from None
+            raise
         except Exception as error:
             message = explained(error)
             leave_status(2 if message else 1)
@@ -61,6 +66,16 @@ def main() -> None:
                 raise
             _say(message)
             raise SystemExit(2) from None
+        finally:
+            _flush()
+
+
+def _flush() -> None:
+    """Write what is printed; where its reader has gone or its disk is full, nothing is left to fail at the exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _say(message: str) -> None:

@@ -181,18 +181,10 @@ def _mount(folder: Path, size: int, *, again: bool = False) -> None:
 def _command(words: list[str]) -> int:
     """Return the exit status of a command line, as its process would have it."""
     from apertura.cli import main
-    from apertura.errors import explained
 
     sys.argv = words
     try:
-        try:
-            main()
-        except BaseException as error:
-            message = explained(error)
-            if message is None:
-                raise
-            print(f"error: {message}", file=sys.stderr)
-            return 2
+        main()
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
     except BaseException:

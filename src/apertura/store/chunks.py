@@ -65,6 +65,16 @@ class StageStore(LocalStore):
         raise damaged(self.root, key)
 
 
+def array_of(folder: Path, name: str, mode: str) -> Any:
+    """Return an array of a stage, a `zarr.Array`."""
+    return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
+
+
+def update_attributes(folder: Path, attributes: Mapping[str, Any]) -> None:
+    """Write attributes of a stage in work."""
+    zarr.open_group(StageStore(folder), mode="r+").attrs.update(attributes)
+
+
 def damaged(folder: Path, key: str) -> CampaignError:
     """Return the error that a chunk of a stage, finished or in work, is not what was written."""
     finished = folder.suffix == ".zarr"

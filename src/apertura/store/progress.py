@@ -225,9 +225,9 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
     """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
-    from apertura.store.chunks import StageStore, zarr
+    from apertura.store.chunks import array_of
 
-    return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
+    return array_of(folder, name, mode)
 
 
 def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None, **attributes: Any) -> None:
@@ -243,9 +243,9 @@ def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None,
         Attributes of the stage that are known only now, such as what was measured on it.
     """
     if attributes:
-        from apertura.store.chunks import StageStore, zarr
+        from apertura.store.chunks import update_attributes
 
-        zarr.open_group(StageStore(wip), mode="r+").attrs.update(attributes)
+        update_attributes(wip, attributes)
     for partial in wip.rglob("*.partial"):  # what a killed writer left
         partial.unlink()
     files = sha256_tree(wip)

@@ -1,0 +1,86 @@
+"""How commands end: one message and one status, whatever the machine does to them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+APERTURA = Path(sys.executable).parent / "apertura"
+
+
+def run(*words, **options):
+    return subprocess.run([APERTURA, *map(str, words)], text=True, capture_output=True, check=False, **options)
+
+
+def test_a_folder_that_is_no_campaign_ends_with_2_and_one_line(tmp_path):
+    done = run("check", tmp_path / "nowhere")
+    assert done.returncode == 2
+    assert done.stdout.count("\n") == 1
+    done = run("plan", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_every_problem_is_a_line_of_its_own(tiny):
+    (tiny / "raw/f01/uav1.sigmf-data").unlink()
+    (tiny / "raw/codes.npy").write_bytes(b"x")
+    done = run("check", tiny)
+    assert done.returncode == 2
+    assert [line.partition(": ")[0] for line in done.stdout.splitlines()] == [
+        f"{tiny}/raw/f01/uav1.sigmf-data",
+        f"{tiny}/raw/codes.npy",
+    ]
+
+
+def test_a_reader_that_has_gone_is_one_message(finished_tiny):
+    """`apertura summary | true`"""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        command = [APERTURA, "summary", finished_tiny.root]
+        done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "error: output: Broken pipe (EPIPE). Whoever read the output has gone.\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
+    with Path("/dev/full").open("w") as full:
+        command = [APERTURA, "summary", finished_tiny.root]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: output: No space left on device (ENOSPC)")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
+    code = (
+        "import time; from apertura import cli; cli.app = lambda: time.sleep(60); print('up', flush=True); cli.main()"
+    )
+    step = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert step.stdout.readline() == "up\n"
+    time.sleep(0.2)
+    step.send_signal(number)
+    assert step.communicate(timeout=30)[1] == f"error: interrupted by {number.name}\n"
+    assert step.returncode == 130
+
+
+def test_a_defect_shows_its_traceback_and_ends_with_1():
+    code = "from apertura import cli; cli.app = lambda: 1 / 0; cli.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "ZeroDivisionError" in done.stderr
+
+
+def test_memory_that_runs_out_is_one_message():
+    code = "import numpy; from apertura import cli; cli.app = lambda: numpy.empty(1 << 50); cli.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: out of memory")
+    assert done.stderr.count("\n") == 1
