@@ -15,7 +15,17 @@ import zarr
 
 from apertura.contracts import STAGES, check, stamp
 from apertura.errors import CampaignError, ContractError
-from apertura.store import finish, manifest_of, open_array, open_stage, resume, save_stage, sharing, writing
+from apertura.store import (
+    finish,
+    manifest_of,
+    mark_rewritten,
+    open_array,
+    open_stage,
+    resume,
+    save_stage,
+    sharing,
+    writing,
+)
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -153,6 +163,38 @@ def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
         finish(wip, tmp_path / "image.zarr")
     files = json.loads(manifest_of(tmp_path / "image.zarr").read_text())["files"]
     assert not [name for name in files if name.endswith(".partial")]
+
+
+def test_chunks_that_were_being_rewritten_are_begun_anew_and_so_are_those_of_a_finished_stage(tmp_path):
+    """Tiles formed again for their error: a run that is killed meanwhile must come to the same certificate."""
+    folder = tmp_path / "image.zarr"
+    with writing(folder) as wip:
+        resume(wip, empty_image(), "image", WINDOWS)
+        open_array(wip, "image")[:] = 1
+        mark_rewritten(wip, "image", WINDOWS, WINDOWS[:1])
+        mark_rewritten(wip, "image", WINDOWS, WINDOWS[1:2])
+        open_array(wip, "image")[WINDOWS[0]] = 2
+    with writing(folder) as wip:
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS[:2]
+        open_array(wip, "image")[:] = 1
+        mark_rewritten(wip, "image", WINDOWS, WINDOWS[2:3])
+        finish(wip, folder)
+    manifest_of(folder).unlink()
+    with writing(folder) as wip:
+        assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS[2:3]
+
+
+def test_no_name_in_work_of_a_stranger_removes_anything_else(tmp_path):
+    (tmp_path / "kept").write_text("")
+    with writing(tmp_path / "image.zarr") as wip:
+        resume(wip, empty_image(), "image", WINDOWS)
+        open_array(wip, "image")[:] = 1
+        path = wip / "zarr.json"
+        document = json.loads(path.read_text())
+        document["attributes"]["rewritten_chunks"] = ["../kept", str(tmp_path / "kept"), "zarr.json"]
+        path.write_text(json.dumps(document))
+        assert resume(wip, empty_image(), "image", WINDOWS) == []
+    assert (tmp_path / "kept").exists()
 
 
 def test_a_second_writer_waits_for_the_first(tmp_path):

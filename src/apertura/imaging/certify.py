@@ -1,11 +1,13 @@
 """What an image says of itself: its measured numerical error, and what its pixels and its brightest target tell."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.contracts import Window
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.formation import Formation
 from apertura.quality.error_bound import CONFIDENCE, ErrorBound
@@ -21,7 +23,14 @@ CUT_REACH_M = 3.0
 """How far the cuts through the brightest target go to both sides."""
 
 
-def certified(formation: Formation, target: Any, *, accuracy_db: float, threads: int) -> dict[str, Any]:
+def certified(
+    formation: Formation,
+    target: Any,
+    *,
+    accuracy_db: float,
+    threads: int,
+    rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
+) -> dict[str, Any]:
     """Return what bounds the error; form tiles that are worse than asked again with the next better settings first.
 
     Parameters
@@ -34,6 +43,8 @@ def certified(formation: Formation, target: Any, *, accuracy_db: float, threads:
         Error asked.
     threads
         Tiles in work at once.
+    rewriting
+        Told of tiles before they are formed again, so that a run that is killed meanwhile begins them as planned.
     """
     certificate = _drawn(formation)
     settings, redone = iter(formation.plan.fallbacks), []
@@ -47,8 +58,9 @@ def certified(formation: Formation, target: Any, *, accuracy_db: float, threads:
             worse = formation.windows  # each tile passes, all of them together do not
         print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {setting.line}", flush=True)  # noqa: T201
         image = formation.image_by(setting)
+        rewriting([*uncertified, *worse])
         compute_tiles(image, uncertified, target, threads=threads)
-        compute_tiles(image, worse, target, threads=threads)  # last: a run that was killed here does all of it again
+        compute_tiles(image, worse, target, threads=threads)
         redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     line = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure), {accuracy_db:.1f} dB asked"
     return {

@@ -1,6 +1,7 @@
 """Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import sha256_file
 from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
-from apertura.store import finish, open_array, open_stage, resume, sharing, writing
+from apertura.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
 
 _MODULES = [__name__, *ENGINES.values()]
 _QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
@@ -48,7 +49,13 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "engine": plan.engine,
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
-            **certified(work.formation, target, accuracy_db=plan.accuracy_db, threads=threads),
+            **certified(
+                work.formation,
+                target,
+                accuracy_db=plan.accuracy_db,
+                threads=threads,
+                rewriting=partial(mark_rewritten, wip, "image", work.formation.windows),
+            ),
             **measures(work.formation, target),
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.scene.report,

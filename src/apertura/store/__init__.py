@@ -14,7 +14,8 @@ from apertura.store.manifest import (
     remake,
     save_document,
 )
-from apertura.store.progress import create, finish, missing, open_array, resume, sharing, writing
+from apertura.store.progress import finish, sharing, writing
+from apertura.store.resuming import create, mark_rewritten, missing, open_array, resume
 from apertura.store.stages import open_stage, save_stage
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "damaged_files",
     "finish",
     "manifest_of",
+    "mark_rewritten",
     "missing",
     "open_array",
     "open_document",

@@ -1,25 +1,20 @@
-"""Work in progress: who may write a stage, its arrays written chunk by chunk, and the rename that finishes it."""
+"""Work in progress: who may write a stage, and the rename that finishes it."""
 
-import errno
 import fcntl
-import json
-import logging
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from apertura.atomic import naming, remove, rename, write_beside
+from apertura.atomic import naming, remove, rename
 from apertura.contracts import Window
 from apertura.provenance import canonical_json, sha256_tree
 from apertura.store.manifest import manifest_of, write_manifest
+from apertura.store.resuming import is_intact, is_work_on, missing, resume, skeleton_of
 
 if TYPE_CHECKING:
     import xarray as xr
-
-_LOG = logging.getLogger(__name__)
-_PROVENANCE = ("runspec", "inputs", "code_sha256")
 
 
 @contextmanager
@@ -59,7 +54,7 @@ def sharing(
     """
     with _opened(folder) as (wip, lock):
         fcntl.flock(lock, fcntl.LOCK_SH)
-        if not (is_work_on(wip, stage) and _is_intact(wip, _skeleton(stage, name, windows))):
+        if not (is_work_on(wip, stage) and is_intact(wip, skeleton_of(stage, name, windows))):
             _take(lock, folder, wip)
             resume(wip, stage, name, windows)
             fcntl.flock(lock, fcntl.LOCK_SH)  # not atomic: another writer may come between
@@ -86,148 +81,6 @@ def _take(lock: IO[str], folder: Path, wip: Path) -> None:
 def _lock_of(folder: Path) -> Path:
     """Return the lock file of a stage, which keeps the hashes of its files: snakemake removes manifests."""
     return folder.with_name(f".{folder.name}.lock")
-
-
-def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` that `wip` does not hold yet; create `wip` if it is absent or other work.
-
-    Nothing found in `wip` is trusted: what is damaged is made again, and a notice says so.
-
-    Parameters
-    ----------
-    wip
-        Work in progress, from `writing`.
-    stage
-        The stamped stage; of array `name` only shape, dtype and fill value count, so it may be a broadcast zero.
-    name
-        The array that is written tile by tile.
-    windows
-        Every tile, square but at the edges; the first one's shape is the chunk's.
-
-    Notes
-    -----
-    Work in progress is other work when its settings, inputs or code differ.
-    """
-    files = _skeleton(stage, name, windows)
-    if is_work_on(wip, stage):
-        _repair(wip, files, {f"{name}/{_key(window, windows)}" for window in windows})
-    else:
-        _begin(wip, files)
-    return missing(wip, name, windows)
-
-
-def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
-    """Return whether `wip` was begun with the settings, inputs and code of the stamped `stage`."""
-    try:
-        begun = json.loads((wip / "zarr.json").read_bytes())["attributes"]
-        return {key: begun[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except (ValueError, TypeError, KeyError, RecursionError, IsADirectoryError) as error:
-        _notice(wip / "zarr.json", error, "all of it is begun anew")
-        return False
-
-
-def missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` whose chunks `wip` does not hold as they were written.
-
-    A chunk that is damaged is removed, and a notice says so.
-    """
-    array = open_array(wip, name, "r")
-    return [window for window in windows if not _is_whole(wip / name / _key(window, windows), array, window)]
-
-
-def _is_whole(path: Path, array: Any, window: Window) -> bool:
-    if not path.is_file():
-        remove(path)
-        return False
-    try:
-        array[window]
-    except MemoryError:
-        raise
-    except Exception as error:  # a codec may raise anything
-        if isinstance(error, OSError) and error.errno != errno.EIO:
-            raise
-        _notice(path, error, "it is formed again")
-        remove(path)
-        return False
-    return True
-
-
-def _notice(path: Path, error: BaseException, what: str) -> None:
-    """Tell on stderr, where nothing else is set up, that something in work in progress is made again."""
-    _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, what)
-
-
-def _skeleton(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> dict[str, bytes]:
-    from apertura.store.chunks import skeleton
-
-    return skeleton(stage, {name: _chunk(windows)})
-
-
-def _begin(wip: Path, files: Mapping[str, bytes]) -> None:
-    """Write metadata and coordinates; that of the stage, by which it is known, last. Resuming checks all of it."""
-    remove(wip)
-    for name, content in files.items():
-        if name != "zarr.json":
-            (wip / name).parent.mkdir(parents=True, exist_ok=True)
-            with naming(wip / name):
-                (wip / name).write_bytes(content)
-    write_beside(wip / "zarr.json", files["zarr.json"])
-
-
-def _is_intact(wip: Path, files: Mapping[str, bytes]) -> bool:
-    """Return whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
-    paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
-    return all(path.is_file() and path.read_bytes() == content for path, content in paths)
-
-
-def _repair(wip: Path, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
-    """Bring metadata and coordinates of work in progress back to how it was begun; remove what does not belong."""
-    for path in [path for path in wip.rglob("*") if not path.is_dir()]:
-        if (name := path.relative_to(wip).as_posix()) not in files and name not in chunks:
-            path.unlink()
-    for name, content in files.items():
-        path = wip / name
-        if not path.is_file() or path.read_bytes() != content:
-            if name != "zarr.json":  # of a finished stage it also says what was measured
-                _notice(path, ValueError("not as it was written"), "it is written again")
-            remove(path)
-            write_beside(path, content)
-
-
-def _key(window: Window, windows: Sequence[Window]) -> str:
-    """Return where the chunk of a window lies in its array."""
-    return "/".join(["c", *(str(part.start // size) for part, size in zip(window, _chunk(windows), strict=True))])
-
-
-def _chunk(windows: Sequence[Window]) -> tuple[int, ...]:
-    return tuple(part.stop - part.start for part in windows[0])
-
-
-def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> None:
-    """Create `wip`: metadata and coordinates of a stage, and arrays without values, to be written chunk by chunk.
-
-    Parameters
-    ----------
-    wip
-        Work in progress, from `writing`; what is there is removed.
-    stage
-        The stamped stage; of the arrays in `chunks` only dims, dtype, fill value and attributes count, so they may be
-        broadcast.
-    chunks
-        Array name → shape of its chunks. One process at a time may write a chunk.
-    """
-    from apertura.store.chunks import skeleton
-
-    _begin(wip, skeleton(stage, chunks))
-
-
-def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
-    """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
-    from apertura.store.chunks import array_of
-
-    return array_of(folder, name, mode)
 
 
 def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None, **attributes: Any) -> None:
