@@ -45,11 +45,13 @@ test: $(SETUP)
 test-slow: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m slow $(TESTS)
 
-# Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed: an hour.
+# Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed, and every
+# physical mistake: hours.
 attack: $(SETUP)
 	$(BIN)/python -m tests.attack.fuzz --inputs 5000
 	$(BIN)/python -m tests.attack.faults --kills 300 --errors 50 --full 10
 	$(BIN)/python benchmarks/kills.py - 100
+	$(BIN)/python benchmarks/mistakes.py build/mistakes --base sample
 
 lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks
