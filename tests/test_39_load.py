@@ -16,6 +16,7 @@ from apertura.load.scene import expected_scene, settled_scene
 from apertura.steps import echo, scene
 from apertura.steps.plan import first_flight
 from apertura.steps.verify import verify
+from apertura.store import record_files
 
 PAIR = ("f01", "uav1-uav2")
 
@@ -53,6 +54,7 @@ def test_a_report_is_image_json_of_a_pair_or_of_what_was_fused(finished_tiny, tm
         path = opened.campaign.results / "f01" / pair / "image.json"
         written = json.loads(path.read_text()) | {"flags": {"clipped": f"in {pair}"}}
         path.write_text(json.dumps(written))
+        record_files(path.with_name("export.manifest.json"), [path])
         assert opened.report("f01", pair) == written
         assert opened.flags("f01", pair) == {"clipped": f"in {pair}"}
 

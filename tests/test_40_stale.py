@@ -16,6 +16,7 @@ from apertura.digests import Sources, digest_of
 from apertura.errors import CampaignError
 from apertura.lineage import results_of
 from apertura.lock import hold
+from apertura.steps.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
 
@@ -178,6 +179,41 @@ def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     assert list(damaged_results(Campaign.load(finished))) == [f"results/{manifest}.manifest.json"]
+
+
+@pytest.mark.parametrize("file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "layers/mask.tif", "scene.json"])
+@pytest.mark.parametrize("how", ["edited", "gone"])
+def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, file, how):
+    path = finished / "results" / file
+    if how == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+    found = stale_results(Campaign.load(finished))
+    reason = "is gone" if how == "gone" else "is not as it was written"
+    assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
+
+
+def test_a_stage_of_which_a_chunk_is_gone_is_made_again(finished):
+    shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/transfer")
+    found = stale_results(Campaign.load(finished))
+    assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is gone")
+
+
+def test_products_without_their_manifest_are_stale_and_their_report_is_not_believed(finished):
+    for path in finished.rglob("*.manifest.json"):
+        path.unlink()
+    campaign = Campaign.load(finished)
+    assert names(stale_results(campaign)) == {"export", "layers"}
+    with pytest.raises(CampaignError, match=r"export\.manifest\.json: no such file"):
+        print_summary(campaign)
+
+
+def test_a_report_that_was_edited_is_not_believed(finished):
+    path = finished / "results/f01/fused/image.json"
+    path.write_text(path.read_text().replace("focused", "perfect"))
+    with pytest.raises(CampaignError, match=r"image\.json: not as export\.manifest\.json describes it"):
+        print_summary(Campaign.load(finished))
 
 
 @pytest.mark.parametrize("file", ["scene.json", "f01/assessment.json"])

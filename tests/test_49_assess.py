@@ -9,6 +9,7 @@ from apertura.campaign import Campaign
 from apertura.load.results import assessment_of
 from apertura.steps import assess, cube, echo, image, profile
 from apertura.steps.summary import print_summary
+from apertura.store import record_files
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 
@@ -65,6 +66,7 @@ def test_the_summary_says_each_flag_once_and_whole(right, capsys, tmp_path):
         path = root / "results" / "f01" / name / "image.json"
         report = json.loads(path.read_text())
         path.write_text(json.dumps(report | {"flags": {"defocused": "a line [with brackets]"}}))
+        record_files(path.with_name("export.manifest.json"), [path])
     print_summary(Campaign.load(root))
     said = capsys.readouterr().out
     assert said.count("a line [with brackets]") == 1

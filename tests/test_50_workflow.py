@@ -67,7 +67,8 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
 
 
 def tiles(root):
-    return list((root / "results" / "f01").glob("*/image.zarr.wip/image/c/*/*"))
+    chunks = (root / "results" / "f01").glob("*/image.zarr.wip/image/c/*/*")
+    return [path for path in chunks if path.suffix != ".partial"]
 
 
 def lines_of(folder, pattern):
@@ -148,11 +149,26 @@ def test_a_wrong_campaign_ends_with_its_message_and_no_traceback(tiny):
 @pytest.mark.slow
 def test_a_failing_step_shows_its_message_in_the_run(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
-    path.write_bytes(path.read_bytes()[:-4000])
+    data = bytearray(path.read_bytes())
+    data[4000] ^= 1
+    path.write_bytes(data)
     code, output = finished(snakemake(tiny))
     assert code != 0
-    assert "error: raw/f01/uav1.sigmf-meta: capture" in output
+    assert "uav1.sigmf-data: sha512" in output
     assert "Traceback" not in output
+
+
+@pytest.mark.slow
+def test_what_headers_tell_ends_a_run_before_any_step(tiny):
+    path = tiny / "raw" / "f01" / "uav1.sigmf-data"
+    path.write_bytes(path.read_bytes()[:-4000])
+    for run in (snakemake(tiny), apertura("run", tiny)):
+        code, output = finished(run)
+        assert code != 0
+        assert "raw/f01/uav1.sigmf-meta: capture" in output
+        assert "Traceback" not in output
+    assert code == 2
+    assert not (tiny / "results").exists()
 
 
 @pytest.mark.slow

@@ -7,10 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from folders import copy_writable
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CODE = "import os; os.close(os.open({marker!r}, os.O_CREAT))"
+
+LOOKS = ("plan", "check", "summary", "step scene")
+"""What a person types in a campaign folder."""
 
 ROADS = {
     "snakemake from the sources": ([BIN / "snakemake", "--directory", "{campaign}"], ROOT),
@@ -43,6 +47,8 @@ def plant(root, marker):
     files |= {f"{name}.py": f"{code}\n" for name in modules}
     files |= {"apertura/__init__.py": f"{code}\n", "pyproject.toml": "[tool.x]\n", "python.pth": f"import os; {code}\n"}
     files |= dict.fromkeys(("apertura.sh", "bash", "python", ".envrc", ".bashrc"), f"#!/bin/sh\ntouch {marker}\n")
+    # Settings that libraries read from the working folder when they are imported; these would be an error at least.
+    files |= {".numba_config.yaml": "[", "matplotlibrc": "backend: nosuch\n\x00"}
     for name, text in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -74,6 +80,17 @@ def test_no_file_beside_the_data_is_run(tiny, tmp_path, road):
     marker = tmp_path / "marker"
     plant(tiny, marker)
     done = run(road, tiny, tmp_path, "-n")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("words", LOOKS)
+def test_nor_by_commands_typed_in_the_folder(finished_tiny, tmp_path, words):
+    """Such as numba's cache of compiled code, unpickled from where `.numba_config.yaml` says."""
+    campaign, marker = copy_writable(finished_tiny.root, tmp_path / "campaign"), tmp_path / "marker"
+    plant(campaign, marker)
+    words = [*words.split(), *([] if "step" in words or "summary" in words else ["."])]
+    done = subprocess.run([BIN / "apertura", *words], cwd=campaign, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert not marker.exists()
 

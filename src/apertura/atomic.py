@@ -4,7 +4,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,18 @@ def rename(source: Path, target: Path) -> None:
         _synchronise(path)
     source.replace(target)
     _synchronise(target.parent)
+
+
+def not_older(paths: Iterable[Path], newest_ns: int) -> None:
+    """Give files that are older than what they were made from its time: Snakemake goes by times where a clock does not.
+
+    A clock that was set back, or inputs copied from a machine whose clock is fast, would make results for ever too old.
+    """
+    for path in paths:
+        with suppress(OSError):
+            found = path.stat()
+            if found.st_mtime_ns < newest_ns:
+                os.utime(path, ns=(found.st_atime_ns, newest_ns))
 
 
 def remove(path: Path) -> None:

@@ -14,6 +14,7 @@ import typer
 from apertura import __version__
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError, explained
+from apertura.paths import leave_working_folder
 from apertura.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
 from apertura.step_commands import Threads
 from apertura.step_commands import app as step
@@ -26,7 +27,7 @@ app.add_typer(step, name="step")
 app.add_typer(study, name="study")
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
-Cores = Annotated[int, typer.Option(help="cores to use")]
+Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
@@ -37,18 +38,19 @@ PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 def _opened(campaign: Path) -> "Campaign":
     from apertura.campaign import Campaign
 
-    return Campaign.load(campaign)
+    return Campaign.load(leave_working_folder(campaign))
 
 
 def main() -> None:
     """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
+    started = Path.cwd()
     with ended_by_signals():
         try:
             app()
         except CampaignError as error:
             from apertura.settings import located
 
-            _say(located(str(error)))
+            _say(located(str(error).replace(f"{started}/", "")))
             leave_status(2)
             raise SystemExit(2) from None
         except Interrupted as signalled:
@@ -122,9 +124,10 @@ def check(
 @app.command()
 def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
     """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
+    opened = _opened(campaign)  # before anything large is imported, see `leave_working_folder`
     from apertura.steps.plan import print_plan
 
-    print_plan(_opened(campaign), threads=threads)
+    print_plan(opened, threads=threads)
 
 
 @app.command(context_settings=PASS_ON)
@@ -141,9 +144,10 @@ def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_C
 @app.command()
 def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = HERE) -> None:
     """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
+    opened = _opened(campaign)
     from apertura.steps.summary import print_summary
 
-    print_summary(_opened(campaign))
+    print_summary(opened)
 
 
 @app.command()
@@ -151,9 +155,10 @@ def verify(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
 ) -> None:
     """Compare where point targets are found with where they were put, and print the products' paths."""
+    opened = _opened(campaign)
     from apertura.steps.verify import print_findings
 
-    print_findings(_opened(campaign), paths=paths)
+    print_findings(opened, paths=paths)
 
 
 @app.command()

@@ -42,17 +42,7 @@ class Result:
         return sha256_text(canonical_json(self.settings))
 
     def begin(self, root: Path, modules: Sequence[str], *, further: Sequence[str] = ()) -> "Lineage":
-        """Hash what it is made from.
-
-        Parameters
-        ----------
-        root
-            The campaign folder.
-        modules
-            Whose import closure is the code that makes it.
-        further
-            Files that only reading the others names.
-        """
+        """Hash what it is made from, and `further` files that reading it names; code is what `modules` import."""
         return Lineage(self, Sources.of(root, (*self.sources, *further)), tuple(modules))
 
 
@@ -63,6 +53,11 @@ class Lineage:
     result: Result
     sources: Sources
     modules: tuple[str, ...]
+
+    @property
+    def newest_ns(self) -> int:
+        """When the youngest source was written, ns since 1970."""
+        return self.sources.newest_ns
 
     def record(self) -> dict[str, Any]:
         """Return what the manifest says of where the result comes from.

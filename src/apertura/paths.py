@@ -1,5 +1,6 @@
 """Where a name that a stranger's file gives may lead: to a file inside the folder, through no link."""
 
+import os
 from pathlib import Path
 
 from apertura.errors import CampaignError, quoted
@@ -44,3 +45,14 @@ def inside(root: Path, name: str, *, where: object) -> Path:
             "Copy the file into the folder and name it from there.",
         )
     return way[-1]
+
+
+def leave_working_folder(path: Path) -> Path:
+    """Return a path as an absolute one, and make the package's own folder the working folder.
+
+    Libraries read settings from the working folder when they are imported (numba ``.numba_config.yaml``, matplotlib
+    ``matplotlibrc``), and with them run code. Steps are started in a campaign folder, which is a stranger's.
+    """
+    absolute = path.absolute()
+    os.chdir(Path(__file__).parent)
+    return absolute

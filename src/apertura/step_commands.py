@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from apertura.paths import leave_working_folder
+
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
@@ -17,8 +19,10 @@ def _run(function: str, campaign: Path, *arguments: str, **options: object) -> N
     """Run ``module:function`` on a campaign and print the paths that it wrote."""
     from apertura.campaign import Campaign
 
+    started, campaign = Path.cwd(), leave_working_folder(campaign)
     written = pkgutil.resolve_name(function)(Campaign.load(campaign), *arguments, **options)
-    print(*([written] if isinstance(written, Path) else written), sep="\n")
+    for path in [written] if isinstance(written, Path) else written:
+        print(path.relative_to(started) if path.is_relative_to(started) else path)
 
 
 @app.command()

@@ -56,7 +56,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     stale = stale_results(campaign, paranoid=paranoid)
     overtaken = [manifest for manifest in stale if not manifest.startswith(f"results/{STUDY}/")]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    folder = _workflow_folder()
+    folder, root = _workflow_folder(), root.absolute()
     command = [
         sys.executable,
         "-P",
@@ -83,7 +83,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         print(
             f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.", file=sys.stderr
         )
-    return 2 if status == 1 and (told == {"2"} or (killed and "1" not in told)) else status
+    return 2 if status == 1 and "1" not in told else status
 
 
 def _killed_for_memory() -> int:
@@ -104,6 +104,7 @@ def _supervised(command: Sequence[str], environment: dict[str, str]) -> int:
     """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
     process = subprocess.Popen(
         command,
+        cwd=Path(__file__).parent,  # never the campaign's: see `leave_working_folder`
         env=environment,
         start_new_session=True,
         preexec_fn=_die_with_parent,  # noqa: PLW1509 - this process has no other threads

@@ -101,7 +101,8 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
 
     lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
     if products:
-        lines += [f"{manifest}: damaged: {why}" for manifest, why in damaged_results(campaign).items()]
+        damaged = damaged_results(campaign).items()
+        lines += [f"{manifest}: damaged, {why}. Delete it and run the workflow again." for manifest, why in damaged]
     for line in lines:
         print(line)
     return len(lines)

@@ -56,12 +56,12 @@ def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
     folder = campaign.results if campaign.results.is_dir() else campaign.root
     free = shutil.disk_usage(folder).free
     if needed > free:
-        parts = ", ".join(f"{name} {size / 1e9:.2f} GB" for name, size in disk_bytes(inspected).items() if size)
+        parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(inspected).items() if size)
         yield CampaignError(
-            f"results take at least {needed / 1e9:.2f} GB more ({parts})",
+            f"results take at least {needed / 1e6:.0f} MB more ({parts})",
             where=folder,
-            expected=f"at most the {free / 1e9:.2f} GB that are free",
-            remedy="Free some space, put results on another disk, or make the scene smaller.",
+            expected=f"at most the {free / 1e6:.0f} MB that are free",
+            remedy="Free some space, copy the campaign to a larger disk, or make the scene smaller.",
         )
 
 

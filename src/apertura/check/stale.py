@@ -2,10 +2,11 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from apertura.atomic import not_older
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
@@ -37,6 +38,8 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     for name, result in results_of(campaign):
         path = campaign.root / result.manifest
         if not path.is_file():
+            if name in _PRODUCTS and any(path.parent.glob("*.tif")):
+                stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
             continue
         try:
             reasons = list(_reasons(campaign.root, name, result, read_manifest(path), paranoid=paranoid))
@@ -47,12 +50,34 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     return stale
 
 
+def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
+    """Give results that are not stale no older times than what they were made from, as they would have: only copied.
+
+    Snakemake makes again what is older than its input, also where a copy has lost the times.
+    """
+    results = [result for _, result in results_of(campaign)]
+    inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
+    newest_ns = _newest_ns(campaign.root, inputs)
+    for result in results:
+        newest_ns = max(newest_ns, _newest_ns(campaign.root, result.sources))
+        path = campaign.root / result.manifest
+        if result.manifest not in stale and path.is_file():
+            files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
+            not_older([path, *files], newest_ns)
+
+
+def _newest_ns(root: Path, names: Iterable[str]) -> int:
+    return max((path.stat().st_mtime_ns for path in (root / name for name in names) if path.is_file()), default=0)
+
+
 def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
     """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
     for manifest in reversed(list(stale)) if remove else ():  # what stands on others first: a kill leaves no gap below
-        (campaign.root / manifest).unlink()
+        (campaign.root / manifest).unlink(missing_ok=True)
+    if stale and not remove:
+        print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
@@ -103,10 +128,14 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
     return damaged
 
 
+_PRODUCTS = frozenset({"export", "fused", "layers"})
+
+
 def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not {"sources", "settings", "code"} <= recorded.keys():
         yield "it does not say what it was made from"
         return
+    yield from _spoilt(root, result.manifest, recorded["files"])
     for source in sorted({*result.sources, *recorded["sources"]}):
         was = recorded["sources"].get(source)
         if was is None:
@@ -119,3 +148,15 @@ def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any],
         yield "its settings have changed"
     if recorded["code"] != code_of(name):
         yield "its code has changed"
+
+
+def _spoilt(root: Path, manifest: str, files: Mapping[str, str]) -> Iterator[str]:
+    """Yield what of a result's own files is gone, or edited since; arrays are looked into where they are opened."""
+    folder = (root / manifest).parent
+    for name, digest in files.items():
+        path = inside(folder, name, where=root / manifest)
+        if not path.is_file():
+            yield f"{name} is gone"
+            return
+        if ".zarr/" not in name and digest_of(root, path.relative_to(root).as_posix()) != digest:
+            yield f"{name} is not as it was written"

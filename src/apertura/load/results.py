@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
 from apertura.contracts import STAGES
-from apertura.documents import read_json, undamaged
+from apertura.documents import undamaged
 from apertura.errors import CampaignError
 from apertura.load.scene import OpenScene, open_scene
-from apertura.store import open_document, open_stage, remake
+from apertura.store import open_document, open_listed, open_stage, remake
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,7 +79,7 @@ class OpenCampaign:
         known = (*self.campaign.flight(flight).pairs, "fused")
         _check_name(pair, "pair", known, where=f"campaign.report({flight!r})")
         path = self.campaign.result(flight, pair, "image.json")
-        return read_json(path, expected="the report of an image", remedy="Run the workflow first.")
+        return open_listed(path, path.with_name("export.manifest.json"))
 
     def flags(self, flight: str, pair: str) -> dict[str, str]:
         """Return the limits that an image exceeds: name → what was measured, in one line."""

@@ -66,8 +66,10 @@ class Scene(Section):
         counts = ((xmax - xmin) / spacing, (ymax - ymin) / spacing)
         if any(abs(count - round(count)) > 1e-6 * max(count, 1.0) for count in counts):
             columns, rows = (max(1, round(count)) for count in counts)
+            degrees = self.crs != "local" and max(map(abs, (xmin, ymin, xmax, ymax))) <= 180 and xmax - xmin < 1
+            hint = ": these look like degrees, bounds_m is in metres of crs" if degrees else ""
             nearest = [xmin, round(ymax - rows * spacing, 9), round(xmin + columns * spacing, 9), ymax]
             raise ValueError(
                 f"bounds_m={list(self.bounds_m)} is {counts[0]:.6g} × {counts[1]:.6g} pixels of {spacing} m; "
-                f"the nearest whole grid is {nearest}"
+                f"the nearest whole grid is {nearest}{hint}"
             )

@@ -62,7 +62,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
     }
     path = campaign.result(flight, "assessment.json")
-    save_document(path, report, lineage.record())
+    save_document(path, report, lineage)
     return path
 
 

@@ -38,7 +38,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
         }
     report["code_sha256"] = chained_sha256(code_sha256(__name__), codes)
     path = campaign.result(flight, "calibration.json")
-    save_document(path, report, lineage.record())
+    save_document(path, report, lineage)
     return path
 
 

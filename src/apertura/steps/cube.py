@@ -55,7 +55,7 @@ def cube(campaign: Campaign) -> Path:
                 arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
                 arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
                 arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
-        finish(wip, folder, lineage=lineage.record())
+        finish(wip, folder, lineage=lineage)
     return folder
 
 

@@ -50,7 +50,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     stage = stamped(dataset, "echo", modules=[__name__], parents=parents, settings=relevant, inputs=inputs)
-    save_stage(stage, folder, lineage=lineage.record())
+    save_stage(stage, folder, lineage=lineage)
     return folder
 
 

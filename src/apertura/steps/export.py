@@ -93,7 +93,7 @@ def _finish(folder: Path, written: list[Path], report: Mapping[str, Any], lineag
     """Write image.json beside the products, then the manifest of all."""
     files = [*written, folder / "image.json"]
     write_json(files[-1], report)
-    record_files(folder / "export.manifest.json", files, lineage.record())
+    record_files(folder / "export.manifest.json", files, lineage)
     return files
 
 

@@ -67,7 +67,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         expected_db = expected(lines).loss_db
         focus["expected_db"] = round(expected_db, 3)
         quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"], **focus_flags(focus, expected_db)}
-        finish(wip, folder, lineage=lineage.record(), quality=quality, flags=quality["flags"])
+        finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 
 

@@ -55,7 +55,7 @@ def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )
-    record_files(campaign.root / lineage.result.manifest, written, lineage.record())
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 
 

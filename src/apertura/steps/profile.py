@@ -40,7 +40,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     folder = campaign.stage("profile", flight, pair)
     settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
     how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": scene.inputs}
-    save_stage(stamped(dataset, "profile", **how), folder, lineage=lineage.record())
+    save_stage(stamped(dataset, "profile", **how), folder, lineage=lineage)
     return folder
 
 

@@ -17,7 +17,7 @@ def scene(campaign: Campaign) -> Path:
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
     document = {"grid": asdict(grid), "height_m": height_m, "chosen": chosen, "inputs": ground.inputs}
-    save_document(path, document, lineage.record())
+    save_document(path, document, lineage)
     return path
 
 

@@ -3,8 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
-from apertura.documents import DAMAGED, read_json, undamaged
+from apertura.documents import undamaged
 from apertura.errors import shown
+from apertura.store import open_listed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -39,9 +40,9 @@ def print_summary(campaign: Campaign) -> None:
 
 
 def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
-    path = campaign.results / flight / name / "image.json"
-    report = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
-    with undamaged(path, expected="the report of an image", remedy=DAMAGED):
+    path = campaign.result(flight, name, "image.json")
+    report = open_listed(path, path.with_name("export.manifest.json"))
+    with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
         flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
         return {**report, "flags": flags, "numerical_error_db": float(report["numerical_error_db"])}
 

@@ -50,7 +50,7 @@ def terrain(campaign: Campaign) -> Path:
             "highest_m": highest_m,
             "datum": campaign.settings.scene.dem_datum,
         }
-        finish(wip, folder, lineage=lineage.record(), terrain=report)
+        finish(wip, folder, lineage=lineage, terrain=report)
     return folder
 
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from apertura.atomic import write_json
+from apertura.atomic import not_older, write_json
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.paths import inside
@@ -33,7 +33,18 @@ def remake(result: Path) -> str:
     return f"Delete {manifest_of(result)} and run the workflow again."
 
 
-def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Mapping[str, Any] | None = None) -> None:
+class Origin(Protocol):
+    """What a result is being made from, `apertura.lineage.Lineage`."""
+
+    @property
+    def newest_ns(self) -> int:
+        """When the youngest source was written, ns since 1970."""
+
+    def record(self) -> dict[str, Any]:
+        """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
+
+
+def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Origin | None = None) -> None:
     """Write the manifest of a result that is complete.
 
     Parameters
@@ -43,12 +54,15 @@ def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Mapping[st
     files
         File relative to the manifest's folder → sha256.
     lineage
-        What it was made from: sources (file → sha256), settings, code; None: nobody says.
+        What it was made from; None: nobody says.
     """
-    write_json(manifest, {"files": files, **(lineage or {})})
+    write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
+    if lineage:
+        outputs = [manifest, *(manifest.parent / name for name in files if ".zarr/" not in name)]
+        not_older(outputs, lineage.newest_ns)
 
 
-def record_files(manifest: Path, files: Sequence[Path], lineage: Mapping[str, Any] | None = None) -> None:
+def record_files(manifest: Path, files: Sequence[Path], lineage: Origin | None = None) -> None:
     """Write the manifest of some files beside or below it."""
     write_manifest(
         manifest, {path.relative_to(manifest.parent).as_posix(): sha256_file(path) for path in sorted(files)}, lineage
@@ -114,7 +128,7 @@ def refuse_others(manifest: Path, expected: Mapping[str, str], present: Mapping[
         )
 
 
-def save_document(path: Path, document: Mapping[str, Any], lineage: Mapping[str, Any] | None = None) -> None:
+def save_document(path: Path, document: Mapping[str, Any], lineage: Origin | None = None) -> None:
     """Write a result that is one JSON document, and its manifest."""
     manifest_of(path).unlink(missing_ok=True)
     write_json(path, document)
@@ -131,3 +145,19 @@ def open_document(path: Path) -> dict[str, Any]:
     """
     check_files(path)
     return read_json(path, expected="a result of the workflow", remedy=remake(path))
+
+
+def open_listed(path: Path, manifest: Path) -> dict[str, Any]:
+    """Return a JSON document that is one of a result's files, after checking it against their manifest.
+
+    Raises
+    ------
+    CampaignError
+        If it or the manifest is missing, or it is not as it was written.
+    """
+    document = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
+    expected = read_manifest(manifest)["files"].get(path.name)
+    if expected != sha256_file(path):
+        found = f"not as {manifest.name} describes it"
+        raise CampaignError(found, path, "what the workflow wrote", "Run the workflow again.")
+    return document

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 from apertura.atomic import naming, remove, rename
 from apertura.contracts import Window
 from apertura.provenance import canonical_json, sha256_tree
-from apertura.store.manifest import manifest_of, write_manifest
+from apertura.store.manifest import Origin, manifest_of, write_manifest
 from apertura.store.resuming import is_intact, is_work_on, missing, resume, skeleton_of
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def _lock_of(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.lock")
 
 
-def finish(wip: Path, folder: Path, *, lineage: Mapping[str, Any] | None = None, **attributes: Any) -> None:
+def finish(wip: Path, folder: Path, *, lineage: Origin | None = None, **attributes: Any) -> None:
     """Turn work in progress into the finished stage and write its manifest.
 
     Parameters

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from apertura.atomic import naming, remove
 from apertura.contracts import check
-from apertura.store.manifest import check_files
+from apertura.store.manifest import Origin, check_files
 from apertura.store.progress import finish, writing
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def save_stage(
     folder: Path,
     *,
     chunks: Mapping[str, int] | None = None,
-    lineage: Mapping[str, Any] | None = None,
+    lineage: Origin | None = None,
 ) -> None:
     """Write a stage at once: `folder`.wip, rename, manifest.
 

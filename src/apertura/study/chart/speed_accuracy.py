@@ -111,7 +111,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     write_table(paths[0], points, digits=6)
     draw_points(points, paths[1], title=title, accuracy_db=accuracy_db)
     write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=accuracy_db)
-    record_files(campaign.root / lineage.result.manifest, paths, lineage.record())
+    record_files(campaign.root / lineage.result.manifest, paths, lineage)
     return paths
 
 

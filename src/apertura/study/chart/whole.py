@@ -79,7 +79,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
     paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
     write_table(paths[0], rows, digits=6)
     draw_whole(rows, paths[1], title=_title(campaign, rows, repeats), refused=refused)
-    record_files(campaign.root / lineage.result.manifest, paths, lineage.record())
+    record_files(campaign.root / lineage.result.manifest, paths, lineage)
     return paths
 
 
