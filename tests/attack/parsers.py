@@ -111,6 +111,12 @@ def _recorded(path: Path) -> Path:
     return path
 
 
+def _listed(path: Path) -> Path:
+    """Write the manifest of the products that a report is one of."""
+    record_files(path.with_name("export.manifest.json"), [path])
+    return path
+
+
 def _calibration(path: Path) -> Any:
     return calibrated(_campaign(_recorded(path).parents[2]), "f01", "uav1-uav2")
 
@@ -198,7 +204,7 @@ PARSERS: dict[str, Parser] = {
     "image.json": Parser(
         "results/f01/fused/image.json",
         lambda: seeds.documents(seeds.REPORTED),
-        lambda path: OpenCampaign(Campaign(path.parents[3], None, (FLIGHT,))).report("f01", "fused"),  # type: ignore[arg-type]
+        lambda path: OpenCampaign(Campaign(_listed(path).parents[3], None, (FLIGHT,))).report("f01", "fused"),  # type: ignore[arg-type]
         _JSON_TREE,
         _JSON,
     ),
