@@ -64,6 +64,9 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
         if result.manifest not in stale and path.is_file():
             files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
             not_older([path, *files], newest_ns)
+    not_older(
+        (campaign.root / "results" / "benchmarks").rglob("*.tsv"), newest_ns
+    )  # Snakemake's oldest output may be one
 
 
 def _newest_ns(root: Path, names: Iterable[str]) -> int:
