@@ -1,9 +1,11 @@
 """Before anything runs: every problem of a campaign folder at once, from headers alone."""
 
 import io
+import os
 import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -285,3 +287,13 @@ def test_codes_of_a_shape_that_no_disk_holds_are_told_by_their_header(tiny):
 def test_the_page_of_checks_has_a_row_for_each_and_for_no_other():
     rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/checks.md").read_text(encoding="utf-8"), re.M)
     assert list(dict.fromkeys(rows)) == list(CHECKS)
+
+
+def test_a_file_from_the_future_is_told_with_what_to_do(tiny):
+    path = tiny / "raw/f01/uav1.sigmf-meta"
+    for ahead_s, count in ((2, 0), (7200, 1)):
+        os.utime(path, (time.time() + ahead_s,) * 2)
+        lines = told(tiny)
+        assert len(lines) == count
+    assert "dated 2.0 h in the future; expected a time that has been, by this machine's clock" in lines[0]
+    assert "run `touch raw/f01/uav1.sigmf-meta`" in lines[0]

@@ -105,16 +105,14 @@ def rename(source: Path, target: Path) -> None:
     _synchronise(target.parent)
 
 
-def not_older(paths: Iterable[Path], newest_ns: int) -> None:
-    """Give files that are older than what they were made from its time: Snakemake goes by times where a clock does not.
-
-    A clock that was set back, or inputs copied from a machine whose clock is fast, would make results for ever too old.
-    """
+def date(paths: Iterable[Path], *, earliest_ns: int, latest_ns: int) -> None:
+    """Bring the times of files between two, where they may be changed."""
     for path in paths:
         with suppress(OSError):
             found = path.stat()
-            if found.st_mtime_ns < newest_ns:
-                os.utime(path, ns=(found.st_atime_ns, newest_ns))
+            wanted_ns = min(max(found.st_mtime_ns, earliest_ns), latest_ns)
+            if wanted_ns != found.st_mtime_ns:
+                os.utime(path, ns=(found.st_atime_ns, wanted_ns))
 
 
 def remove(path: Path) -> None:

@@ -79,11 +79,6 @@ class Sources:
         states = {name: _state(root / name) for name in sorted(set(names))}
         return cls(root, {name: digest_of(root, name) for name in states}, states)
 
-    @property
-    def newest_ns(self) -> int:
-        """When the youngest of them was written, ns since 1970; 0 where there is none."""
-        return max((state["mtime_ns"] for state in self._states.values()), default=0)
-
     def unchanged(self) -> dict[str, str]:
         """Return file → sha256; raise CampaignError if one has changed since it was hashed: what was read is unknown.
 

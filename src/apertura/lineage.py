@@ -54,11 +54,6 @@ class Lineage:
     sources: Sources
     modules: tuple[str, ...]
 
-    @property
-    def newest_ns(self) -> int:
-        """When the youngest source was written, ns since 1970."""
-        return self.sources.newest_ns
-
     def record(self) -> dict[str, Any]:
         """Return what the manifest says of where the result comes from.
 

@@ -1,6 +1,7 @@
 """Whether everything is there that flights.tsv and the config promise."""
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,8 @@ from apertura.errors import CampaignError
 from apertura.ingest import RECORDERS
 from apertura.paths import inside
 from apertura.settings import CONFIG, FLIGHTS, Flight, OfdmWaveform
+
+_AHEAD_S = 5.0
 
 
 def check_files(inspected: Inspected) -> Iterator[CampaignError]:
@@ -79,6 +82,13 @@ def _found(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
 def _readable(path: Path, expected: str, remedy: str) -> Iterator[CampaignError]:
     if not path.is_file():
         yield CampaignError("no such file", where=path, expected=expected, remedy=remedy)
+    elif path.stat().st_mtime > time.time() + _AHEAD_S:
+        yield CampaignError(
+            f"dated {(path.stat().st_mtime - time.time()) / 3600:.1f} h in the future",
+            where=path,
+            expected="a time that has been, by this machine's clock",
+            remedy=f"Set the clock, or run `touch {path}`: Snakemake takes no input from the future.",
+        )
     elif path.stat().st_size == 0:
         yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")
     elif not os.access(path, os.R_OK):

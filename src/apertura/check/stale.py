@@ -2,11 +2,12 @@
 
 import re
 import sys
+import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from apertura.atomic import not_older
+from apertura.atomic import date
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
@@ -51,11 +52,12 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
 
 
 def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
-    """Give results that are not stale no older times than what they were made from, as they would have: only copied.
+    """Give results that are not stale times that say so: not before what they were made from, and not after now.
 
-    Snakemake makes again what is older than its input, also where a copy has lost the times.
+    Snakemake makes again what is older than its input, also where a copy has lost the times, and refuses an input from
+    the future, as a clock that was set back leaves it.
     """
-    results = [result for _, result in results_of(campaign)]
+    results, now_ns = [result for _, result in results_of(campaign)], time.time_ns()
     inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
     newest_ns = _newest_ns(campaign.root, inputs)
     for result in results:
@@ -63,10 +65,9 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
         path = campaign.root / result.manifest
         if result.manifest not in stale and path.is_file():
             files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
-            not_older([path, *files], newest_ns)
-    not_older(
-        (campaign.root / "results" / "benchmarks").rglob("*.tsv"), newest_ns
-    )  # Snakemake's oldest output may be one
+            date([path, *files], earliest_ns=newest_ns, latest_ns=now_ns)
+    benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")  # Snakemake's oldest output may be one
+    date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
 
 
 def _newest_ns(root: Path, names: Iterable[str]) -> int:

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import xarray as xr
 
-from apertura.atomic import not_older
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.ingest import open_recording, read_track
@@ -14,7 +13,7 @@ from apertura.load.transmitted import read_framing, symbol_samples
 from apertura.paths import inside
 from apertura.settings import OfdmWaveform
 from apertura.steps.stamping import stamped
-from apertura.store import manifest_of, save_stage
+from apertura.store import save_stage
 
 
 def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
@@ -42,8 +41,6 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
     save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256}, lineage=recorded)
     save_stage(track, folders[1], lineage=logged)
-    newest_ns = max(recorded.newest_ns, logged.newest_ns)
-    not_older(map(manifest_of, folders), newest_ns)  # one rule makes both, of all the node's files
     return folders
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from apertura.atomic import not_older, write_json
+from apertura.atomic import write_json
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.paths import inside
@@ -36,10 +36,6 @@ def remake(result: Path) -> str:
 class Origin(Protocol):
     """What a result is being made from, `apertura.lineage.Lineage`."""
 
-    @property
-    def newest_ns(self) -> int:
-        """When the youngest source was written, ns since 1970."""
-
     def record(self) -> dict[str, Any]:
         """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
 
@@ -57,9 +53,6 @@ def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Origin | N
         What it was made from; None: nobody says.
     """
     write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
-    if lineage:
-        outputs = [manifest, *(manifest.parent / name for name in files if ".zarr/" not in name)]
-        not_older(outputs, lineage.newest_ns)
 
 
 def record_files(manifest: Path, files: Sequence[Path], lineage: Origin | None = None) -> None:
