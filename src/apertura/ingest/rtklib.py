@@ -89,7 +89,9 @@ def _time(first: str, second: str) -> str | np.datetime64:
 
 def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime64]:
     dates = [place for place, time in enumerate(stated) if isinstance(time, str)]
-    times = np.array([np.datetime64("NaT") if isinstance(time, str) else time for time in stated], "datetime64[ns]")
+    times = np.array(
+        [np.datetime64("NaT", "ns") if isinstance(time, str) else time for time in stated], "datetime64[ns]"
+    )
     try:
         times[dates] = utc_times([time for time in stated if isinstance(time, str)])
     except ValueError as error:
