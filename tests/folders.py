@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 from apertura.campaign import Campaign
+from apertura.check.files import check_files
+from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.simulation import (
     CampaignSpecification,
@@ -41,6 +43,12 @@ def copy_writable(source: Path, target: Path) -> Path:
     for folder in [target, *(path for path in target.rglob("*") if path.is_dir())]:
         folder.chmod(0o755)
     return target
+
+
+def require_files(campaign: Campaign) -> None:
+    """Raise the first problem with the files that the config and the flights promise."""
+    for problem in check_files(Inspected(campaign)):
+        raise problem
 
 
 def settle_ground(campaign: Campaign) -> None:

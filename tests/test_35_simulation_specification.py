@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 import yaml
-from folders import contents, recordings_of, small_simulation
+from folders import contents, recordings_of, require_files, small_simulation
 from typer.testing import CliRunner
 
 from apertura.campaign import Campaign
-from apertura.check.files import require_files
 from apertura.cli import app
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import projected_from_ecef

@@ -4,10 +4,10 @@ import shutil
 
 import pytest
 import yaml
-from folders import copy_writable
+from folders import copy_writable, require_files
 
 from apertura.campaign import Campaign
-from apertura.check.files import require_files
+from apertura.check import problems
 from apertura.check.inspected import Inspected
 from apertura.check.links import check_links
 from apertura.errors import CampaignError
@@ -108,3 +108,13 @@ def test_other_names_stay_as_they_are(name):
 
 def test_a_copy_of_the_results_elsewhere_is_no_link(finished_tiny, tmp_path):
     assert list(check_links(Inspected(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy"))))) == []
+
+
+def test_what_lies_outside_the_folder_is_not_opened_by_a_check(tiny):
+    (tiny.parent / "codes.npy").write_bytes(b"no codes at all")
+    path = tiny / "config" / "config.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["waveform"]["codes"] = "../codes.npy"
+    path.write_text(yaml.safe_dump(document))
+    (line,) = map(str, problems(tiny))
+    assert "waveform.codes: path '../codes.npy' leads out of the campaign folder" in line

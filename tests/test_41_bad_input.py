@@ -5,10 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all
+from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all, require_files
 
 from apertura.campaign import Campaign
-from apertura.check.files import require_files
 from apertura.load.pair import open_pair
 from apertura.steps import echo, ingest, profile, scene
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import complaint, copy_writable, run_steps, settle_ground
+from folders import complaint, copy_writable, require_files, run_steps, settle_ground
 from rasterio.transform import from_origin
 
 from apertura.campaign import Campaign
-from apertura.check.files import require_files
 from apertura.cli import main
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import projected_from_ecef

@@ -14,7 +14,7 @@ def check_codes(inspected: Inspected) -> Iterator[CampaignError]:
     waveform = inspected.waveform
     if waveform is None:
         return
-    path = inspected.campaign.root / waveform.codes
+    path = inspected.campaign.codes_file
     if not path.is_file() or path.stat().st_size == 0:
         return
     found = _found(path, waveform.subcarriers)

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from apertura.campaign import Campaign
-from apertura.check.inspected import Inspected, participants
+from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest import RECORDERS
 from apertura.paths import inside
@@ -17,7 +17,7 @@ _AHEAD_S = 5.0
 
 
 def check_files(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield every file that is missing, empty or may not be read."""
+    """Yield every file that is missing, empty, dated in the future or may not be read."""
     campaign = inspected.campaign
     for flight in campaign.flights:
         yield from _recorded(campaign, flight)
@@ -37,19 +37,13 @@ def check_files(inspected: Inspected) -> Iterator[CampaignError]:
             yield from _readable(path, f"the file of {CONFIG}: {key}", f"Copy it there, or correct {key}.")
 
 
-def require_files(campaign: Campaign) -> None:
-    """Raise CampaignError with the first file that is missing."""
-    for problem in check_files(Inspected(campaign)):
-        raise problem
-
-
 def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
     """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, OfdmWaveform):
         for node in flight.nodes:
             yield from _found(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
         return
-    for node in participants(flight):
+    for node in flight.participants:
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
         for path in promised_recording(campaign.root / "raw" / flight.name, node):

@@ -7,6 +7,7 @@ import numpy as np
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest.recording import Recording
+from apertura.paths import inside
 from apertura.settings import CONFIG, OfdmWaveform
 
 _SAME = 1e-9
@@ -30,10 +31,13 @@ def check_recordings(inspected: Inspected) -> Iterator[CampaignError]:
                     remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
                 )
         preamble = recording.framing["preamble"] if recording.framing else None
-        if preamble and not (inspected.campaign.root / preamble).is_file():
+        if not preamble:
+            continue
+        path = inside(inspected.campaign.root, preamble, where=f"{recording.files[0]}: apertura:framing.preamble")
+        if not path.is_file():
             yield CampaignError(
                 "no such file",
-                where=inspected.campaign.root / preamble,
+                where=path,
                 expected=f"the preamble that {recording.files[0].name}: apertura:framing names",
                 remedy="Copy it there.",
             )
