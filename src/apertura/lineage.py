@@ -91,7 +91,7 @@ def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
 def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     ofdm = isinstance(campaign.settings.waveform, OfdmWaveform)
     for flight in sorted(campaign.flights, key=lambda flight: flight.kind != "calibration"):
-        for node in dict.fromkeys((flight.transmitter, *flight.nodes)) if ofdm else ():
+        for node in flight.participants if ofdm else ():
             yield from ((stage, flight.name, node) for stage in ("raw", "track"))
         yield from (("echo", flight.name, pair) for pair in flight.pairs)
         if flight.kind == "calibration":

@@ -15,7 +15,7 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.ingest import open_recording, read_track
-from apertura.settings import Flight, OfdmWaveform
+from apertura.settings import OfdmWaveform
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,7 +50,7 @@ class Inspected:
     def keys(self) -> tuple[Key, ...]:
         """Every flight and node of which samples and a log are needed."""
         flights = self.campaign.flights if self.waveform else ()
-        return tuple((flight.name, node) for flight in flights for node in participants(flight))
+        return tuple((flight.name, node) for flight in flights for node in flight.participants)
 
     @property
     def recordings(self) -> dict[Key, "Recording"]:
@@ -187,14 +187,3 @@ def in_metres(crs: str) -> bool:
     except CRSError:
         return False
     return system.is_projected and all(axis.unit_name == "metre" for axis in system.axis_info)
-
-
-def participants(flight: Flight) -> tuple[str, ...]:
-    """Return the nodes of a flight, the transmitter first, each once.
-
-    Examples
-    --------
-    >>> participants(Flight("f01", "image", "a", ("b", "a")))
-    ('a', 'b')
-    """
-    return tuple(dict.fromkeys((flight.transmitter, *flight.nodes)))

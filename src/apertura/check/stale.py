@@ -4,6 +4,7 @@ import re
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
         Read every file, also where its state is that of a hash taken before.
     """
     stale: dict[str, str] = {}
+    code = cache(code_of)  # the same for every flight and pair
     for name, result in results_of(campaign):
         path = campaign.root / result.manifest
         if not path.is_file():
@@ -43,7 +45,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
                 stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
             continue
         try:
-            reasons = list(_reasons(campaign.root, name, result, read_manifest(path), paranoid=paranoid))
+            reasons = list(_reasons(campaign.root, code(name), result, read_manifest(path), paranoid=paranoid))
         except CampaignError:
             reasons = ["its manifest is damaged"]
         if reasons or not stale.keys().isdisjoint(result.sources):
@@ -135,7 +137,7 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
 _PRODUCTS = frozenset({"export", "fused", "layers"})
 
 
-def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
+def _reasons(root: Path, code: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not {"sources", "settings", "code"} <= recorded.keys():
         yield "it does not say what it was made from"
         return
@@ -150,7 +152,7 @@ def _reasons(root: Path, name: str, result: Result, recorded: Mapping[str, Any],
             yield f"{source} has changed"
     if recorded["settings"] != result.settings_sha256:
         yield "its settings have changed"
-    if recorded["code"] != code_of(name):
+    if recorded["code"] != code:
         yield "its code has changed"
 
 

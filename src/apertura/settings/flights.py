@@ -26,6 +26,17 @@ class Flight:
     nodes: tuple[str, ...]
 
     @property
+    def participants(self) -> tuple[str, ...]:
+        """The transmitter and then the receivers, each once.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("b", "a")).participants
+        ('a', 'b')
+        """
+        return tuple(dict.fromkeys((self.transmitter, *self.nodes)))
+
+    @property
     def pairs(self) -> tuple[str, ...]:
         """Transmitter-receiver names, as folders are named."""
         return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
