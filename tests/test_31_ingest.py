@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.ingest import RECORDERS, TRACKS, open_recording, read_phase_history, read_track
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.recording import Captures, Recording
+from apertura.ingest.sample_file import SampleFile
 from apertura.ingest.track import make_track
 
 QUICK = settings(max_examples=30, deadline=None, derandomize=True)
@@ -124,6 +126,12 @@ def raw_of(*files):
     return opened.cut(opened.captures, node="a")
 
 
+def iq_of(raw):
+    """Return (channel, pulse, sample, 2) as the stage refers to them."""
+    file = SampleFile(Path(raw.attrs["samples"]), len(raw.attrs["channels"]))
+    return np.moveaxis(file.captures(raw.start.values, raw.attrs["capture_samples"]), 2, 0)
+
+
 def recording(folder, samples, captures, **header):
     data = folder / "a.sigmf-data"
     samples.astype("<i2").tofile(data)
@@ -157,7 +165,7 @@ def test_channels_are_interleaved_per_sample_and_captures_become_pulses(tmp_path
         **{"apertura:channels": ["sidelink", "radar"]},
     )
     check(raw, "raw")
-    np.testing.assert_array_equal(raw.iq.values[1, 1], samples[5:, 1])
+    np.testing.assert_array_equal(iq_of(raw)[1, 1], samples[5:, 1])
     assert raw.attrs["channels"] == ["sidelink", "radar"]
     assert raw.frame.values.tolist() == [7, -1]
     assert raw.attrs["frequency_hz"] == 1e9
@@ -177,7 +185,7 @@ def test_a_real_recording_of_another_maker_is_read(shared):
     folder = shared / "sigmf_nbiot"
     names = [folder / f"V16-beacon-NB-IoT-uplink.sigmf-{kind}" for kind in ("meta", "data")]
     raw = check(raw_of(*names), "raw")
-    assert raw.iq.shape == (1, 1, 512000, 2)
+    assert iq_of(raw).shape == (1, 1, 512000, 2)
     assert raw.attrs["sample_rate_hz"] == 640000
 
 
@@ -266,10 +274,10 @@ def test_captures_hold_their_own_samples_whatever_lies_between_them(tmp_path_fac
         for index, start in enumerate(starts[:-1])
     ]
     raw = recording(tmp_path_factory.mktemp("sigmf"), samples, captures, **{"apertura:channels": names})
-    assert raw.sizes["sample"] == length
+    assert raw.attrs["capture_samples"] == length
     for pulse, start in enumerate(starts[:-1]):
         for channel in range(channels):
-            np.testing.assert_array_equal(raw.iq.values[channel, pulse], samples[start : start + length, channel])
+            np.testing.assert_array_equal(iq_of(raw)[channel, pulse], samples[start : start + length, channel])
 
 
 def test_a_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
@@ -297,7 +305,7 @@ def test_a_recorder_of_one_file_is_one_function_and_one_row(tmp_path, monkeypatc
     opened = open_recording(Campaign(tmp_path, None, ()).recording_files("f01", "a"))
     opened.check_hash()
     raw = check(opened.cut(opened.captures, node="a"), "raw")
-    np.testing.assert_array_equal(raw.iq.values[0, 1], [[7, 8], [9, 10], [11, 12]])
+    np.testing.assert_array_equal(iq_of(raw)[0, 1], [[7, 8], [9, 10], [11, 12]])
     np.zeros(12, "<i2").tofile(path)
     for work in (opened.check_hash, lambda: opened.cut(opened.captures, node="a")):
         with pytest.raises(CampaignError, match=r"a\.toy: "):
@@ -307,7 +315,7 @@ def test_a_recorder_of_one_file_is_one_function_and_one_row(tmp_path, monkeypatc
 def open_toy_recording(path):
     time = np.array(["2025-05-14T09:30:00", "2025-05-14T09:30:01"], "datetime64[ns]")
     return Recording(
-        samples=np.memmap(path, "<i2", "r", shape=(6, 1, 2)),
+        samples=SampleFile(path, channels=1),
         channels=["radar"],
         sample_rate_hz=1e6,
         frequency_hz=1e9,

@@ -55,11 +55,17 @@ _FRAME = {
 STAGES: Mapping[str, Stage] = {
     "raw": Stage(
         {
-            "iq": Variable(("channel", "pulse", "sample", "component"), "int16", "1", "ADC counts: I, Q"),
+            "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
             "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, node's own clock"),
             "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload, -1 without"),
         },
-        {"node": "node name", "channels": "names of the channels", "sample_rate_hz": "complex samples per second"},
+        {
+            "node": "node name",
+            "samples": "the recorder's file, relative to the campaign folder: channels interleaved per sample",
+            "channels": "names of the channels",
+            "capture_samples": "samples of each capture",
+            "sample_rate_hz": "complex samples per second",
+        },
     ),
     "track": Stage(
         {

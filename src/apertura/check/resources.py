@@ -89,7 +89,7 @@ def disk_bytes(inspected: Inspected) -> dict[str, int]:
 
 
 def _bytes(recording: Recording) -> int:
-    return int(recording.samples.nbytes)
+    return len(recording.samples) * recording.samples.sample_bytes
 
 
 def _made(inspected: Inspected, stage: str, *where: str) -> bool:

@@ -4,12 +4,14 @@ The symbol repeats itself after 1/Δf and lasts longer than that, so the beginni
 end: turned by the carrier offset, and slid by the sampling offset. No code and no delay need be known.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from apertura.echo.captures import AT_ONCE, spread
 from apertura.echo.demodulate import Numerology
 from apertura.echo.resampling import Complexes, Floats
 
@@ -19,8 +21,9 @@ SIGMAS = 3.0
 AMBIGUOUS_SHARE = 0.4
 """Offsets beyond this share of Δf could as well be of the other sign: half of Δf is where they wrap."""
 
-_GROUPS = 16
-_PULSES_AT_ONCE = 64
+GROUPS = 16
+"""Parts of the flight whose scatter tells how well the clock is known."""
+
 _SMALLEST_REPEAT = 32
 
 
@@ -70,24 +73,7 @@ class ClockDecision:
 
 
 def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
-    """Measure the clock of a receiver on its sidelink.
-
-    Parameters
-    ----------
-    sidelink
-        (pulse, sample) complex64, captures from the start of the cyclic prefix to the end of the symbol
-        (T_cp + T), no longer; pulses without signal do no harm.
-    numerology
-        Of the symbol.
-
-    Raises
-    ------
-    ValueError
-        If captures hold too little of the repetition.
-
-    Notes
-    -----
-    Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
+    """Measure the clock of a receiver on the (pulse, sample) complex64 sidelink of a whole flight; as `clock_of`.
 
     Examples
     --------
@@ -98,19 +84,45 @@ def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
     >>> round(clock.cfo_hz), round(clock.sfo_ppm), clock.one_clock
     (5000, 0, False)
     """
+    groups = spread(len(sidelink), groups=GROUPS, each=len(sidelink))
+    return clock_of((sidelink[some] for some in groups), numerology, pulses=len(sidelink))
+
+
+def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int) -> ClockOffset:
+    """Measure the clock of a receiver on its sidelink.
+
+    Parameters
+    ----------
+    groups
+        (pulse, sample) complex64 each, captures from the start of the cyclic prefix to the end of the symbol
+        (T_cp + T), no longer, amid equal parts of the flight; pulses without signal do no harm.
+    numerology
+        Of the symbol.
+    pulses
+        Of the whole flight.
+
+    Raises
+    ------
+    ValueError
+        If captures hold too little of the repetition.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
+    """
     period_s = 1 / numerology.spacing_hz
-    frequency_hz, groups = _repetition(sidelink, numerology)
-    phase, slope, centre_hz = _phase_and_slope(groups.sum(0), frequency_hz, start=(0.0, 0.0))
-    parts = np.array([_phase_and_slope(group, frequency_hz, start=(phase, slope))[:2] for group in groups])
-    growth, phase_std = _line(parts[:, 0])
+    frequency_hz, parts = _repetition(groups, numerology)
+    phase, slope, centre_hz = _phase_and_slope(parts.sum(0), frequency_hz, start=(0.0, 0.0))
+    fits = np.array([_phase_and_slope(part, frequency_hz, start=(phase, slope))[:2] for part in parts])
+    growth, phase_std = _line(fits[:, 0])
     ppm = 1e6 / (2 * np.pi * period_s)
-    sfo_ppm, sfo_std_ppm = -slope * ppm, _line(parts[:, 1])[1] * ppm
+    sfo_ppm, sfo_std_ppm = -slope * ppm, _line(fits[:, 1])[1] * ppm
     joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock feeds both
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
     return ClockOffset(
         cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
-        cfo_slope_hz=-growth * len(groups) / (2 * np.pi * period_s * len(sidelink)),
+        cfo_slope_hz=-growth * len(parts) / (2 * np.pi * period_s * pulses),
         sfo_ppm=sfo_ppm,
         cfo_std_hz=phase_std / (2 * np.pi * period_s),
         sfo_std_ppm=sfo_std_ppm,
@@ -177,29 +189,32 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology)
     return float(10 * np.log10(max(2 * lost / numerology.numbers.size, 1e-30)))
 
 
-def _repetition(sidelink: Complexes, numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
+def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
     """Return occupied frequencies and, per group of pulses, the cross-spectrum of the end with its first copy."""
+    crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
+    size = crosses[0].size
+    lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
+    frequency_hz = (
+        fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
+    ) % numerology.sample_rate_hz + lowest_hz
+    occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
+    return frequency_hz[occupied], np.array(crosses)[:, occupied]
+
+
+def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.complex128]:
     period, prefix, count = numerology.dft_samples, numerology.prefix_samples, sidelink.shape[1]
     start = prefix if count - period - prefix >= prefix // 2 else prefix // 2
     length = count - period - start
     if length < _SMALLEST_REPEAT:
         raise ValueError(f"captures of {count} samples repeat only {length} of them; {_SMALLEST_REPEAT} are needed")
     size = fft.next_fast_len(length)
-    lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
-    frequency_hz = (
-        fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
-    ) % numerology.sample_rate_hz + lowest_hz
-    occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
-    groups = []
-    for pulses in np.array_split(sidelink, min(_GROUPS, len(sidelink))):
-        cross = np.zeros(size, np.complex128)
-        for first in range(0, len(pulses), _PULSES_AT_ONCE):
-            block = pulses[first : first + _PULSES_AT_ONCE].astype(np.complex128)
-            early = fft.fft(block[:, start : start + length], size, axis=1)
-            late = fft.fft(block[:, start + period : start + period + length], size, axis=1)
-            cross += (late * early.conj()).sum(0)
-        groups.append(cross[occupied])
-    return frequency_hz[occupied], np.array(groups)
+    cross = np.zeros(size, np.complex128)
+    for first in range(0, len(sidelink), AT_ONCE):
+        block = sidelink[first : first + AT_ONCE].astype(np.complex128)
+        early = fft.fft(block[:, start : start + length], size, axis=1)
+        late = fft.fft(block[:, start + period : start + period + length], size, axis=1)
+        cross += (late * early.conj()).sum(0)
+    return cross
 
 
 def _phase_and_slope(

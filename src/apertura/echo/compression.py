@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.phasors import phasors, turned
 from apertura.interpolation import kaiser_window
 
 _PULSES_AT_ONCE = 32  # which the caches hold
@@ -129,10 +130,10 @@ def compress(
         part = slice(first, min(first + _PULSES_AT_ONCE, len(transfer)))
         here = weighted[: part.stop - first]
         np.multiply(transfer[part], weight.astype(np.float32), out=here[:, : len(frequency_hz)])
-        taps = filters * _phasors(turns[part], factor)[:, :, None]
+        taps = filters * phasors(turns[part], factor)[:, :, None]
         sums = here.reshape(len(here), blocks, factor) @ taps
-        start = _turned(carrier[part], -middle * turns[part])
-        sums *= (_phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
+        start = turned(carrier[part], -middle * turns[part])
+        sums *= (phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
         spectrum = np.zeros((len(here), length // factor), np.complex64)
         for tap in range(filters.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
@@ -150,7 +151,7 @@ def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.c
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]
     factors = [n for n in factors if length // n >= max(_ROOM * count, -(-subcarriers // n) + _TAPS - 1)]
     if not factors:
-        return np.ones((1, 1), np.complex64), _turned(np.ones(count), -middle * after / length)
+        return np.ones((1, 1), np.complex64), turned(np.ones(count), -middle * after / length)
     factor, reach = factors[-1], _TAPS // 2
     beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
 
@@ -160,15 +161,4 @@ def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.c
     wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
     response = 1 / (wave @ (weights * _TAPS / 2 * kaiser_window(nodes, beta)))
     delay = (factor - 1) / 2 - middle - factor * reach
-    return taps.astype(np.complex64), _turned(response, delay * after / length)
-
-
-def _turned(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    return np.asarray(values * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)
-
-
-def _phasors(turns: NDArray[np.float64], count: int) -> NDArray[np.complex64]:
-    """Return (pulse, count) exp(j2π·turns·n), as products of coarse and fine ones: exponentials cost most."""
-    side = int(np.ceil(np.sqrt(count)))
-    fine, coarse = (_turned(np.ones(1), turns[:, None] * step * np.arange(side)) for step in (1, side))
-    return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
+    return taps.astype(np.complex64), turned(response, delay * after / length)

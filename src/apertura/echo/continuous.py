@@ -2,16 +2,24 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.echo.framing import Framing
-from apertura.echo.trigger import Samples, find_preambles
+from apertura.echo.trigger import find_preambles
 
 _SAMPLES_AT_ONCE = 2**18
 _BITS = 16
+
+
+class Samples(Protocol):
+    """(sample, 2) int16, I and Q: an array, or what reads slices of one from a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, span: slice, /) -> NDArray[np.int16]: ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ def trigger_captures(
     Parameters
     ----------
     samples
-        (sample, 2) int16, I and Q of the trigger's channel; may be memory-mapped, is read in blocks.
+        (sample, 2) int16, I and Q of the trigger's channel; read in blocks.
     framing, symbol_samples, false_alarms_per_s
         As for `find_preambles`.
     """
@@ -65,6 +73,6 @@ def trigger_captures(
     return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
 
 
-def _blocks(samples: Samples) -> Iterator[Samples]:
+def _blocks(samples: Samples) -> Iterator[NDArray[np.int16]]:
     for start in range(0, len(samples), _SAMPLES_AT_ONCE):
         yield samples[start : start + _SAMPLES_AT_ONCE]

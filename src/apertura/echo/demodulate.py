@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from apertura.echo.phasors import phasors, turned
+
 _PULSES_AT_ONCE = 64
 
 
@@ -109,10 +111,14 @@ def remove_path(
 ) -> NDArray[np.complex64]:
     """Return (pulse, subcarrier) `transfer` with a delay per pulse taken off every echo: times exp(+j2πf·delay).
 
+    Frequencies (subcarrier,) ascend in equal steps.
+
     Examples
     --------
     >>> remove_path(np.ones((1, 2), np.complex64), np.array([1e9, 2e9]), delay_s=np.array([0.25e-9])).round(6)
     array([[ 0.+1.j, -1.+0.j]], dtype=complex64)
     """
-    turns = delay_s[:, None] * frequency_hz[None, :]
-    return np.asarray(transfer * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)
+    count = len(frequency_hz)
+    spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
+    along = phasors(delay_s * spacing_hz, count)
+    return transfer * along * turned(np.ones(1), delay_s * frequency_hz[0])[:, None]

@@ -23,7 +23,7 @@ FIT_SNR_DB = 13.4
 """Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
-_Inverse = Callable[[Complexes, LineOfSight], NDArray[np.complex128]]
+_Inverse = Callable[[Complexes, LineOfSight], Complexes]
 
 
 def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
@@ -51,7 +51,7 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     array([6., 6., 6.], dtype=float32)
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         return _bounded_inverse(symbols, _amplitude(symbols, path))
 
     return _correct(radar, sidelink, path, inverse)
@@ -68,13 +68,13 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     SNR/(SNR + 1).
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         amplitude = _amplitude(symbols, path)
         noise = np.where(path.locked, path.noise_power, 0.0)[:, None]  # without lock the noise is unknown
         weakest = _weakest(amplitude)
         regular = symbols.conj() * amplitude / np.maximum(np.abs(symbols) ** 2 + noise, weakest**2)
         kept = np.abs((regular * phasor(path, symbols.shape[1])).mean(1, keepdims=True))
-        return np.asarray(np.where(path.locked[:, None], regular / np.maximum(kept, 1e-30), regular))
+        return np.asarray(np.where(path.locked[:, None], regular / np.maximum(kept, 1e-30), regular), np.complex64)
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -89,13 +89,13 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
     Source: docs/theory/echo_methods.md, "Corrections". Of the noise, 33 cells of N stay.
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         subcarriers = symbols.shape[1]
         direct = phasor(path, subcarriers)
         profile = fft.ifft(symbols * direct.conj(), axis=1)
         profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # nothing to cut below 33 subcarriers
         clean = fft.fft(profile, axis=1) * direct
-        return _bounded_inverse(clean, path.amplitude[:, None])
+        return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
 
     return _correct(radar, sidelink, path, inverse)
 
@@ -110,7 +110,7 @@ def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | Non
     Source: docs/theory/echo_methods.md, "Two parameters of a pulse".
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> NDArray[np.complex128]:
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         return phasor(path, symbols.shape[1]).conj()
 
     return _correct(radar, sidelink, path, inverse)
@@ -182,20 +182,22 @@ def _gain_db(state: SidelinkState, cells: int) -> float:
     return state.snr_db + 10 * float(np.log10(state.subcarriers / min(cells, state.subcarriers)))
 
 
-def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float64]:
+def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:
     """Return (pulse, 1) amplitude of the direct path, or of all that arrives where it did not lock."""
     rms = np.sqrt(np.mean(np.abs(symbols) ** 2, axis=1))
-    return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float64)
+    return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float32)
 
 
-def _bounded_inverse(symbols: NDArray[np.complexfloating], amplitude: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _bounded_inverse(symbols: Complexes, amplitude: NDArray[np.float32]) -> Complexes:
     """Return A/S, where |S| counts as no weaker than `_weakest`."""
-    return np.asarray(symbols.conj() * amplitude / np.maximum(np.abs(symbols), _weakest(amplitude)) ** 2, np.complex128)
+    power = np.square(symbols.real) + np.square(symbols.imag)
+    scale = amplitude / np.maximum(power, np.square(_weakest(amplitude)))
+    return np.asarray(symbols.conj() * scale, np.complex64)
 
 
-def _weakest(amplitude: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the |S| below which a subcarrier is attenuated instead of divided; never zero."""
-    return np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-30)
+def _weakest(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the |S| below which a subcarrier is attenuated instead of divided; never zero, nor is its square."""
+    return np.asarray(np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-15), np.float32)
 
 
 def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, inverse: _Inverse) -> Complexes:

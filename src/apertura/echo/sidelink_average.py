@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
-from apertura.echo.line_of_sight import Complexes, Floats, LineOfSight, phasor
+from apertura.echo.line_of_sight import Complexes, Floats, LineOfSight
 
 
 class SidelinkAverage(NamedTuple):
@@ -21,27 +20,49 @@ class SidelinkAverage(NamedTuple):
     second_power: float
 
 
-def average_pulses(sidelink: Complexes, path: LineOfSight) -> SidelinkAverage:
-    """Return the average of the locked pulses of a sidelink, (pulse, subcarrier) complex64; `path` is the direct."""
-    locked, subcarriers = np.flatnonzero(path.locked), sidelink.shape[1]
-    power, spectrum, mean = np.zeros(subcarriers), np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
-    cells, levels = [], []
-    for first in range(0, locked.size, 64):
-        some = locked[first : first + 64]
-        direct = path.select(some)
-        aligned = sidelink[some] * phasor(direct, subcarriers).conj() / direct.amplitude[:, None]
-        profile = fft.ifft(aligned, axis=1)
-        profile_power = np.abs(profile) ** 2
-        power += profile_power.sum(0)
-        mean += profile.sum(0)
-        spectrum += (np.abs(aligned) ** 2).sum(0)
-        cells.append(profile_power[:, 2:-1].argmax(1) + 2)
-        levels.append(profile_power[:, 2:-1].max(1))
-    level = np.concatenate(levels)
-    typical = int(np.argsort(level)[level.size // 2])
-    noise = float(np.mean(path.noise_power[locked] / path.amplitude[locked] ** 2)) / subcarriers
-    count = locked.size
-    second_cell = int(np.concatenate(cells)[typical])
-    return SidelinkAverage(
-        count, noise, power / count, mean / count, spectrum / count, second_cell, float(level[typical])
-    )
+class Averaging:
+    """Sums over the locked pulses, block by block.
+
+    Parameters
+    ----------
+    subcarriers
+        Of the sidelink, and cells of its profile.
+    """
+
+    def __init__(self, subcarriers: int) -> None:
+        self._power, self._spectrum = np.zeros(subcarriers), np.zeros(subcarriers)
+        self._mean = np.zeros(subcarriers, np.complex128)
+        self._noise: list[Floats] = []
+        self._cells: list[NDArray[np.intp]] = []
+        self._levels: list[NDArray[np.float32]] = []
+
+    def add(self, sidelink: Complexes, path: LineOfSight, profile: Complexes) -> None:
+        """Add some pulses, (pulse, subcarrier), their direct path, and their aligned profile, (pulse, cell)."""
+        locked = path.locked
+        if not locked.any():
+            return
+        direct = path.select(locked)
+        size = 1 / direct.amplitude
+        turned = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
+        unit = profile[locked] * turned[:, None]
+        power = np.square(unit.real) + np.square(unit.imag)
+        self._power += power.sum(0)
+        self._mean += unit.sum(0)
+        self._spectrum += (np.square(np.abs(sidelink[locked])) * np.square(size)[:, None]).sum(0)
+        self._noise.append(direct.noise_power * np.square(size))
+        self._cells.append(power[:, 2:-1].argmax(1) + 2)
+        self._levels.append(power[:, 2:-1].max(1))
+
+    def result(self) -> SidelinkAverage:
+        """Return the average of what was added, at least one pulse."""
+        level, noise = np.concatenate(self._levels), np.concatenate(self._noise)
+        typical, count = int(np.argsort(level, kind="stable")[level.size // 2]), level.size
+        return SidelinkAverage(
+            count,
+            float(np.mean(noise)) / self._power.size,
+            self._power / count,
+            self._mean / count,
+            self._spectrum / count,
+            int(np.concatenate(self._cells)[typical]),
+            float(level[typical]),
+        )

@@ -1,14 +1,15 @@
 """State of a sidelink: its SNR, echoes and ripple, and the pulses in which it locks."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv
 
-from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_line_of_sight
-from apertura.echo.sidelink_average import SidelinkAverage, average_pulses
+from apertura.echo.captures import AT_ONCE
+from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_block, joined
+from apertura.echo.sidelink_average import Averaging, SidelinkAverage
 from apertura.errors import CampaignError
 
 GATE_CELLS = 16
@@ -78,7 +79,30 @@ class SidelinkState:
 
 
 def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
-    """Measure the sidelink of a flight, (pulse, subcarrier) complex64, the code removed; errors call it `where`.
+    """Measure the sidelink of a flight, (pulse, subcarrier) complex64, the code removed; as `measure_blocks`.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
+    >>> state = measure((10 + noise[0] + 1j * noise[1]).astype(np.complex64))
+    >>> round(state.snr_db), state.echo_cells, state.locked.all()
+    (17, 0, np.True_)
+    """
+    return measure_blocks(
+        lambda: (sidelink[first : first + AT_ONCE] for first in range(0, len(sidelink), AT_ONCE)), where
+    )
+
+
+def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "sidelink") -> SidelinkState:
+    """Measure the sidelink of a flight, block by block.
+
+    Parameters
+    ----------
+    blocks
+        Gives the sidelink from its beginning, (pulse, subcarrier) complex64 each, the code removed; asked once, and
+        once more where no pulse locks.
+    where
+        What to call the recording in errors.
 
     Raises
     ------
@@ -88,27 +112,32 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     Notes
     -----
     Source: docs/theory/echo_methods.md, "State of a sidelink".
-
-    Examples
-    --------
-    >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
-    >>> state = measure((10 + noise[0] + 1j * noise[1]).astype(np.complex64))
-    >>> round(state.snr_db), state.echo_cells, state.locked.all()
-    (17, 0, np.True_)
     """
-    path = fit_line_of_sight(sidelink)
-    if not path.locked.any():
-        return _measure_without_code(sidelink, path, where)
-    average = average_pulses(sidelink, path)
+    averaging: Averaging | None = None
+    paths = []
+    for block in blocks():
+        averaging = averaging or Averaging(block.shape[1])
+        direct, profile = fit_block(block)
+        averaging.add(block, direct, profile)
+        paths.append(direct)
+    path = joined(paths)
+    if averaging is None or not path.locked.any():
+        return _measure_without_code(blocks, path, where)
+    return _state_of(path, averaging.result())
+
+
+def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
+    """Return the state of a sidelink from its direct path and the average of its locked pulses."""
+    subcarriers = average.power.size
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
     echo_db, echo_cells = _strongest_echo(average)
     # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
     ripple_db, ripple_cells, fine_ripple_db = _ripple(
         average, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB)
     )
-    flat = average.spectrum - average.noise * sidelink.shape[1]
+    flat = average.spectrum - average.noise * subcarriers
     state = SidelinkState(
-        subcarriers=sidelink.shape[1],
+        subcarriers=subcarriers,
         snr_db=_db(snr),
         echo_db=echo_db,
         echo_cells=echo_cells,
@@ -186,18 +215,19 @@ def _db(power: float) -> float:
     return float(10 * np.log10(max(power, 1e-30)))
 
 
-def _measure_without_code(sidelink: Complexes, path: LineOfSight, where: str) -> SidelinkState:
+def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineOfSight, where: str) -> SidelinkState:
     """Tell a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink at all."""
-    common = fit_line_of_sight(np.asarray(sidelink[1:] * sidelink[:-1].conj(), np.complex64))
-    if common.locked.mean() < 0.5 or not common.locked.size:
+    pulses = path.locked.size
+    common = joined([fit_block(products)[0] for products in _neighbours(blocks())] or [path.select(slice(0))])
+    if not common.locked.size or common.locked.mean() < 0.5:
         raise CampaignError(
-            f"a sidelink that locks in none of {len(sidelink)} pulses",
+            f"a sidelink that locks in none of {pulses} pulses",
             where=where,
             expected="the direct path of the transmitter above the noise",
             remedy="Check antenna and gain of the sidelink and which channel it was recorded on.",
         )
     product = float(np.median((common.amplitude**2 / np.maximum(common.noise_power, 1e-30))[common.locked]))
-    locked = np.zeros(len(sidelink), bool)
+    locked = np.zeros(pulses, bool)
     locked[1:] |= common.locked
     locked[:-1] |= common.locked
     snr_db = _db(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
@@ -206,7 +236,18 @@ def _measure_without_code(sidelink: Complexes, path: LineOfSight, where: str) ->
         "one, monostatic images of the transmitter are wrong"
     )
     flags = {"wrong_code": line}
-    return SidelinkState(sidelink.shape[1], snr_db, -300.0, 0, False, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
+    subcarriers = next(iter(blocks())).shape[1]
+    return SidelinkState(subcarriers, snr_db, -300.0, 0, False, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
+
+
+def _neighbours(blocks: Iterable[Complexes]) -> Iterator[Complexes]:
+    """Yield each pulse times the conjugate of the one before it, across blocks."""
+    last: Complexes | None = None
+    for block in blocks:
+        some = block if last is None else np.concatenate([last, block])
+        if len(some) > 1:
+            yield np.asarray(some[1:] * some[:-1].conj(), np.complex64)
+        last = some[-1:]
 
 
 def _flags(state: SidelinkState) -> dict[str, str]:

@@ -1,6 +1,10 @@
-"""Captures of a pair become transfer functions: by the code alone, or against the sidelink."""
+"""Captures of a pair become transfer functions: by the code alone, or against the sidelink.
 
-from collections.abc import Mapping
+In two passes: the first finds what a flight's captures have in common and a few numbers per pulse, the second forms
+transfer functions, block by block. No more than a block of captures is held, however long the flight is.
+"""
+
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,17 +13,18 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
-from apertura.echo.captures import saturation_flags
-from apertura.echo.clock import decide_clock, estimate_clock
+from apertura.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, spread
+from apertura.echo.clock import GROUPS, ClockOffset, clock_of, decide_clock
 from apertura.echo.code_check import CodeEvidence, own_code
 from apertura.echo.demodulate import Numerology, demodulate
 from apertura.echo.phase_check import phase_stability
 from apertura.echo.resampling import Complexes, Floats, correct_clock
 from apertura.echo.second_path import second_path_flags
 from apertura.echo.sidelink import METHODS, choose, edges
-from apertura.echo.sidelink_state import SidelinkState, measure
+from apertura.echo.sidelink_state import SidelinkState, measure_blocks
 
-Samples = NDArray[np.int16]
+_STRETCH = 128  # neighbouring pulses that own code and phase are looked for in
+_CLOCK_STRETCH = 256
 
 
 @dataclass(frozen=True)
@@ -28,50 +33,77 @@ class Transfer:
 
     Attributes
     ----------
-    transfer
-        (pulse, subcarrier) complex64, the code removed; electrical paths are still in it.
     kept
-        (capture,) bool, the captures that `transfer` holds.
+        (capture,) bool, the captures that measured something.
     flags
         Edge crossed → what was measured, in one line.
     report
         What was decided on the way and why: clock, sidelink, code.
     sidelink_delay_m
-        (pulse,) float64, measured delay of the sidelink times c in the pulses kept, metres; NaN where it did not lock,
-        None without a sidelink.
+        (pulse,) float64, measured delay of the sidelink times c in the captures kept, metres; NaN where it did not
+        lock, None without a sidelink.
+    form
+        Numbers of a few captures, ascending → their transfer functions, (pulse, subcarrier) complex64. The code is
+        removed; electrical paths are still in them.
+    saturation
+        Of the samples that transfer functions were formed from so far.
     """
 
-    transfer: Complexes
     kept: NDArray[np.bool_]
     flags: dict[str, str]
     report: dict[str, Any]
-    sidelink_delay_m: Floats | None = None
+    sidelink_delay_m: Floats | None
+    form: Callable[[Pulses], Complexes]
+    saturation: Saturation
 
 
-def transfer_by_code(radar: Samples, codes: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
+def transfer_by_code(read: Read, codes: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
     """Return what a node received of its own pulses, whose clock is the transmitter's.
 
-    `radar` holds (capture, sample, 2) int16 I and Q from the start of the cyclic prefix, `codes` (subcarrier,) what was
-    sent, complex64, `time_s` (capture,) float64 when, seconds of any origin.
+    Parameters
+    ----------
+    read
+        Reads `radar`.
+    codes, numerology
+        (subcarrier,) complex64 as transmitted, and the grid of the symbol.
+    time_s
+        (capture,) float64, when each was sent, seconds of any origin.
+
+    Notes
+    -----
+    Code and phase are looked at in up to 2048 captures, 16 stretches spread over the flight.
 
     Examples
     --------
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> abs(transfer_by_code(iq, np.full(8, 2, np.complex64), numerology, time_s=np.zeros(1)).transfer).round(0)
+    >>> measured = transfer_by_code(lambda some: {"radar": iq[some]}, np.full(8, 2, np.complex64), numerology,
+    ...                             time_s=np.zeros(1))
+    >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
-    transfer = demodulate(_complex(radar), numerology) / codes
-    code = own_code(transfer, prefix_cells=numerology.prefix_cells)
-    phase = phase_stability(transfer, time_s, prefix_cells=numerology.prefix_cells)
-    flags = {**saturation_flags({"radar": radar}), **code.flags, **(phase.flags if phase else {})}
+    saturation, inverse = Saturation(), 1 / codes
+
+    def demodulated(radar: Samples) -> Complexes:
+        return demodulate(as_complex(radar), numerology) * inverse
+
+    def form(captures: Pulses) -> Complexes:
+        radar = read(captures)["radar"]
+        saturation.count({"radar": radar})
+        return demodulated(radar)
+
+    some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
+    sample = np.concatenate([demodulated(read(block)["radar"]) for block in blocks_of(some)])
+    code = own_code(sample, prefix_cells=numerology.prefix_cells)
+    phase = phase_stability(sample, time_s[some], prefix_cells=numerology.prefix_cells)
+    flags = {**code.flags, **(phase.flags if phase else {})}
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
-    return Transfer(transfer, np.ones(len(radar), bool), flags, report)
+    return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
 
 
 def transfer_by_sidelink(
-    iq: Mapping[str, Samples],
+    read: Read,
     codes: Complexes,
     numerology: Numerology,
     *,
@@ -85,8 +117,8 @@ def transfer_by_sidelink(
 
     Parameters
     ----------
-    iq
-        radar, sidelink → (capture, sample, 2) int16 I and Q, from near the start of the cyclic prefix.
+    read
+        Reads `radar` and `sidelink`.
     codes, numerology
         (subcarrier,) complex64 as transmitted, and the grid of the symbol.
     symbol_samples
@@ -107,63 +139,93 @@ def transfer_by_sidelink(
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md.
+    Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
+    flight, the state of the sidelink on all.
     """
-    captures = {name: _complex(samples[:, :symbol_samples]) for name, samples in iq.items()}
-    captures, clock, clock_flags = _clock_corrected(captures, numerology, accuracy_db)
-    radar, sidelink = (demodulate(captures[name], numerology) / codes for name in ("radar", "sidelink"))
-    state = measure(sidelink, where=f"{where}: sidelink")
+    receiver = _Receiver.measured(read, codes, numerology, symbol_samples, len(sidelink_m), accuracy_db)
+    every = np.arange(len(sidelink_m))
+    state = measure_blocks(
+        lambda: (receiver.channel("sidelink", some) for some in blocks_of(every)), f"{where}: sidelink"
+    )
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
-    locked, cell_m = state.locked, SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
+    cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     residual = baseline_residual(delay_m, sidelink_m)
     suspect = detect_wrong_association(residual)
     flags = {
-        **saturation_flags(iq),
-        **clock_flags,
+        **receiver.flags,
         **state.flags,
         **edges(chosen, state),
         **second_path_flags(state, cell_m=cell_m),
         **({"association_suspect": suspect} if suspect else {}),
     }
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
-    return Transfer(
-        METHODS[chosen](radar[locked], sidelink[locked], state.path.select(locked)),
-        locked,
-        flags,
-        {"clock": clock, "sidelink": quality, "code": _sidelink_code(state).report},
-        delay_m[locked],
-    )
+    saturation = Saturation()
+
+    def form(captures: Pulses) -> Complexes:
+        iq = read(captures)
+        saturation.count(iq)
+        radar, sidelink = (receiver.received(iq[name], captures) for name in ("radar", "sidelink"))
+        return METHODS[chosen](radar, sidelink, state.path.select(captures))
+
+    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
+    return Transfer(state.locked, flags, report, delay_m[state.locked], form, saturation)
 
 
-def _complex(iq: Samples) -> Complexes:
+def as_complex(iq: Samples) -> Complexes:
+    """Return (…, 2) int16 I and Q as complex64."""
     return np.ascontiguousarray(iq, np.float32).view(np.complex64)[..., 0]
 
 
-def _clock_corrected(
-    captures: dict[str, Complexes], numerology: Numerology, accuracy_db: float
-) -> tuple[dict[str, Complexes], dict[str, Any], dict[str, str]]:
-    """Correct the receiver's clock in the samples where it matters; return also what was decided, and flags."""
-    try:
-        clock = estimate_clock(captures["sidelink"], numerology)
-    except ValueError as error:
-        return captures, {"corrected": False, "reason": str(error)}, {"clock_unmeasured": str(error)}
-    decision = decide_clock(clock, numerology, accuracy_db=accuracy_db)
-    ppm, std_ppm = clock.ppm(numerology)
-    report = {
-        "corrected": decision.correct,
-        "reason": decision.reason,
-        "floor_db": round(decision.floor_db, 2),
-        "ppm": round(ppm, 4),
-        "std_ppm": None if std_ppm is None else round(std_ppm, 4),
-    }
-    if decision.correct:
-        cfo_hz = clock.cfo_of_pulses_hz(len(captures["sidelink"]))
-        captures = {
-            name: correct_clock(samples, numerology, cfo_hz=cfo_hz, sfo_ppm=clock.sfo_ppm)
-            for name, samples in captures.items()
+@dataclass(frozen=True)
+class _Receiver:
+    """How captures of a node with its own clock become symbols: as they are, or with its clock corrected."""
+
+    read: Read
+    codes: Complexes
+    numerology: Numerology
+    symbol_samples: int
+    clock: ClockOffset | None  # to be corrected
+    cfo_hz: Floats
+    report: dict[str, Any]
+    flags: dict[str, str]
+
+    @classmethod
+    def measured(
+        cls, read: Read, codes: Complexes, numerology: Numerology, symbol_samples: int, count: int, accuracy_db: float
+    ) -> "_Receiver":
+        """Measure the clock, and decide whether it is corrected in the samples."""
+        groups = spread(count, groups=GROUPS, each=_CLOCK_STRETCH)
+        sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :symbol_samples]) for some in groups)
+        kept = read, codes, numerology, symbol_samples
+        try:
+            clock = clock_of(sidelink, numerology, pulses=count)
+        except ValueError as error:
+            report = {"corrected": False, "reason": str(error)}
+            return cls(*kept, None, np.zeros(count), report, {"clock_unmeasured": str(error)})
+        decision = decide_clock(clock, numerology, accuracy_db=accuracy_db)
+        ppm, std_ppm = clock.ppm(numerology)
+        report = {
+            "corrected": decision.correct,
+            "reason": decision.reason,
+            "floor_db": round(decision.floor_db, 2),
+            "ppm": round(ppm, 4),
+            "std_ppm": None if std_ppm is None else round(std_ppm, 4),
         }
-    return captures, report, decision.flags
+        cfo_hz = clock.cfo_of_pulses_hz(count)
+        return cls(*kept, clock if decision.correct else None, cfo_hz, report, decision.flags)
+
+    def channel(self, name: str, captures: Pulses) -> Complexes:
+        """Return the symbols of a channel, (pulse, subcarrier) complex64, the code removed."""
+        return self.received(self.read(captures)[name], captures)
+
+    def received(self, iq: Samples, captures: Pulses) -> Complexes:
+        """Return the symbols of some captures' samples."""
+        samples = as_complex(iq[:, : self.symbol_samples])
+        if self.clock is not None:
+            cfo_hz = self.cfo_hz[captures]
+            samples = correct_clock(samples, self.numerology, cfo_hz=cfo_hz, sfo_ppm=self.clock.sfo_ppm)
+        return demodulate(samples, self.numerology) * (1 / self.codes)
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What every recorder's files become: memory-mapped samples, captures in UTC, and what was sent before each symbol."""
+"""What every recorder's files become: samples to be read, captures in UTC, and what was sent before each symbol."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,6 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
+from apertura.ingest.sample_file import SampleFile
+
+_BLOCK_BYTES = 8 << 20
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Recording:
     Attributes
     ----------
     samples
-        (sample, channel, 2) int16 I and Q, memory-mapped.
+        The file of I and Q.
     sample_rate_hz, frequency_hz
         Complex samples per second and RF frequency at baseband zero.
     captures
@@ -55,7 +58,7 @@ class Recording:
         Of the file of samples as the recorder stated it.
     """
 
-    samples: NDArray[np.int16]
+    samples: SampleFile
     channels: list[str]
     sample_rate_hz: float
     frequency_hz: float
@@ -84,33 +87,43 @@ class Recording:
             )
 
     def cut(self, captures: Captures, *, node: str) -> xr.Dataset:
-        """Return the `raw` stage of some captures of a node: iq, int16 counts, with UTC time and frame of each pulse.
+        """Return the `raw` stage of some captures of a node: where they lie in the file, with UTC time and frame.
+
+        Every sample of them is read once.
 
         Raises
         ------
         CampaignError
-            If a capture holds only zeros.
+            If a capture holds only zeros, or the file ends before the last.
         """
-        iq = np.stack([self.samples[start : start + captures.length] for start in captures.start])
-        for index, name in enumerate(self.channels):
-            dead = np.flatnonzero(~iq[:, :, index].any(axis=(1, 2)))
-            if dead.size:
-                raise CampaignError(
-                    f"{dead.size} captures of channel {name} hold only zeros, first capture {int(dead[0])}",
-                    self.files[-1],
-                    "samples",
-                    "The receiver or the copy failed; record or copy again, or remove those captures.",
-                )
+        self._check_alive(captures)
         return xr.Dataset(
             {
-                "iq": (("channel", "pulse", "sample", "component"), np.moveaxis(iq, 2, 0)),
+                "start": ("pulse", captures.start),
                 "time": ("pulse", captures.time),
                 "frame": ("pulse", captures.frame),
             },
             attrs={
                 "node": node,
+                "samples": str(self.samples.path),
                 "channels": self.channels,
+                "capture_samples": captures.length,
                 "sample_rate_hz": self.sample_rate_hz,
                 "frequency_hz": self.frequency_hz,
             },
         )
+
+    def _check_alive(self, captures: Captures) -> None:
+        dead: list[NDArray[np.bool_]] = []
+        at_once = max(1, _BLOCK_BYTES // (captures.length * self.samples.sample_bytes))
+        for first in range(0, len(captures.start), at_once):
+            iq = self.samples.captures(captures.start[first : first + at_once], captures.length)
+            dead.append(np.asarray(~iq.any(axis=(1, 3))))
+        for name, silent in zip(self.channels, np.concatenate(dead).T, strict=True):
+            if silent.any():
+                raise CampaignError(
+                    f"{silent.sum()} captures of channel {name} hold only zeros, first capture {int(silent.argmax())}",
+                    self.files[-1],
+                    "samples",
+                    "The receiver or the copy failed; record or copy again, or remove those captures.",
+                )

@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field, ValidationError
 from apertura.documents import read_text
 from apertura.errors import CampaignError, quoted
 from apertura.ingest.recording import Captures, Recording
+from apertura.ingest.sample_file import SampleFile
 from apertura.ingest.times import utc_times
 
 _DATATYPE = "ci16_le"
@@ -79,7 +80,7 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
     meta = _read_meta(meta_path)
     header, captures = meta.header, meta.captures
     channels = _channels(header, meta_path)
-    samples = _map(data_path, len(channels), captures, meta_path)
+    samples = _samples(data_path, len(channels), captures, meta_path)
     return Recording(
         samples=samples,
         channels=channels,
@@ -145,7 +146,7 @@ def _channels(header: _Global, path: Path) -> list[str]:
     return names
 
 
-def _map(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -> NDArray[np.int16]:
+def _samples(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -> SampleFile:
     if not path.is_file():
         raise CampaignError("no such file", path, f"the samples of {meta_path.name}", "Copy it there.")
     size, frame = path.stat().st_size, channels * _BYTES_PER_SAMPLE
@@ -163,7 +164,7 @@ def _map(path: Path, channels: int, captures: list[_Capture], meta_path: Path) -
             f"captures inside {path.name}",
             "The data are truncated or the metadata belong to another file; copy both again.",
         )
-    return np.memmap(path, np.dtype("<i2"), "r", shape=(size // frame, channels, 2))
+    return SampleFile(path, channels)
 
 
 def _length(captures: list[_Capture], total: int, path: Path) -> int:

@@ -1,5 +1,6 @@
 """What one node recorded in one flight: its samples by channel and its antennas by pulse."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,12 +12,16 @@ from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.digests import digest_of
 from apertura.echo.association import Association, associate
+from apertura.echo.captures import Read
 from apertura.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.errors import CampaignError
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.geometry.track_checks import CheckedTrack, check_track
+from apertura.ingest.sample_file import SampleFile
 from apertura.ingest.track import FIXES
+from apertura.paths import inside
 from apertura.settings import Node, OfdmWaveform
 from apertura.store import open_stage
 
@@ -33,6 +38,8 @@ class Acquisition:
         Of the node.
     raw, track
         Its stages.
+    samples
+        The recorder's file.
     files
         raw/<flight>/<node>, what its files' names begin with.
     recording, log
@@ -45,37 +52,51 @@ class Acquisition:
     raw: xr.Dataset
     track: xr.Dataset
     settings: Node
+    samples: SampleFile
     files: Path
     recording: str
     log: str
     numerology: Numerology
 
-    def captures(self, channel: str, pulses: NDArray[np.int64]) -> NDArray[np.int16]:
-        """Return the samples of a channel at some pulses, (pulse, sample, 2) int16.
+    def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
+        """Return what reads channels of some captures from the recorder's file, a block of them at a time.
+
+        Parameters
+        ----------
+        channels
+            Names.
+        pulses
+            (capture,) int64, which captures of the recording; they are then asked for by their place here.
 
         Raises
         ------
         CampaignError
-            If the channel was not recorded, or captures are shorter than prefix and DFT window.
+            If a channel was not recorded, or captures are shorter than prefix and DFT window.
         """
-        channels = self.raw.attrs["channels"]
-        if channel not in channels:
-            raise CampaignError(
-                f"channels {channels}",
-                where=self.recording,
-                expected=f"a channel named {channel!r}",
-                remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
-            )
-        iq = self.raw.iq.isel(channel=channels.index(channel)).values[pulses]
+        recorded, length = list(self.raw.attrs["channels"]), int(self.raw.attrs["capture_samples"])
+        for channel in channels:
+            if channel not in recorded:
+                raise CampaignError(
+                    f"channels {recorded}",
+                    where=self.recording,
+                    expected=f"a channel named {channel!r}",
+                    remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
+                )
         needed = self.numerology.prefix_samples + self.numerology.dft_samples
-        if iq.shape[1] < needed:
+        if length < needed:
             raise CampaignError(
-                f"captures of {iq.shape[1]} samples",
+                f"captures of {length} samples",
                 where=self.recording,
                 expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz",
                 remedy="Correct the waveform in config/config.yaml or record longer captures.",
             )
-        return np.asarray(iq)
+        start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
+
+        def read(captures: NDArray[np.int64]) -> dict[str, NDArray[np.int16]]:
+            iq = self.samples.captures(start[captures], length)
+            return {name: iq[:, :, place] for name, place in places.items()}
+
+        return read
 
     @cached_property
     def checked(self) -> CheckedTrack:
@@ -164,7 +185,23 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmW
                 expected=f"{asked:.6f}, as config/config.yaml: waveform.{key}",
                 remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
             )
-    return Acquisition(node, raw, track, campaign.settings.nodes[node], files, recording, log, numerology_of(waveform))
+    path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
+    samples = SampleFile(path, len(raw.attrs["channels"]))
+    _check_same(campaign, raw)
+    settings, numerology = campaign.settings.nodes[node], numerology_of(waveform)
+    return Acquisition(node, raw, track, settings, samples, files, recording, log, numerology)
+
+
+def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
+    """Raise CampaignError unless the recorder's file is the one that the stage describes."""
+    name = raw.attrs["samples"]
+    if digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
+        raise CampaignError(
+            "changed since it was ingested",
+            where=campaign.root / name,
+            expected="the file that the raw stage describes",
+            remedy="Run the workflow again: it ingests the recording first.",
+        )
 
 
 def _read_from(stage: xr.Dataset, files: Path) -> str:

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
+from apertura.imaging.stages import aperture_of, phase_history_of
 from apertura.load.acquisition import Acquisition, Times
 
 MOST_PULSES = 512
@@ -74,11 +76,16 @@ class Suspicion:
     height_m: float = 0.0
 
 
-def evidence_of(nodes: Mapping[str, Acquisition], pair: str, history: PhaseHistory, time: Times) -> Evidence:
-    """Return a pair's echo, thinned to what suspicions are tried on."""
+def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
+    """Return the echo of a pair, weighted by a window, as evidence; give it `some_pulses`."""
     tx, rx = (nodes[name] for name in pair.split("-"))
-    some = history.aperture.sample(MOST_PULSES)
-    return Evidence(pair, history[some], time[some], _sidelink_m(tx, rx, time[some]))
+    time = echo.time.values
+    return Evidence(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
+
+
+def some_pulses(echo: xr.Dataset) -> slice:
+    """Return the pulses of an echo that suspicions are tried on."""
+    return aperture_of(echo).sample(MOST_PULSES)
 
 
 def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:

@@ -37,9 +37,10 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
         dataset, settings = recording.cut(recording.captures, node=node), {}
     else:
         dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
+    dataset.attrs["samples"] = campaign.relative(recording.samples.path)
     raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=recorded.sources.digests)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
-    save_stage(raw, folders[0], chunks={"channel": 1, "pulse": 256}, lineage=recorded)
+    save_stage(raw, folders[0], lineage=recorded)
     save_stage(track, folders[1], lineage=logged)
     return folders
 
@@ -59,7 +60,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     )
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
-    samples, length = recording.samples[:, recording.channels.index(channel)], symbol_samples(waveform)
+    samples, length = recording.samples.channel(recording.channels.index(channel)), symbol_samples(waveform)
     captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate)
     if not captures.start.size:
         raise CampaignError(

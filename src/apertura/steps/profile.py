@@ -1,47 +1,64 @@
 """Rule `profile`: transfer functions of a pair become range profiles, cropped to what the scene needs."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.echo.compression import centre_frequency
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
-from apertura.imaging.stages import phase_history_of
+from apertura.imaging.stages import aperture_of, phase_history_of
 from apertura.lineage import result_of
-from apertura.load.scene import open_scene
+from apertura.load.scene import OpenScene, open_scene
 from apertura.scene.clearance import check_antennas
 from apertura.settings import CONFIG
 from apertura.steps.stamping import stamped
-from apertura.store import open_stage, save_stage
+from apertura.store import blocks_of_rows, finish, open_stage, write_blocks, writing
 
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
-    """Write results/<flight>/<pair>/profile.zarr."""
+    """Write results/<flight>/<pair>/profile.zarr, block by block."""
     lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root, [__name__])
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
-    history, where = phase_history_of(source, campaign.settings.processing.window), f"flight {flight}, pair {pair}"
-    check_antennas(scene.grid, scene.terrain, history.aperture, where=where)
-    window = RangeWindow.of(history.aperture, scene.grid, scene.terrain, history.frequency_hz)
+    aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
+    check_antennas(scene.grid, scene.terrain, aperture, where=where)
+    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency)
     _check_prefix(window.farthest_m, source.path_limit.values, where=where)
     _check_unambiguous(window)
-    profiles = range_compress(history, scene.grid, scene.terrain, window=window)
+    asked = campaign.settings.processing.window
+    zeros = np.broadcast_to(np.complex64(0), (len(aperture), window.samples))
     dataset = source[["time", "tx_position", "rx_position"]].assign(
-        profile=(("pulse", "range"), profiles.samples), start=("pulse", profiles.start_m)
+        profile=(("pulse", "range"), zeros), start=("pulse", window.start_m)
     )
     dataset.attrs = {name: source.attrs[name] for name in ("frame", "pair", "flags")} | {
-        "step_m": profiles.step_m,
-        "centre_frequency_hz": profiles.centre_frequency_hz,
-        "oversampling": profiles.oversampling,
-        "window": campaign.settings.processing.window,
+        "step_m": window.step_m,
+        "centre_frequency_hz": centre_frequency(frequency),
+        "oversampling": window.unambiguous / len(frequency),
+        "window": asked,
     }
-    folder = campaign.stage("profile", flight, pair)
     settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
     how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": scene.inputs}
-    save_stage(stamped(dataset, "profile", **how), folder, lineage=lineage)
+    stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
+    with writing(folder) as wip:
+        write_blocks(wip, stage, "profile", _compressed(source, asked, window, scene))
+        finish(wip, folder, lineage=lineage)
     return folder
+
+
+def _compressed(
+    source: xr.Dataset, asked: str, window: RangeWindow, scene: OpenScene
+) -> Iterator[NDArray[np.complex64]]:
+    """Yield the profiles of some pulses at a time: those of one chunk of the echo, so that each is read once."""
+    for part in blocks_of_rows(source, "transfer"):
+        history = phase_history_of(source.isel(pulse=part), asked)
+        here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
+        yield range_compress(history, scene.grid, scene.terrain, window=here).samples
 
 
 def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:

@@ -13,15 +13,14 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory
 from apertura.imaging.sharpness import gathered
-from apertura.imaging.stages import phase_history_of
 from apertura.load.acquisition import Acquisition, numerology_of, open_acquisition
+from apertura.load.echo import pair_echo
 from apertura.load.scene import OpenScene, open_scene
-from apertura.load.suspects import Evidence, Suspicion, evidence_of, suspicions
+from apertura.load.suspects import Evidence, Suspicion, evidence_of, some_pulses, suspicions
 from apertura.load.transmitted import read_codes
 from apertura.scene.grid import SceneGrid
 from apertura.settings import OfdmWaveform
 from apertura.steps.calibration import calibrated
-from apertura.steps.echo import pair_echo
 from apertura.store import open_stage
 
 LEAST_GAIN_DB = 1.0
@@ -77,7 +76,7 @@ def hypotheses(
 
 
 def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
-    return evidence_of(nodes, pair, phase_history_of(echo, window), echo.time.values)
+    return evidence_of(nodes, pair, echo.isel(pulse=some_pulses(echo)), window)
 
 
 def _other_echoes(
@@ -93,7 +92,8 @@ def _other_echoes(
         tx, rx = (nodes[name] for name in one.pair.split("-"))
         codes = read_codes(campaign.codes_file, waveform.subcarriers)
         echo = pair_echo(tx, rx, codes, waveform, campaign.settings.processing, calibration[one.pair])
-        return _evidence(nodes, one.pair, echo, campaign.settings.processing.window).history
+        some = echo.at(some_pulses(echo.dataset))
+        return evidence_of(nodes, one.pair, some, campaign.settings.processing.window).history
 
     other = "band_centre" if waveform.carrier_is == "band_start" else "band_start"
     changed = waveform.model_copy(update={"carrier_is": other})

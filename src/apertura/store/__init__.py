@@ -5,6 +5,7 @@ A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a re
 products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
+from apertura.store.blocks import blocks_of_rows, write_blocks
 from apertura.store.manifest import (
     damaged_files,
     manifest_of,
@@ -20,6 +21,7 @@ from apertura.store.resuming import create, mark_rewritten, missing, open_array,
 from apertura.store.stages import open_stage, save_stage
 
 __all__ = [
+    "blocks_of_rows",
     "create",
     "damaged_files",
     "finish",
@@ -37,5 +39,6 @@ __all__ = [
     "save_document",
     "save_stage",
     "sharing",
+    "write_blocks",
     "writing",
 ]

@@ -1,6 +1,7 @@
 """Chunks on disk: brought to the disk before they have their name, and checked by their sum when they are read."""
 
 import asyncio
+import hashlib
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,8 +31,20 @@ _SUM_BYTES = 4
 class StageStore(LocalStore):
     """A folder of a stage, as zarr reads and writes it.
 
-    A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out.
+    A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out:
+    by its own sum, and of a finished stage by its hash in the manifest, where that is given.
+
+    Parameters
+    ----------
+    folder, read_only
+        As `zarr.storage.LocalStore` takes them.
+    sha256
+        File of the folder → hash.
     """
+
+    def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
+        super().__init__(folder, read_only=read_only)
+        self._sha256 = sha256 or {}
 
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
@@ -57,10 +70,9 @@ class StageStore(LocalStore):
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
         if value is None or byte_range is not None or key.endswith("zarr.json"):
             return value
-        content = value.as_numpy_array()
-        if google_crc32c.value(content[:-_SUM_BYTES].tobytes()) == int.from_bytes(
-            content[-_SUM_BYTES:].tobytes(), "little"
-        ):
+        content = value.as_numpy_array().tobytes()
+        whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:], "little")
+        if whole and self._sha256.get(key) in {None, hashlib.sha256(content).hexdigest() if self._sha256 else None}:
             return value
         raise damaged(self.root, key)
 
@@ -110,7 +122,7 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
     return encoding
 
 
-def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> dict[str, bytes]:
+def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True) -> dict[str, bytes]:
     """Return the files of a stage before anything is computed: its metadata and coordinates, path → bytes.
 
     Parameters
@@ -120,6 +132,8 @@ def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> dict
         broadcast.
     chunks
         Array that is written chunk by chunk → shape of its chunks.
+    packed
+        Whether those are compressed; noise is not made smaller by it.
     """
     files: dict[str, Buffer] = {}
     rest, store = stage.drop_vars(list(chunks)), MemoryStore(files)
@@ -132,7 +146,7 @@ def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> dict
             shape=array.shape,
             chunks=shape,
             dtype=array.dtype,
-            compressors=CODECS,
+            compressors=CODECS if packed else CODECS[-1:],
             fill_value=array.values.flat[0],  # what a chunk that nobody writes holds
             dimension_names=[str(dim) for dim in array.dims],
             attributes={**array.attrs, "grid_mapping": "spatial_ref"},

@@ -8,7 +8,7 @@ from apertura.atomic import write_json
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.paths import inside
-from apertura.provenance import sha256_file, sha256_tree
+from apertura.provenance import sha256_file
 
 
 def manifest_of(result: Path) -> Path:
@@ -79,14 +79,47 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     return document
 
 
-def check_files(result: Path) -> None:
-    """Check the files of a finished stage, or a document, against its manifest.
+def check_document(path: Path) -> None:
+    """Check a finished document against its manifest.
 
     Raises
     ------
     CampaignError
         If it is missing, or is not what the manifest describes.
     """
+    refuse_others(manifest_of(path), _expected(path), {path.name: sha256_file(path)})
+
+
+def check_stage(folder: Path) -> dict[str, str]:
+    """Check which files a finished stage has, and what its metadata hold, against its manifest; return their hashes.
+
+    Returns
+    -------
+    dict
+        File of the folder → sha256, against which chunks are checked as they are read: a stage is not read whole to
+        look at a part of it.
+
+    Raises
+    ------
+    CampaignError
+        If it is missing, or is not what the manifest describes.
+    """
+    expected, inside = _expected(folder), f"{folder.name}/"
+    names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    there = {
+        f"{inside}{name}": expected.get(f"{inside}{name}", "") if _is_chunk(name) else sha256_file(folder / name)
+        for name in names
+    }
+    refuse_others(manifest_of(folder), expected, there)
+    return {name.removeprefix(inside): digest for name, digest in expected.items()}
+
+
+def _is_chunk(name: str) -> bool:
+    """Return whether a file of a zarr folder, relative to it, holds values: version 3 keeps them below a folder `c`."""
+    return "c" in name.split("/")[1:]
+
+
+def _expected(result: Path) -> dict[str, str]:
     manifest = manifest_of(result)
     if not manifest.is_file() or not result.exists():
         raise CampaignError(
@@ -95,10 +128,7 @@ def check_files(result: Path) -> None:
             expected="a finished result with its manifest",
             remedy=f"{f'Delete {manifest} and run' if manifest.is_file() else 'Run'} the workflow (`apertura run`).",
         )
-    expected = read_manifest(manifest)["files"]
-    present = sha256_tree(result) if result.is_dir() else {"": sha256_file(result)}
-    present = {"/".join(filter(None, (result.name, name))): digest for name, digest in present.items()}
-    refuse_others(manifest, expected, present)
+    return dict(read_manifest(manifest)["files"])
 
 
 def damaged_files(manifest: Path) -> list[str]:
@@ -136,7 +166,7 @@ def open_document(path: Path) -> dict[str, Any]:
     CampaignError
         If it is missing, or is not what the manifest describes.
     """
-    check_files(path)
+    check_document(path)
     return read_json(path, expected="a result of the workflow", remedy=remake(path))
 
 

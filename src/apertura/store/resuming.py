@@ -156,7 +156,7 @@ def _chunk(windows: Sequence[Window]) -> tuple[int, ...]:
     return tuple(part.stop - part.start for part in windows[0])
 
 
-def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]) -> None:
+def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True) -> None:
     """Create `wip`: metadata and coordinates of a stage, and arrays without values, to be written chunk by chunk.
 
     Parameters
@@ -168,10 +168,12 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
         broadcast.
     chunks
         Array name → shape of its chunks. One process at a time may write a chunk.
+    packed
+        Whether chunks are compressed.
     """
     from apertura.store.chunks import skeleton
 
-    _begin(wip, skeleton(stage, chunks))
+    _begin(wip, skeleton(stage, chunks, packed=packed))
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from apertura.atomic import naming, remove
 from apertura.contracts import check
-from apertura.store.manifest import Origin, check_files
+from apertura.store.manifest import Origin, check_stage
 from apertura.store.progress import finish, writing
 
 if TYPE_CHECKING:
@@ -43,7 +43,9 @@ def save_stage(
 
 
 def open_stage(folder: Path, stage: str) -> "xr.Dataset":
-    """Open a finished stage lazily after checking its files against the manifest and its arrays against the contract.
+    """Open a finished stage lazily, after checking its metadata and coordinates against the manifest and the contract.
+
+    Chunks are checked against the manifest as they are read.
 
     Raises
     ------
@@ -56,5 +58,5 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
 
     from apertura.store.chunks import StageStore
 
-    check_files(folder)
-    return check(xr.open_zarr(StageStore(folder, read_only=True), consolidated=False, chunks=None), stage)
+    store = StageStore(folder, read_only=True, sha256=check_stage(folder))
+    return check(xr.open_zarr(store, consolidated=False, chunks=None), stage)

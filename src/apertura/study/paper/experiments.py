@@ -53,10 +53,10 @@ class Experiment:
             raise TypeError("the paper's experiments are recordings of samples")
         receiver = open_acquisition(campaign, FLIGHT, BISTATIC.split("-")[1], waveform)
         codes = read_codes(campaign.root / waveform.codes, waveform.subcarriers)
-        captures = receiver.captures("radar", np.arange(len(receiver.raw.time)))
+        every = np.arange(len(receiver.raw.time))
         time_s = receiver.log_seconds(receiver.raw.time.values)
-        measured = transfer_by_code(captures, codes, receiver.numerology, time_s=time_s)
-        return replace(self.history(BISTATIC), transfer=measured.transfer)
+        measured = transfer_by_code(receiver.reader(["radar"], every), codes, receiver.numerology, time_s=time_s)
+        return replace(self.history(BISTATIC), transfer=measured.form(every))
 
 
 def open_experiment(folder: Path, name: str) -> Experiment:
