@@ -19,6 +19,7 @@ from apertura.simulation.draw import independent_streams
 from apertura.simulation.files import flight_truth, targets_truth, write_csv_log, write_pos_log, write_recording
 from apertura.simulation.impairments import Adc
 from apertura.simulation.observation import Observation, fly
+from apertura.simulation.periodic import periodic_samples
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import (
@@ -150,7 +151,8 @@ def _write_samples(
     else:
         kept = np.flatnonzero(draw.kept)
         tags = _utc(flight, time_s + draw.start_s + draw.tag_error_s)
-        blocks = _captures(recording, adc, kept, generator)
+        periodic = campaign.specification.synthesis == "periodic"
+        blocks = _captures(recording, adc, kept, generator, periodic=periodic)
         frames = [framing.counted(flight.first_frame + int(pulse)) if framing else None for pulse in kept]
         starts = range(0, len(kept) * waveform.capture_samples, waveform.capture_samples)
         captures = list(zip(starts, tags[kept], frames, strict=True))
@@ -170,16 +172,17 @@ def _write_samples(
 
 
 def _captures(
-    recording: Observation, adc: Adc, kept: NDArray[np.intp], generator: Generator
+    recording: Observation, adc: Adc, kept: NDArray[np.intp], generator: Generator, *, periodic: bool
 ) -> Iterator[NDArray[np.int16]]:
     """Yield (sample, channel, 2) counts of a few captures at a time."""
     channels = recording.channels
+    synthesis = periodic_samples if periodic else samples
     scales = {name: full_scale(channel, adc) for name, channel in channels.items()}
     noise = dict(zip(channels, independent_streams(generator, len(channels)), strict=True))
     for start in range(0, len(kept), _PULSES_AT_ONCE):
         some = kept[start : start + _PULSES_AT_ONCE]
         counts = [
-            digitize(samples(channel, noise[name], some), adc, scales[name]) for name, channel in channels.items()
+            digitize(synthesis(channel, noise[name], some), adc, scales[name]) for name, channel in channels.items()
         ]
         yield np.stack(counts, axis=2).reshape(-1, len(counts), 2)
 

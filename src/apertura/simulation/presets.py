@@ -109,9 +109,29 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
     )
 
 
+def flight(*, pulses: int = 300_000) -> CampaignSpecification:
+    """Return a whole flight: ten minutes at 500 Hz and 5 m/s past 410 m of ground, one transmitter, two receivers.
+
+    A receiver records two channels of 2160 samples per pulse, 5.2 GB; the image has 4096 × 4096 pixels.
+    """
+    waveform = WaveformSpecification(1024, 1.2e9, 100e3, 10.3125e-6, 3.75e-6, 153.6e6, 500.0)
+    nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0))}
+    tracks, half_m = {"uav1": Straight((0.0, -270.0, 80.0), (5.0, 0.0, 0.0))}, 5.0 * (pulses - 1) / 500.0 / 2
+    for name, ahead_m in (("uav2", 12.0), ("uav3", -15.0)):
+        nodes[name] = _secondary(0.4, 0.2, tag_s=0.2e-3, missed=0.0)
+        tracks[name] = Straight((ahead_m, -270.0, 82.0), (5.0, 0.0, 0.0))
+    tracks = {
+        name: replace(track, start_m=(track.start_m[0] - half_m, *track.start_m[1:])) for name, track in tracks.items()
+    }
+    targets = tuple(PointTarget((x, y, 0.0)) for x in (-150.0, -50.0, 50.0, 150.0) for y in (-160.0, -40.0, 80.0))
+    flown = SimulatedFlight("f01", "uav1", tracks, pulses)
+    grid = ImageGrid("EPSG:32632", half_width_m=204.8, spacing_m=0.1)
+    return CampaignSpecification("flight", DEMO_ORIGIN, waveform, targets, nodes, (flown,), grid, synthesis="periodic")
+
+
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
     made.__name__.replace("_", "-"): made
-    for made in (demo, paper, swarm, continuous, paper_lab, paper_static, paper_uav)
+    for made in (demo, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
 }
 
 
@@ -120,7 +140,7 @@ def _over_the_demo_scene(name: str, nodes: dict[str, SimulatedNode], flight: Sim
     return CampaignSpecification(name, DEMO_ORIGIN, _DEMO_WAVEFORM, _DEMO_TARGETS, nodes, (flight,), grid)
 
 
-def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float) -> SimulatedNode:
+def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float, missed: float = 0.03) -> SimulatedNode:
     return SimulatedNode(
         path_offset_m={"radar": radar_m, "sidelink": sidelink_m},
         attitude="none",
@@ -128,7 +148,7 @@ def _secondary(radar_m: float, sidelink_m: float, *, tag_s: float) -> SimulatedN
         impairments=Impairments(
             carrier_phase=UniformPhase(),
             timing=Timing(offset_s=12e-9, half_width_s=40e-9),
-            missed_fraction=0.03,
+            missed_fraction=missed,
             time_tag=TimeTag(offset_s=tag_s, jitter_s=0.2e-3),
             radar_snr_db=25.0,
             sidelink_snr_db=30.0,

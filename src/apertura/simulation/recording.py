@@ -15,6 +15,7 @@ from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum
 
 _PULSES_AT_ONCE = 64
+_MOST_PULSES = 8192
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,9 @@ def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
 
 
 def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
-    """Return the mean of |Σ a·exp(-j2πfτ)|² over pulses and subcarriers."""
+    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses; of a long flight over some, evenly spread."""
+    every = -(-len(paths.delay_s) // _MOST_PULSES)
+    paths = paths.at(slice(None, None, every))
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
     parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
     total = sum(
@@ -133,7 +136,7 @@ def full_scale(channel: Channel, adc: Adc) -> float:
     return float(rms * 10 ** (adc.backoff_db / 20))
 
 
-def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray[np.int16]:
+def digitize(samples: NDArray[np.complexfloating], adc: Adc, full_scale_amplitude: float) -> NDArray[np.int16]:
     """Return (..., 2) int16 counts of I and Q, rounded and clipped to ±2^(bits-1).
 
     Examples
@@ -142,8 +145,10 @@ def digitize(samples: Complex, adc: Adc, full_scale_amplitude: float) -> NDArray
     array([[ 4, -8]], dtype=int16)
     """
     limit = 2 ** (adc.bits - 1)
-    counts = np.rint(np.ascontiguousarray(samples)[..., None].view(np.float64) * (limit / full_scale_amplitude))
-    return np.asarray(np.clip(counts, -limit, limit - 1), np.int16)
+    parts = np.ascontiguousarray(samples)[..., None].view(samples.real.dtype)
+    counts = parts * parts.dtype.type(limit / full_scale_amplitude)
+    np.clip(np.rint(counts, out=counts), -limit, limit - 1, out=counts)
+    return np.asarray(counts, np.int16)
 
 
 def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, offset_m: float, power: float) -> Paths:

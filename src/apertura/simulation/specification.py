@@ -167,6 +167,10 @@ class CampaignSpecification:
     nodes: Mapping[Name, SimulatedNode] = Field(min_length=1, description="one section per UAV")
     flights: tuple[SimulatedFlight, ...] = Field(description="who flies what, one after the other")
     scene: ImageGrid = Field(description="the grid on which the campaign is imaged")
+    synthesis: Literal["exact", "periodic"] = Field(
+        default="exact",
+        description="true edges of every echo, or fast, for long flights: as if echoes did not begin or end",
+    )
 
     @model_validator(mode="after")
     def _nodes_fly(self) -> Self:
