@@ -100,9 +100,13 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     if samples < stop:
         raise ValueError(f"{samples=}: a capture needs {stop} (prefix and DFT window)")
     symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
+    count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
+    below = min(count, numerology.dft_samples - lowest)  # of those from `lowest` on; the others lie at the beginning
     for first in range(0, pulses, _PULSES_AT_ONCE):
         spectrum = fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
-        symbols[first : first + len(spectrum)] = spectrum[:, numerology.numbers % numerology.dft_samples]
+        rows = slice(first, first + len(spectrum))
+        symbols[rows, :below] = spectrum[:, lowest : lowest + below]
+        symbols[rows, below:] = spectrum[:, : count - below]
     return symbols
 
 

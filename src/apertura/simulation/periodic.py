@@ -49,13 +49,11 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
     bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = spectrum
     period = fft.ifft(bins, axis=1, norm="forward")
-    turns = np.asarray(channel.phase_rad[pulses, None] / (2 * np.pi), np.float64)
-    period *= turned(np.ones(1), turns)
+    period *= turned(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
     if channel.cfo_hz:
-        captures = captures * turned(
-            np.ones(1), -channel.cfo_hz / sampling_rate(channel) * np.arange(captures.shape[1])
-        )
+        turns = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
+        captures = captures * turned(np.ones(1), np.asarray(turns, np.float64))
     if generator is not None and channel.noise_variance:
         parts = captures.view(np.float32)
         parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))
