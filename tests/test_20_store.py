@@ -15,7 +15,9 @@ import zarr
 
 from apertura.contracts import STAGES, check, stamp
 from apertura.errors import CampaignError, ContractError
+from apertura.provenance import sha256_tree
 from apertura.store import (
+    blocks,
     finish,
     manifest_of,
     mark_rewritten,
@@ -24,8 +26,11 @@ from apertura.store import (
     resume,
     save_stage,
     sharing,
+    write_blocks,
     writing,
 )
+from apertura.store.chunks import StageStore
+from apertura.store.manifest import check_stage
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -54,7 +59,44 @@ def test_a_changed_file_is_named_with_the_manifest_to_delete(tmp_path):
     chunk = next(path for path in (tmp_path / "track.zarr" / "position" / "c").rglob("*") if path.is_file())
     chunk.write_bytes(b"x")
     with pytest.raises(CampaignError, match=r"position/.*track\.manifest\.json and run the workflow again"):
-        open_stage(tmp_path / "track.zarr", "track")
+        open_stage(tmp_path / "track.zarr", "track").load()
+
+
+def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):
+    """It is whole by its own sum; the manifest knows better. What is not read is not looked at."""
+    values = np.arange(40.0).reshape(10, 4).astype(np.complex64)
+    stage = xr.Dataset({"transfer": (("pulse", "subcarrier"), np.broadcast_to(np.complex64(0), values.shape))})
+    for name in ("a", "b"):
+        with writing(tmp_path / name / "echo.zarr") as wip:
+            write_blocks(wip, stage, "transfer", [values[:7] + (name == "b"), values[7:]])
+            finish(wip, tmp_path / name / "echo.zarr")
+    place = "echo.zarr/transfer/c/0/0"
+    (tmp_path / "a" / place).write_bytes((tmp_path / "b" / place).read_bytes())
+    sums = check_stage(tmp_path / "a" / "echo.zarr")
+    with pytest.raises(CampaignError, match=r"transfer/c/0/0: damaged since it was written"):
+        zarr.open_array(StageStore(tmp_path / "a" / "echo.zarr", read_only=True, sha256=sums), path="transfer")[:]
+    np.testing.assert_array_equal(zarr.open_array(tmp_path / "b" / "echo.zarr", path="transfer")[:7], values[:7] + 1)
+
+
+def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks, "_CHUNK_BYTES", 3 * 4 * 8)
+    monkeypatch.setattr(blocks, "_FEWEST_ROWS", 1)
+    values = np.random.default_rng(1).normal(size=(11, 4))
+    stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, values.shape))})
+    trees = []
+    for cut in ([11], [1] * 11, [5, 6]):
+        write_blocks(tmp_path / "x.wip", stage, "profile", np.split(values, np.cumsum(cut)[:-1]))
+        np.testing.assert_array_equal(zarr.open_array(tmp_path / "x.wip", path="profile")[:], values)
+        trees.append(sha256_tree(tmp_path / "x.wip"))
+    assert trees[0] == trees[1] == trees[2]
+    assert len(trees[0]) == 2 + 6  # two rows a chunk
+
+
+@pytest.mark.parametrize("rows", [10, 12])
+def test_blocks_that_are_not_the_whole_array_are_no_stage(tmp_path, rows):
+    stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, (11, 4)))})
+    with pytest.raises(ValueError, match="of profile: must be 11"):
+        write_blocks(tmp_path / "x.wip", stage, "profile", [np.zeros((rows, 4))])
 
 
 def test_a_folder_without_a_manifest_is_not_finished(tmp_path):

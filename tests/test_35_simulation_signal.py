@@ -22,6 +22,7 @@ from apertura.simulation.impairments import (
     UniformPhase,
 )
 from apertura.simulation.observation import observe
+from apertura.simulation.periodic import periodic_samples
 from apertura.simulation.presets import paper_scene, paper_waveform
 from apertura.simulation.radar import Paths, TransmitWaveform, qpsk_codes
 from apertura.simulation.recording import Geometry, digitize, full_scale
@@ -115,6 +116,40 @@ def test_fast_transfer_functions_equal_the_dft_of_samples():
     for channel in seen.channels.values():
         fast = transfer_functions(channel, None)
         assert_allclose(recovered(waveform, samples(channel, None)), fast, atol=1e-11 * abs(fast).max())
+
+
+@pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
+def test_periodic_samples_are_the_exact_ones_wherever_all_echoes_are_there(carrier_is):
+    """From the last arrival to the first end; an echo that the window would not hold whole is left out."""
+    waveform = small_waveform(carrier_is)
+    wrong = Impairments(
+        carrier_phase=UniformPhase(), timing=Timing(half_width_s=20e-9), clock=Clock(cfo_hz=3e4), doppler=False
+    )
+    seen = observe(waveform, *two_uavs(), np.random.default_rng(0), receiver=wrong)
+    for channel in seen.channels.values():
+        arrival = (channel.paths.delay_s - channel.start_s[:, None]) * waveform.sample_rate_hz
+        first, last = int(arrival.max()) + 1, int(arrival.min() + waveform.duration_s * waveform.sample_rate_hz) - 1
+        exact, fast = samples(channel, None), periodic_samples(channel, None, np.arange(6))
+        assert_allclose(fast[:, first:last], exact[:, first:last], atol=3e-6 * abs(exact).max())
+        late = replace(
+            channel, paths=channel.paths.and_also(replace(channel.paths, delay_s=channel.paths.delay_s + 1e-6))
+        )
+        assert_allclose(periodic_samples(late, None, np.arange(6)), fast)
+
+
+def test_periodic_synthesis_is_refused_where_the_symbol_is_not_periodic():
+    paths = Paths(np.full((2, 1), 1e-7), np.ones((2, 1), complex), np.zeros((2, 1)))
+    channel = Channel(small_waveform(), paths, np.ones(200, complex), np.zeros(2), np.zeros(2))
+    for wrong in (replace(channel, sfo_hz=10.0), replace(channel, paths=replace(paths, delay_rate=paths.delay_s))):
+        with pytest.raises(ValueError, match="needs exact synthesis"):
+            periodic_samples(wrong, None, np.arange(2))
+
+
+def test_noise_of_periodic_samples_is_as_strong_as_asked():
+    paths = Paths(np.full((40, 1), 1e-7), np.zeros((40, 1), complex), np.zeros((40, 1)))
+    channel = Channel(small_waveform(), paths, np.ones(200), np.zeros(40), np.zeros(40), noise_variance=9.0)
+    found = periodic_samples(channel, np.random.default_rng(1), np.arange(40))
+    assert np.mean(np.abs(found) ** 2) == pytest.approx(9.0, rel=0.03)
 
 
 def test_sidelink_division_removes_phase_start_and_transmit_ripple_exactly():

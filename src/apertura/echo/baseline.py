@@ -16,6 +16,8 @@ SIGMAS = 5.0
 _MEDIAN_PULSES = 15, 61, 241
 """Of the running medians that tell movement from jitter, odd numbers: the longer, the less noise and the slower."""
 
+_WINDOWS_AT_ONCE = 4096
+
 
 @dataclass(frozen=True)
 class BaselineResidual:
@@ -71,7 +73,9 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
 
 
 def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(residual, width), axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(residual, width)
+    parts = range(0, len(windows), _WINDOWS_AT_ONCE)  # a median copies its windows
+    smooth = np.concatenate([np.median(windows[first : first + _WINDOWS_AT_ONCE], axis=1) for first in parts])
     middle = pulse[width // 2 : -(width // 2)]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
     noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples

@@ -29,7 +29,7 @@ PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura
 
 
 def open_recording(files: Sequence[Path]) -> "Recording":
-    """Open a recording; metadata and sizes are checked, samples are memory-mapped and not read.
+    """Open a recording; metadata and sizes are checked, samples are not read.
 
     Parameters
     ----------

@@ -1,0 +1,145 @@
+"""A flight is read in blocks: what comes out does not depend on them, and memory not on its length."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from apertura.echo import transfer
+from apertura.echo.captures import Saturation, blocks_of, spread
+from apertura.echo.clock import clock_of, estimate_clock
+from apertura.echo.demodulate import Numerology, remove_path
+from apertura.echo.line_of_sight import fit_line_of_sight
+from apertura.echo.sidelink_state import measure, measure_blocks
+from apertura.echo.transfer import transfer_by_code, transfer_by_sidelink
+
+NUMEROLOGY = Numerology(1.2e9, 32e6, np.arange(200), prefix_samples=64, dft_samples=256)
+CODES = np.exp(2j * np.pi * np.random.default_rng(1).random(200)).astype(np.complex64)
+SYMBOL = 64 + 256 + 40
+
+
+def recorded(pulses, *, first=0, ppm=0.0):
+    """Return channel → captures, (pulse, sample, 2) int16, of a sidelink and one echo."""
+    time, frequency = np.arange(SYMBOL) / 32e6, 1.2e9 + np.arange(200) * 125e3
+    waves = np.exp(2j * np.pi * np.arange(200)[:, None] * 125e3 * (time - 2e-6))
+    iq = {"radar": [], "sidelink": []}
+    for pulse in range(first, first + pulses):
+        rng = np.random.default_rng(pulse)
+        phase, late_s = rng.uniform(-np.pi, np.pi), rng.uniform(0.1e-6, 0.3e-6)
+        for name, delay_s, level in (("radar", 0.5e-6 + 1e-11 * pulse, 120.0), ("sidelink", 0.05e-6, 300.0)):
+            spectrum = CODES * np.exp(-2j * np.pi * frequency * (delay_s + late_s) + 1j * phase)
+            signal = level / 14 * (spectrum @ waves) * np.exp(-2j * np.pi * 1.2e9 * ppm * 1e-6 * time)
+            signal = signal + rng.normal(size=SYMBOL) + 1j * rng.normal(size=SYMBOL)
+            iq[name].append(np.stack([signal.real, signal.imag], -1))
+    return {name: np.round(blocks).astype(np.int16) for name, blocks in iq.items()}
+
+
+def formed(iq, **more):
+    pulses = len(iq["radar"])
+    measured = transfer_by_sidelink(
+        lambda some: {name: samples[some] for name, samples in iq.items()},
+        CODES,
+        NUMEROLOGY,
+        symbol_samples=SYMBOL,
+        sidelink_m=np.full(pulses, 15.0),
+        accuracy_db=-60.0,
+        where="here",
+        **({"method": "auto"} | more),
+    )
+    return measured, np.concatenate([measured.form(some) for some in blocks_of(np.flatnonzero(measured.kept))])
+
+
+@pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
+def test_transfer_functions_do_not_depend_on_the_blocks_they_are_formed_in(method):
+    iq = recorded(70)
+    measured, whole = formed(iq, method=method)
+    odd = np.concatenate([measured.form(some) for some in blocks_of(np.arange(70), 23)])
+    np.testing.assert_array_equal(odd, whole)
+
+
+def test_a_secondary_gives_the_echo_of_its_scene_whatever_phase_and_start_its_captures_have():
+    """After division the echo runs 0.45 µs behind the sidelink, and 10 ps more with every pulse."""
+    _, whole = formed(recorded(40))
+    delay_s = 0.45e-6 + 1e-11 * np.arange(40)
+    straight = remove_path(whole, NUMEROLOGY.frequency_hz, delay_s=delay_s)
+    together = np.abs(straight.sum()) / np.abs(straight).sum()
+    assert together > 0.995
+
+
+def test_the_state_of_a_sidelink_is_the_same_in_any_blocks():
+    rng = np.random.default_rng(3)
+    sidelink = (8 + rng.normal(size=(150, 128)) + 1j * rng.normal(size=(150, 128))).astype(np.complex64)
+    in_one, in_many = (
+        measure(sidelink),
+        measure_blocks(lambda: (sidelink[some] for some in blocks_of(np.arange(150), 31))),
+    )
+    np.testing.assert_array_equal(in_many.locked, in_one.locked)
+    np.testing.assert_allclose(in_many.delay_cells, in_one.delay_cells, atol=1e-6)
+    for name in ("snr_db", "echo_db", "ripple_db", "near_db"):
+        assert getattr(in_many, name) == pytest.approx(getattr(in_one, name), abs=1e-3), name
+
+
+def test_a_code_that_is_not_carried_is_told_across_blocks():
+    """Neighbouring pulses agree, also the last of a block and the first of the next."""
+    rng = np.random.default_rng(4)
+    wrong = np.exp(2j * np.pi * rng.random(128))
+    sidelink = (20 * wrong + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
+    state = measure_blocks(lambda: (sidelink[some] for some in blocks_of(np.arange(9), 1)))
+    assert "wrong_code" in state.flags
+    assert state.locked.all()
+
+
+def test_the_delay_of_a_direct_path_is_the_most_likely_one():
+    """Its power |Σ S_n exp(j2πn·delay/N)|² does not grow to either side; noise, ripple and an echo are in it."""
+    rng = np.random.default_rng(5)
+    number = np.arange(300) - 149.5
+    delay = rng.uniform(-140, 140, 50)
+    sidelink = (1 + 0.1 * np.cos(number / 9)) * np.exp(-2j * np.pi * np.outer(delay, number) / 300)
+    sidelink = sidelink + 0.1 * np.exp(-2j * np.pi * np.outer(delay + 7.3, number) / 300)
+    sidelink = (sidelink + 0.2 * (rng.normal(size=(50, 300)) + 1j * rng.normal(size=(50, 300)))).astype(np.complex64)
+    found = fit_line_of_sight(sidelink).delay_cells
+    np.testing.assert_allclose(found, delay, atol=0.05)
+
+    def power(cells):
+        return np.abs((sidelink * np.exp(2j * np.pi * np.outer(cells, number) / 300)).sum(1)) ** 2
+
+    for step in (-2e-3, 2e-3):
+        assert (power(found + step) < power(found)).all()
+
+
+def test_a_clock_is_measured_as_well_on_stretches_of_a_long_flight():
+    """8 ppm, on 16 stretches of 8 of 640 pulses: as all of them, and near the truth."""
+    iq = recorded(640, ppm=8.0)["sidelink"]
+    samples = transfer.as_complex(iq)
+    groups = spread(640, groups=16, each=8)
+    assert sum(map(len, groups)) == 128
+    part = clock_of((samples[some] for some in groups), NUMEROLOGY, pulses=640)
+    whole = estimate_clock(samples, NUMEROLOGY)
+    assert part.cfo_hz == pytest.approx(whole.cfo_hz, abs=4 * part.cfo_std_hz)
+    assert part.cfo_hz == pytest.approx(9600, abs=20)
+    assert part.cfo_std_hz < 5
+
+
+def test_saturation_is_that_of_all_blocks_together():
+    """Extremes that only a later block reaches replace those of the earlier ones."""
+    saturation = Saturation()
+    for values in ([1, 5, 5, -3], [7, 7, 7, -3], [7, 0, 0, -9]):
+        saturation.count({"radar": np.array(values, np.int16)})
+    assert saturation.shares["radar"] == pytest.approx((4 + 1 - 2) / 12)
+
+
+def test_a_long_flight_takes_no_more_memory_than_a_short_one(monkeypatch):
+    """Ten times the pulses, the same peak but for a few numbers per pulse; captures come from nowhere."""
+    monkeypatch.setattr(transfer, "_STRETCH", 8)
+    some = recorded(64)["radar"]
+    peaks = []
+    for pulses in (500, 5000):
+        tracemalloc.start()
+        measured = transfer_by_code(
+            lambda wanted: {"radar": some[wanted % 64]}, CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
+        )
+        for block in blocks_of(np.arange(pulses)):
+            assert measured.form(block).shape == (len(block), 200)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 5000 * 200
