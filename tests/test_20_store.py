@@ -92,6 +92,15 @@ def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, m
     assert len(trees[0]) == 2 + 6  # two rows a chunk
 
 
+def test_rows_of_zeros_take_no_space_and_read_as_zeros(tmp_path):
+    values = np.zeros((4096, 1024), np.complex64)
+    values[1500] = 1
+    stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(np.complex64(0), values.shape))})
+    write_blocks(tmp_path / "x.wip", stage, "profile", [values])
+    assert [path.name for path in (tmp_path / "x.wip/profile/c").iterdir()] == ["1"]
+    np.testing.assert_array_equal(zarr.open_array(tmp_path / "x.wip", path="profile")[:], values)
+
+
 @pytest.mark.parametrize("rows", [10, 12])
 def test_blocks_that_are_not_the_whole_array_are_no_stage(tmp_path, rows):
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, (11, 4)))})

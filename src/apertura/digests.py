@@ -10,10 +10,11 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from apertura.atomic import write_json
 from apertura.errors import CampaignError
-from apertura.provenance import sha256_file
+from apertura.provenance import hashes_of_file
 
 _KEPT = Path("results/.hashes")
 _SMALL = 1 << 16  # bytes; hashed faster than its state is looked up
@@ -21,8 +22,10 @@ _SETTLED_S = 2.0
 """A file changed within this time of being read may change again in the same tick of the clock: not kept."""
 
 
-def digest_of(root: Path, name: str, *, paranoid: bool = False) -> str:
-    """Return the sha256 of a campaign's file, hex; from `results/.hashes` where its state is known.
+def digest_of(
+    root: Path, name: str, *, algorithm: Literal["sha256", "sha512"] = "sha256", paranoid: bool = False
+) -> str:
+    """Return the hash of a campaign's file, hex; from `results/.hashes` where its state is known.
 
     Parameters
     ----------
@@ -30,6 +33,8 @@ def digest_of(root: Path, name: str, *, paranoid: bool = False) -> str:
         The campaign folder.
     name
         The file relative to it.
+    algorithm
+        sha256, or sha512, with which the other is taken, too: a recording is read once for both.
     paranoid
         Read the file in any case.
 
@@ -40,21 +45,22 @@ def digest_of(root: Path, name: str, *, paranoid: bool = False) -> str:
     """
     path = root / name
     state = _state(path)
+    algorithms = list(dict.fromkeys(["sha256", algorithm]))
     if state["size"] < _SMALL:
-        return sha256_file(path)
+        return hashes_of_file(path, algorithms)[algorithm]
     kept = root / _KEPT / f"{name}.json"
     if not paranoid:
-        with suppress(OSError, ValueError, TypeError):
+        with suppress(OSError, ValueError, TypeError, KeyError):
             known = json.loads(kept.read_text(encoding="utf-8"))
             if known["state"] == state:
-                return str(known["sha256"])
-    digest = sha256_file(path)
+                return str(known[algorithm])
+    digests = hashes_of_file(path, algorithms)
     if _state(path) != state:
         raise _changed(path)
     if max(state["mtime_ns"], state["ctime_ns"]) < time.time_ns() - _SETTLED_S * 1e9:
         with suppress(OSError):  # a folder that cannot be written: the next one hashes again
-            write_json(kept, {"state": state, "sha256": digest})
-    return digest
+            write_json(kept, {"state": state, **digests})
+    return digests[algorithm]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from apertura import __version__
 
 PACKAGE = Path(__file__).parent
 
+_READ_BYTES = 1 << 20
+
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
 _NAME = re.compile(r"[\w.]+")
 _TYPING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTILINE)  # never run
@@ -132,6 +134,21 @@ def sha256_file(path: Path) -> str:
     """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha512_file(path: Path) -> str:
+    """Return the sha512 of a file's bytes, hex, as SigMF states it."""
+    return hashes_of_file(path, ["sha512"])["sha512"]
+
+
+def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
+    """Return algorithm → hash of a file's bytes, hex; it is read once."""
+    digests = {name: hashlib.new(name) for name in algorithms}
+    with path.open("rb") as stream:
+        while block := stream.read(_READ_BYTES):
+            for digest in digests.values():
+                digest.update(block)
+    return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
 def sha256_tree(folder: Path) -> dict[str, str]:

@@ -1,7 +1,6 @@
 """What every recorder's files become: samples to be read, captures in UTC, and what was sent before each symbol."""
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.ingest.sample_file import SampleFile
+from apertura.provenance import sha512_file
 
-_BLOCK_BYTES = 8 << 20
+_AT_ONCE = 4096
 _ALIVE = 16  # samples of which one that is not zero spares the others a look
 
 
@@ -73,12 +73,11 @@ class Recording:
         elapsed = np.round(start / self.sample_rate_hz * 1e9).astype(np.int64).astype("timedelta64[ns]")
         return Captures(start, length, self.captures.time[0] + elapsed, frame)
 
-    def check_hash(self) -> None:
+    def check_hash(self, sha512_of: Callable[[Path], str] = sha512_file) -> None:
         """Raise CampaignError unless the samples are those that the recorder hashed."""
         if self.sha512 is None:
             return
-        with self.files[-1].open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha512").hexdigest()
+        digest = sha512_of(self.files[-1])
         if digest != self.sha512:
             raise CampaignError(
                 f"sha512 {digest[:12]}…",
@@ -89,8 +88,6 @@ class Recording:
 
     def cut(self, captures: Captures, *, node: str) -> xr.Dataset:
         """Return the `raw` stage of some captures of a node: where they lie in the file, with UTC time and frame.
-
-        Every sample of them is read once.
 
         Raises
         ------
@@ -115,12 +112,16 @@ class Recording:
         )
 
     def _check_alive(self, captures: Captures) -> None:
+        """Raise CampaignError if a capture holds only zeros; of those that begin otherwise no more is read."""
+        start, few = captures.start, min(_ALIVE, captures.length)
         dead: list[NDArray[np.bool_]] = []
-        at_once = max(1, _BLOCK_BYTES // (captures.length * self.samples.sample_bytes))
-        for first in range(0, len(captures.start), at_once):
-            iq = self.samples.captures(captures.start[first : first + at_once], captures.length)
-            silent = np.asarray(~iq[:, :_ALIVE].any(axis=(1, 3)))
-            silent[silent] = ~np.moveaxis(iq, 2, 1)[silent].any(axis=(1, 2))
+        for first in range(0, len(start), _AT_ONCE):
+            some = start[first : first + _AT_ONCE]
+            silent = np.asarray(~self.samples.captures(some, few).any(axis=(1, 3)))
+            for capture in np.flatnonzero(silent.any(axis=1)):
+                silent[capture] = ~self.samples.captures(some[capture : capture + 1], captures.length).any(
+                    axis=(0, 1, 3)
+                )
             dead.append(silent)
         for name, silent in zip(self.channels, np.concatenate(dead).T, strict=True):
             if silent.any():

@@ -16,9 +16,6 @@ from apertura.errors import CampaignError
 _COUNT = np.dtype("<i2")
 _COMPONENTS = 2  # I and Q
 
-GAPS = 1.0
-"""Samples between captures that are read along with them, as a share of those in them."""
-
 
 @dataclass(frozen=True)
 class SampleFile:
@@ -61,17 +58,7 @@ class SampleFile:
         ...     SampleFile(Path(folder) / "iq", channels=2).read(1, 3)[:, 0].tolist()
         [[4, 5], [8, 9]]
         """
-        wanted = (last - first) * self.channels * _COMPONENTS
-        with naming(self.path):
-            counts = np.fromfile(self.path, _COUNT, wanted, offset=first * self.sample_bytes)
-        if counts.size < wanted:
-            raise CampaignError(
-                f"ends at sample {len(self)}, while it is read",
-                self.path,
-                f"at least {last} samples, as there were",
-                "The file was cut short or is being copied; copy it again and run the workflow again.",
-            )
-        return counts.reshape(-1, self.channels, _COMPONENTS)
+        return self._read([(first, last)]).reshape(-1, self.channels, _COMPONENTS)
 
     def captures(self, start: NDArray[np.int64], length: int) -> NDArray[np.int16]:
         """Return some captures, each of `length` samples from its `start` on, (pulse, sample, channel, 2) int16.
@@ -83,13 +70,34 @@ class SampleFile:
         length
             Samples of each.
         """
+        shape = len(start), length, self.channels, _COMPONENTS
         first, last = int(start[0]), int(start[-1]) + length
-        if last - first > (1 + GAPS) * length * len(start):  # little of what lies between is wanted
-            return np.stack([self.read(int(one), int(one) + length) for one in start])
-        span = self.read(first, last)
         if last - first == length * len(start) and (np.diff(start) == length).all():
-            return span.reshape(len(start), length, self.channels, _COMPONENTS)
-        return np.stack([span[one - first : one - first + length] for one in start])
+            return self._read([(first, last)]).reshape(shape)
+        return self._read([(one, one + length) for one in start.tolist()]).reshape(shape)
+
+    def _read(self, spans: list[tuple[int, int]]) -> NDArray[np.int16]:
+        """Return the counts of some spans of samples, one after the other."""
+        counts = np.empty(sum(last - first for first, last in spans) * self.sample_bytes, np.uint8)
+        with naming(self.path), self.path.open("rb", buffering=0) as stream:
+            filled = memoryview(counts.data)
+            for first, last in spans:
+                size = (last - first) * self.sample_bytes
+                stream.seek(first * self.sample_bytes)
+                while size:
+                    count = stream.readinto(filled[:size])
+                    if not count:
+                        raise self._cut_short(last)
+                    size, filled = size - count, filled[count:]
+        return counts.view(_COUNT)
+
+    def _cut_short(self, last: int) -> CampaignError:
+        return CampaignError(
+            f"ends at sample {len(self)}, while it is read",
+            self.path,
+            f"at least {last} samples, as there were",
+            "The file was cut short or is being copied; copy it again and run the workflow again.",
+        )
 
     def channel(self, index: int) -> "ChannelOfFile":
         """Return one channel, to be read by slices."""

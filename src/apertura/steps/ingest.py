@@ -5,6 +5,7 @@ from pathlib import Path
 import xarray as xr
 
 from apertura.campaign import Campaign
+from apertura.digests import digest_of
 from apertura.errors import CampaignError
 from apertura.ingest import open_recording, read_track
 from apertura.ingest.recording import Recording
@@ -28,7 +29,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     log = read_track(campaign.track_file(flight, node), node=node)
     track = stamped(log, "track", modules=[__name__], inputs=logged.sources.digests)
     recording = open_recording(campaign.recording_files(flight, node))
-    recording.check_hash()
+    recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
     preamble = () if recording.framing is None else (_preamble(recording, campaign),)
     recorded = result_of(campaign, "raw", flight, node).begin(
         campaign.root, [__name__], further=[campaign.relative(path) for path in preamble]

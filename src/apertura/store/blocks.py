@@ -29,7 +29,7 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
         The array.
     blocks
         It, some rows at a time, in order. On the disk it lies in chunks of some 8 MB, however blocks are cut, not
-        compressed: echoes are mostly noise.
+        compressed: echoes are mostly noise. A chunk of nothing but zeros is left out.
 
     Raises
     ------
@@ -47,12 +47,12 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
             count = min(chunk - filled, len(block) - taken)
             held[filled : filled + count] = block[taken : taken + count]
             filled, taken = filled + count, taken + count
-            if filled == chunk:
-                array[written : written + chunk], written, filled = held, written + chunk, 0
+            if filled == chunk or written + filled == rows:
+                if held[:filled].any():
+                    array[written : written + filled] = held[:filled]
+                written, filled = written + filled, 0
     if written + filled != rows:
         raise ValueError(f"{written + filled} rows of {name}: must be {rows}")
-    if filled:
-        array[written:] = held[:filled]
 
 
 def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
