@@ -6,28 +6,26 @@ from pathlib import Path
 
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
-from apertura.ingest.recording import Recording
 
-_BASE_BYTES = 150_000_000  # the interpreter and its libraries
-_READ_BYTES = 3  # per byte of a recording while it is read in; measured: 4.4 at ingest, 6.9 where a pair becomes echo
-_RAW_SHARE = 0.85  # of the bytes recorded stay in the stage raw, compressed; measured: 0.88
-_ECHO_SHARE = 0.5  # of 8 bytes per pulse and subcarrier; measured: 0.65
+_BASE_BYTES = 120_000_000  # the interpreter and its libraries
+_CAPTURE_BYTES = 1100  # of the metadata of a capture while they are read; samples are read in blocks
+_RAW_BYTES = 10  # of a capture in the stage raw, compressed
+_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, which are not compressed; the rest for pulses that drop out
 _PIXEL_BYTES = 24  # per pixel and pair: image, its part of the cube, three rasters, compressed; 60 before
-_SMALL_BYTES = 1_000_000_000  # what every machine has
 
 MEMINFO = Path("/proc/meminfo")
 
 
 def check_memory(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield a problem where the largest recording does not fit into memory while it is read in."""
+    """Yield a problem where the metadata of the longest recording do not fit into memory; samples need none."""
     if not inspected.recordings:
         return
-    key, largest = max(inspected.recordings.items(), key=lambda item: _bytes(item[1]))
-    needed = _BASE_BYTES + _READ_BYTES * _bytes(largest)
-    if largest.framing is None and needed > _SMALL_BYTES and needed > (free := free_memory()):
+    key, largest = max(inspected.recordings.items(), key=lambda item: len(item[1].captures.start))
+    captures = len(largest.captures.start)
+    needed = _BASE_BYTES + _CAPTURE_BYTES * captures
+    if needed > (free := free_memory()):
         yield CampaignError(
-            f"{_bytes(largest) / 1e9:.1f} GB recorded by {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of "
-            "memory",
+            f"{captures} captures of {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of memory",
             where=largest.files[-1],
             expected=f"at most the {free / 1e9:.1f} GB that this process may use now",
             remedy="Run on a machine with more memory, end other work, or cut the recording into several flights.",
@@ -69,7 +67,7 @@ def disk_bytes(inspected: Inspected) -> dict[str, int]:
     """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
     campaign, waveform = inspected.campaign, inspected.waveform
     raw = sum(
-        round(_RAW_SHARE * _bytes(recording))
+        _RAW_BYTES * len(recording.captures.start)
         for key, recording in inspected.recordings.items()
         if recording.framing is None and not _made(inspected, "raw", *key)
     )
@@ -86,10 +84,6 @@ def disk_bytes(inspected: Inspected) -> dict[str, int]:
             if flight.kind == "image" and not _made(inspected, "image", flight.name, pair):
                 images += _PIXEL_BYTES * pixels
     return {"raw": raw, "echo": echo, "images": images}
-
-
-def _bytes(recording: Recording) -> int:
-    return len(recording.samples) * recording.samples.sample_bytes
 
 
 def _made(inspected: Inspected, stage: str, *where: str) -> bool:
