@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apertura import progress as told
-from apertura.progress import Counted, progress, progress_file, telling
+from apertura.progress import Counted, progress, telling, told_at
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def counted(path):
 
 
 def test_a_step_tells_at_most_once_a_second_and_in_the_end(tmp_path, clock):
-    path = progress_file(tmp_path, ["image", "f01", "uav1-uav2"])
+    path = tmp_path.joinpath(*told_at(["image", "f01", "uav1-uav2"]))
     with telling(path):
         with progress("tiles", 10) as done:
             assert counted(path) == (0, 10)
@@ -46,13 +46,13 @@ def test_work_outside_a_step_tells_nothing_and_writes_nothing(tmp_path, monkeypa
 
 
 def test_a_folder_that_takes_no_file_does_not_end_the_step(tmp_path):
-    (tmp_path / "results").write_text("a file where a folder should be")
-    with telling(progress_file(tmp_path, ["cube"])), progress("images", 2) as done:
+    (tmp_path / ".run").write_text("a file where a folder should be")
+    with telling(tmp_path.joinpath(*told_at(["cube"]))), progress("images", 2) as done:
         done(2)
 
 
 def test_a_failing_step_leaves_no_progress_behind(tmp_path):
-    path = progress_file(tmp_path, ["echo", "f01", "a-a"])
+    path = tmp_path.joinpath(*told_at(["echo", "f01", "a-a"]))
     with pytest.raises(ZeroDivisionError), telling(path), progress("pulses", 0) as done:
         done(1 // 0)
     assert not path.exists()

@@ -102,11 +102,19 @@ def _options(
 
 
 @app.command(context_settings=PASS_ON)
-def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES, paranoid: Paranoid = False) -> None:
+def run(
+    context: typer.Context,
+    campaign: CampaignFolder,
+    cores: Cores = ALL_CORES,
+    paranoid: Paranoid = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only errors, and what to open")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
+) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
-    from apertura.workflow import run_workflow
+    from apertura.workflow import Show, run_workflow
 
-    raise SystemExit(run_workflow(campaign, cores, *context.args, paranoid=paranoid))
+    show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
+    raise SystemExit(run_workflow(campaign, cores, *context.args, paranoid=paranoid, show=show))
 
 
 @app.command()

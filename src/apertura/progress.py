@@ -8,31 +8,29 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-RUN_FOLDER = "results/.run"
-"""What a run keeps of itself: its journal, and a file for each step under way."""
+RUN = ".run"
+"""Folder of the results: what a run keeps of itself, its journal and a file for each step under way."""
 
 _BETWEEN_S = 1.0
 _told_in: list[Path] = []
 """Where this process tells; empty where it is no step of a campaign."""
 
 
-def progress_file(root: Path, step: Sequence[str]) -> Path:
-    """Return where a step tells how far it is.
+def told_at(step: Sequence[str]) -> tuple[str, ...]:
+    """Return where below the results a step tells how far it is.
 
     Parameters
     ----------
-    root
-        The campaign folder.
     step
         The words after ``apertura step``: its name, flight and pair.
 
     Examples
     --------
-    >>> print(progress_file(Path("campaign"), ["image", "f01", "uav1-uav2"]))
-    campaign/results/.run/steps/image/f01/uav1-uav2.json
+    >>> print(*told_at(["image", "f01", "uav1-uav2"]), sep="/")
+    .run/steps/image/f01/uav1-uav2.json
     """
     *folders, name = step
-    return Path(root, RUN_FOLDER, "steps", *folders, f"{name}.json")
+    return RUN, "steps", *folders, f"{name}.json"
 
 
 @contextmanager
@@ -69,9 +67,9 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     >>> with TemporaryDirectory() as folder, telling(Path(folder, "image.json")), progress("tiles", 8) as done:
     ...     done(2)
     ...     print(Path(folder, "image.json").read_text())
-    {"what": "tiles", "done": 0, "total": 8, "at": ...}
+    {"what": "tiles", "done": 0, "total": 8, "since": ..., "at": ...}
     """
-    lock, finished, told_s = threading.Lock(), 0, time.monotonic()
+    lock, finished, told_s, since_s = threading.Lock(), 0, time.monotonic(), round(time.time(), 1)
 
     def done(more: int) -> None:
         nonlocal finished, told_s
@@ -79,11 +77,11 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
             finished += more
             if (now := time.monotonic()) - told_s >= _BETWEEN_S:
                 told_s = now
-                _tell(what, finished, total)
+                _tell(what, finished, total, since_s)
 
-    _tell(what, 0, total)
+    _tell(what, 0, total, since_s)
     yield done
-    _tell(what, finished, total)
+    _tell(what, finished, total, since_s)
 
 
 class Counted:
@@ -112,11 +110,12 @@ class Counted:
         self._done(1)
 
 
-def _tell(what: str, done: int, total: int) -> None:
+def _tell(what: str, done: int, total: int, since_s: float) -> None:
     """Write the file anew, whole at any instant; what only shows how far a step is never ends it."""
+    report = {"what": what, "done": done, "total": total, "since": since_s, "at": round(time.time(), 1)}
     for file in _told_in[-1:]:
         beside = file.with_suffix(".partial")
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            beside.write_text(json.dumps({"what": what, "done": done, "total": total, "at": round(time.time(), 1)}))
+            beside.write_text(json.dumps(report))
             beside.replace(file)
