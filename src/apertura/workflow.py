@@ -20,6 +20,7 @@ from apertura.check import print_problems
 from apertura.check.stale import forms_results, stale_lines, stale_results
 from apertura.lineage import STUDY
 from apertura.lock import hold
+from apertura.paths import shipped
 from apertura.progress import RUN
 from apertura.runs.expectation import Outlook
 from apertura.runs.failure import failures
@@ -113,8 +114,10 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
     command = _command(root, cores, [*arguments, *forced])
     if forms:
-        screen = Screen(campaign, Outlook(campaign, 0 if elsewhere else cores), quiet=show != "steps")
-        return _formed(root, command, _Files.of(campaign), screen, aloud=show == "snakemake")
+        files, at_once = _Files.of(campaign), 0 if elsewhere else cores
+        note(files.journal, "start", cores=at_once)
+        screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
+        return _formed(root, command, files, screen, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         files = _Files.apart(scratch)
         if show != "snakemake" and any(map(_DRY_RUN.fullmatch, arguments)):
@@ -125,7 +128,6 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
 def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen, *, aloud: bool) -> int:
     """Run snakemake with its output in a file, and show what its journal tells."""
     reader, killed, status = Reader(files.journal), _killed_for_memory(), INTERRUPTED
-    note(files.journal, "start")
     try:
         with files.log.open("wb") as output, files.log.open("rb") as said, screen:
 
@@ -168,7 +170,7 @@ def _say(*lines: str) -> None:
 
 
 def _command(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
-    folder = _workflow_folder()
+    folder = shipped()
     own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
     own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
     return [sys.executable, "-P", "-m", RECORDER, *own, *arguments]
@@ -226,9 +228,3 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)  # steps that outlive snakemake, too: work in progress survives it
     process.wait()
-
-
-def _workflow_folder() -> Path:
-    """Return where the root Snakefile lies: inside the installed package, or beside its sources."""
-    package = Path(__file__).parent
-    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())

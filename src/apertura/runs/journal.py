@@ -89,6 +89,8 @@ class Run:
         Number of a job → the job, of those that began.
     said
         Errors of the workflow itself.
+    cores
+        That it uses at once; 0 on a cluster.
     status
         Exit status; None while it runs, or after it was killed.
     begun_s, ended_s
@@ -98,6 +100,7 @@ class Run:
     planned: dict[str, int] = field(default_factory=dict)
     jobs: dict[int, Job] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
+    cores: int = 0
     status: int | None = None
     begun_s: float = 0.0
     ended_s: float | None = None
@@ -144,7 +147,7 @@ class Run:
         elif event == "said":
             self.said.append(str(line["message"]))
         elif event == "start":
-            self.begun_s = at
+            self.begun_s, self.cores = at, int(line["cores"])
         elif event == "end":
             self.status, self.ended_s = int(line["status"]), at
 

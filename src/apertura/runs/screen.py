@@ -92,15 +92,15 @@ def table(rows: list[Bar]) -> "Table":
     from rich.text import Text
 
     grid = Table.grid(expand=True, padding=(0, 2, 0, 0))
-    grid.add_column(no_wrap=True, overflow="ellipsis", max_width=36)
+    grid.add_column(no_wrap=True, overflow="ellipsis", max_width=40)
     grid.add_column(ratio=1, min_width=8)
     grid.add_column(no_wrap=True, justify="right")
     grid.add_column(no_wrap=True, justify="right")
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
-        grid.add_row(Text(row.name), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
+        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
     if len(steps) > _MOST_BARS:
-        grid.add_row(Text(f"and {len(steps) - _MOST_BARS} more", style="dim"))
+        grid.add_row(Text(f"{'':8}and {len(steps) - _MOST_BARS} more", style="dim"))
     grid.add_row(Text(whole.name, style="bold"), ProgressBar(1.0, whole.fraction), "", Text(whole.left, style="bold"))
     return grid
 
@@ -149,8 +149,9 @@ class Screen:
             if not told and not job.running:
                 self._ended(job, run)
             self._told[number, job.begun_s] = not job.running
-        if self._live and run.planned:
-            self._live.update(table(bars(self._campaign, run, self._outlook)), refresh=True)
+        if self._live:
+            shown_now = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
+            self._live.update(shown_now, refresh=True)
 
     def ended(self, run: Run) -> None:
         """Say that all is done."""
