@@ -28,13 +28,13 @@ def failures(root: Path, run: Run, log: Path) -> Iterator[str]:
     for job in run.failed:
         told.setdefault(_message(root / job.log if job.log else None), []).append(job.log)
     if not told:
-        said = [line for message in run.said for line in message.splitlines()[-3:] if line.strip()]
-        told = {shown(line, 2000): [] for line in said or _tail(log)[-1:]}
+        told = {shown(" ".join(message.split()), 2000): [] for message in run.said or _tail(log)[-1:]}
     for message, logs in told.items():
         yield f"error: {message.removeprefix(_SAID)}"
         for name in filter(None, logs):
             yield f"  log of the step: {shown(root / name, 400)}"
-    yield f"  log of snakemake: {shown(log, 400)}"
+    if log.is_relative_to(root):  # that of a dry run is not kept
+        yield f"  log of snakemake: {shown(log, 400)}"
 
 
 def _message(log: Path | None) -> str:
@@ -42,9 +42,9 @@ def _message(log: Path | None) -> str:
     for line in reversed(lines):
         if line.startswith(_SAID):
             return shown(line, 2000)
-    if not lines:
-        return "a step ended without a word: was it killed, or did its machine end?"
-    return f"a defect of ours, please report it with the log: {shown(lines[-1], 2000)}"
+    if any(line.startswith("Traceback") for line in lines):
+        return f"a defect of ours, please report it with the log: {shown(lines[-1], 2000)}"
+    return "a step ended without a word: was it killed, or did its machine end?"
 
 
 def _tail(log: Path) -> list[str]:

@@ -55,4 +55,5 @@ def _line(event: LogEvent | None, said: dict[str, Any]) -> tuple[str, dict[str, 
 
 if __name__ == "__main__":
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
+    sys.argv[0] = "snakemake"  # its messages begin with it
     main()

@@ -59,6 +59,8 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
         if kept:
             more = f" and {len(kept) - 1} more" if len(kept) > 1 else ""
             print(f"kept what it has not made: {shown(campaign.relative(kept[0]), 400)}{more}")
+        elif not unfinished_only:
+            remove(campaign.results)  # with nothing in it but the lock
 
 
 def in_bytes(size: int) -> str:

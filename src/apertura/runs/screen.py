@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 NOTHING = "Nothing to be done: every result is there, and up to date."
 
 _MOST_BARS = 12
+_MARGIN = 3  # a terminal shows ^C behind the last line, which must not break there
 
 
 def span(seconds: float) -> str:
@@ -150,8 +151,10 @@ class Screen:
                 self._ended(job, run)
             self._told[number, job.begun_s] = not job.running
         if self._live:
-            shown_now = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
-            self._live.update(shown_now, refresh=True)
+            from rich.constrain import Constrain
+
+            rows = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
+            self._live.update(Constrain(rows, self._live.console.width - _MARGIN), refresh=True)
 
     def ended(self, run: Run) -> None:
         """Say that all is done."""

@@ -10,7 +10,8 @@ from apertura.runs.expectation import Outlook
 from apertura.runs.failure import failures
 from apertura.runs.inventory import states
 from apertura.runs.journal import Reader, Run
-from apertura.runs.screen import bars, listed, span, table
+from apertura.runs.screen import NOTHING, bars, listed, span, table
+from apertura.signals import INTERRUPTED
 
 
 def print_status(campaign: Campaign) -> None:
@@ -25,7 +26,7 @@ def print_status(campaign: Campaign) -> None:
             print("it is planning, or was started without `apertura run`: nothing known of its steps")
     else:
         print(_ended(run))
-    if run.failed or run.status:
+    if run.status != INTERRUPTED and (run.failed or run.status):
         print(*failures(campaign.root, run, campaign.result("logs", "snakemake.log")), sep="\n")
     if not held:
         counts = Counter[str]()
@@ -53,10 +54,16 @@ def _ended(run: Run) -> str:
     if not run.begun_s:
         return "no run is under way, and none is remembered"
     begun = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.begun_s))
-    done = f"{len(run.finished)} of {run.total} steps done"
+    done = (
+        f"{len(run.finished)} of {run.total} steps done"
+        if run.planned
+        else "before any step"
+        if run.status
+        else NOTHING
+    )
     if run.ended_s is None:
         return (
             f"no run is under way; the last one, begun {begun}, was killed, {done}. Run again: it goes on where it was."
         )
-    how = {0: "ended well", 130: "was interrupted"}.get(run.status or 0, f"failed with {run.status}")
-    return f"no run is under way; the last one, begun {begun}, {how} after {span(run.ended_s - run.begun_s)}, {done}"
+    how = {0: "ended well", INTERRUPTED: "was interrupted"}.get(run.status or 0, f"failed with {run.status}")
+    return f"no run is under way; the last one, begun {begun}, {how} after {span(run.ended_s - run.begun_s)}: {done}"

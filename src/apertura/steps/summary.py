@@ -96,18 +96,26 @@ def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
 
 
 def _print_flags(console: "Console", reports: Reports) -> None:
-    """Print each flag once: what was measured, of which images, what it means and what to look at first."""
-    raised: dict[tuple[str, str], list[str]] = {}
+    """Print each flag with what it means and what to look at first, and below it what was measured of which images."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    raised: dict[str, dict[str, list[str]]] = {}
     for (flight, name), report in reports.items():
         for flag, line in report["flags"].items():
-            raised.setdefault((flag, line), []).append(f"{flight} {name}")
-    for (flag, line), images in raised.items():
-        more = f" and {len(images) - 3} more" if len(images) > 3 else ""
-        console.print(f"[yellow]{flag}[/yellow] of {', '.join(images[:3])}{more}: ", end="")
-        console.print(line, markup=False)
-        if flag in meanings():
-            means, look = meanings()[flag]
-            console.print(f"    means: {means}\n    look at: {look}", markup=False)
+            images = raised.setdefault(flag, {})
+            if name != "fused" or not any(known in line for known in images):  # it quotes its pairs
+                images.setdefault(line, []).append(f"{flight} {name}")
+    for flag, lines in raised.items():
+        means, look = meanings().get(flag, ("", ""))
+        console.print(Text.assemble((flag, "yellow"), f": {means}" if means else ""))
+        told = [f"{_some(images)}: {line}" for line, images in lines.items()]
+        for line in [*told, *([f"look at: {look}"] if look else [])]:
+            console.print(Padding(Text(line), (0, 0, 0, 4)))
+
+
+def _some(names: list[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _table(reports: Reports) -> "Table":
