@@ -96,7 +96,7 @@ def table(rows: list[Bar]) -> "Table":
     grid.add_column(no_wrap=True, overflow="ellipsis", max_width=40)
     grid.add_column(ratio=1, min_width=8)
     grid.add_column(no_wrap=True, justify="right")
-    grid.add_column(no_wrap=True, justify="right")
+    grid.add_column(no_wrap=True, justify="right", min_width=len("about 2.5 h left"))
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
         grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
