@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-_HEADINGS = ("image", "verdict", "lost", "budget", "not stated", "in phase", "error", "pulses", "flags")
+_HEADINGS = ("image", "verdict", "lost", "budget", "in phase", "error <", "pulses", "flags")
+_WHOLE = {"image", "verdict", "lost", "error <", "pulses"}
 _WIDE = 120
 _OPENED = {
     "db.tif": "in a GIS",
@@ -24,6 +25,7 @@ _OPENED = {
     "quicklook.png": "with what the image says of itself",
 }
 _MOST_FLIGHTS = 3
+_NOT_STATED = "not stated"
 _ROW = re.compile(r"^\| (`[a-z_`, ]+`) \| (.+?) \| (.+?) \| `.*\|$", re.MULTILINE)
 
 Reports = Mapping[tuple[str, str], Mapping[str, Any]]
@@ -49,8 +51,9 @@ def print_summary(campaign: Campaign) -> None:
     if not console.is_terminal:
         console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(reports))
-    if any(map(_silent, reports.values())):
-        console.print("not stated: causes of which nobody said how large they are; image.json tells what they would do")
+    silent = dict.fromkeys(cause for report in reports.values() for cause in _silent(report))
+    if silent:
+        console.print(f"not stated, so not in the budget; image.json tells what they would do: {', '.join(silent)}")
     _print_flags(console, reports)
     print_products(campaign)
 
@@ -122,9 +125,9 @@ def _table(reports: Reports) -> "Table":
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=0)
     for heading in _HEADINGS:
-        table.add_column(heading, overflow="fold", no_wrap=heading == "image")
+        table.add_column(heading, overflow="fold", no_wrap=heading in _WHOLE)
     for (flight, name), report in reports.items():
         focus, pulses, coherence = (report.get(key) or {} for key in ("focus", "pulses", "coherence"))
         mean, alone = coherence.get("mean"), len((report.get("fusion") or {}).get("left_out", ()))
@@ -135,11 +138,10 @@ def _table(reports: Reports) -> "Table":
             focus.get("verdict", ""),
             f"{abs(focus['loss_db']):.1f} dB" if "loss_db" in focus else "",
             _expected(report),
-            str(_silent(report) or ""),
             f"{together} {alone} left out".strip() if alone else together,
-            f"< {report['numerical_error_db']:.1f} dB",
-            "" if used is None else f"{used} of {used + dropped}",
-            ", ".join(report["flags"]) or "none",
+            f"{report['numerical_error_db']:.1f} dB",
+            "" if used is None else f"{used}/{used + dropped}",
+            str(len(report["flags"]) or "none"),
         )
     return table
 
@@ -149,12 +151,12 @@ def _expected(report: Mapping[str, Any]) -> str:
     focus = report.get("focus") or {}
     if "expected_db" not in focus:
         return ""
-    stated = [line for line in report.get("budget", ()) if not line["stated"].startswith("not stated")]
+    stated = [line for line in report.get("budget", ()) if not line["stated"].startswith(_NOT_STATED)]
     most = min(stated, key=lambda line: line["loss_db"], default=None)
     by = f", {most['cause']}" if most and focus["expected_db"] < -0.05 else ""
     return f"{abs(focus['expected_db']):.1f} dB{by}"
 
 
-def _silent(report: Mapping[str, Any]) -> int:
-    """Return how many causes of the budget nobody has stated."""
-    return sum(line["stated"].startswith("not stated") for line in report.get("budget", ()))
+def _silent(report: Mapping[str, Any]) -> list[str]:
+    """Return the causes of the budget whose size nobody has stated."""
+    return [line["cause"] for line in report.get("budget", ()) if line["stated"].startswith(_NOT_STATED)]
