@@ -82,6 +82,8 @@ def test_a_step_that_is_tried_again_is_under_way_and_not_failed(journal):
         '{"event": "planned", "at": 1, "jobs": {"a": "b"}}',
         '{"event": "finished", "at": 1, "job": {}}',
         '{"event": "end", "at": null, "status": 0}',
+        '{"event": "end", "at": NaN, "status": 0}',
+        '{"event": "finished", "at": 1e300, "job": 2}',
         "[" * 5000,
         "\x00\xff",
     ],
@@ -130,6 +132,36 @@ def test_what_was_timed_before_counts_until_the_run_has_times_of_its_own(finishe
     assert Outlook(campaign, cores=2).of_run(timed(campaign, 1), {}) == pytest.approx(mean)
 
 
+def test_a_share_of_an_images_tiles_takes_its_share_of_the_time(finished_tiny):
+    outlook, shares = Outlook(finished_tiny, cores=0), (8, 80)
+    runs = [
+        Run(
+            planned={"tiles": 2 * count},
+            jobs={1: Job("tiles", ("tiles", "f01", "uav1-uav1", f"1-of-{count}"), "", 0.0)},
+        )
+        for count in shares
+    ]
+    few, many = (outlook.of_jobs(run, 0.0, {})[1] for run in runs)
+    assert few == pytest.approx(10 * many)
+
+
+def test_what_the_campaign_does_not_have_is_not_looked_for(finished_tiny):
+    for where in (("/", "**"), ("f01", "../../*"), ("f01", "uav1-uav1", "1-of-8", "more"), ()):
+        assert 0 < expected_seconds(finished_tiny, "image", *where) < 10
+    assert expected_seconds(finished_tiny, "image", "/", "**") < expected_seconds(
+        finished_tiny, "image", "f01", "uav1-uav1"
+    )
+
+
+@pytest.mark.parametrize("text", ["", "s\n", "s\nnan\n", "s\n1e300\n", "s\nx\n", "t\n1\n", "\x00", "s\n\n"])
+def test_a_benchmark_that_makes_no_sense_is_none(finished_tiny, tmp_path, text):
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    before = Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {})
+    (campaign.results / "benchmarks").mkdir(exist_ok=True)
+    (campaign.results / "benchmarks/scene.tsv").write_text(text)
+    assert Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {}) == before
+
+
 def tell(campaign, step, **report):
     path = campaign.result(*told_at(step))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -154,6 +186,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
         {"what": "tiles", "done": 10, "total": 40, "since": 5.0, "at": 9.0},  # of a step before
         {"what": "tiles", "done": 50, "total": 40, "since": 2e9, "at": 2e9},
         {"what": "tiles", "done": 0, "total": 0, "since": 2e9, "at": 2e9},
+        {"what": "tiles", "done": 1, "total": 4, "since": 2e9, "at": 1e300},
         {"what": "tiles"},
         [],
     ],

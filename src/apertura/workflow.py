@@ -31,7 +31,7 @@ from apertura.signals import INTERRUPTED, STATUS_FILE
 Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
-_LOOK_S = 0.2
+_LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
 _LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
@@ -208,8 +208,9 @@ def _supervised(
     )
     try:
         while process.poll() is None:
+            began_s = time.monotonic()
             look()
-            time.sleep(_LOOK_S)
+            time.sleep(max(_LOOK_S, _REST * (time.monotonic() - began_s)))
     except BaseException:
         _end(process)
         raise

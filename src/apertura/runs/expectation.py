@@ -15,7 +15,7 @@ from typing import NamedTuple
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
 from apertura.progress import told_at
-from apertura.runs.journal import Job, Run
+from apertura.runs.journal import LAST_S, Job, Run
 
 
 class _Cost(NamedTuple):
@@ -47,6 +47,8 @@ _BESIDE = frozenset({"layers", "export", "scene"})
 """Rules that no other waits for, or hardly."""
 _MOST_BENCHMARKS = 500
 _USUAL_MPX = 0.25
+_LONGEST_S = 1e8
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, StopIteration, csv.Error)
 
 
 def expected_seconds(campaign: Campaign, rule: str, *where: str) -> float:
@@ -62,14 +64,16 @@ def expected_seconds(campaign: Campaign, rule: str, *where: str) -> float:
         Flight and node, flight and pair, or flight; nothing for the whole campaign.
     """
     cost = _COSTS.get(rule, _Cost())
-    mb = _megabytes(campaign.root, *where) if cost.mb or cost.mb_mpx else 0.0
+    mb = _megabytes(campaign, *where[:2]) if cost.mb or cost.mb_mpx else 0.0
     mpx = _megapixels(campaign) if cost.mpx or cost.mb_mpx else 0.0
     return cost.begin + cost.mb * mb + cost.mpx * mpx + cost.mb_mpx * mb * mpx
 
 
-def _megabytes(root: Path, flight: str = "*", of: str = "*") -> float:
-    """Return how much was recorded of a node, or by the nodes of a pair."""
-    files = {path for node in of.split("-") for path in (root / "raw" / flight).glob(f"{node}.*")}
+def _megabytes(campaign: Campaign, flight: str = "", of: str = "") -> float:
+    """Return how much was recorded of a node, or by the nodes of a pair; 0 of what the campaign does not have."""
+    flown = {each.name for each in campaign.flights} & {flight}
+    nodes = campaign.settings.nodes.keys() & set(of.split("-"))
+    files = [path for name in flown for node in nodes for path in (campaign.root / "raw" / name).glob(f"{node}.*")]
     return sum(path.stat().st_size for path in files) / 1e6
 
 
@@ -101,7 +105,7 @@ class Told:
         with suppress(CampaignError, OSError, ValueError, KeyError, TypeError):
             said = json.loads(campaign.result(*told_at(job.step)).read_text("utf-8"))
             told = cls(shown(said["what"]), int(said["done"]), int(said["total"]), said["since"], said["at"])
-            if told.since_s >= job.begun_s - 5 and 0 <= told.done <= told.total and told.total:
+            if 0 <= told.done <= told.total and told.total and job.begun_s - 5 <= told.since_s <= told.at_s < LAST_S:
                 return told
         return None
 
@@ -127,6 +131,11 @@ class Outlook:
         self._campaign, self._cores = campaign, cores
         self._expected = cache(lambda rule, where: expected_seconds(campaign, rule, *where))
 
+    def _expects(self, run: Run, rule: str, where: tuple[str, ...]) -> float:
+        """Return the seconds of a job before anything was timed; the tiles of a pair may be the work of many."""
+        shares = run.planned.get(rule, 0) / max(len(self._places(rule)), 1) if rule == "tiles" else 1.0
+        return self._expected(rule, where[:2]) / max(shares, 1.0)
+
     @cached_property
     def _before(self) -> dict[str, list[float]]:
         """Rule → how much longer than expected each of its jobs took, by the benchmarks of earlier runs."""
@@ -138,8 +147,8 @@ class Outlook:
     def _ratios(self, run: Run) -> dict[str, float]:
         """Return rule → how much longer than expected its jobs take; the rule '' stands for all others."""
         now: dict[str, list[float]] = defaultdict(list)
-        for job in run.finished:
-            now[job.rule].append(job.seconds() / self._expected(job.rule, job.step[1:]))
+        for job in run.finished[-_MOST_BENCHMARKS:]:
+            now[job.rule].append(max(job.seconds(), 0.1) / self._expects(run, job.rule, job.step[1:]))
         known = {rule: median(ratios) for rule, ratios in {**self._before, **now}.items()}
         return {**known, "": median(known.values()) if known else 1.0}
 
@@ -150,7 +159,7 @@ class Outlook:
             if job.running:
                 report = told.get(number)
                 paced = report.left_s if report else None
-                whole = self._expected(job.rule, job.step[1:]) * ratios.get(job.rule, ratios[""])
+                whole = self._expects(run, job.rule, job.step[1:]) * ratios.get(job.rule, ratios[""])
                 left[number] = max(whole - job.seconds(now_s), 0.0) if paced is None else paced
         return left
 
@@ -160,7 +169,7 @@ class Outlook:
         waiting = {
             rule: (
                 count,
-                fmean(self._expected(rule, where) for where in self._places(rule)) * ratios.get(rule, ratios[""]),
+                fmean(self._expects(run, rule, where) for where in self._places(rule)) * ratios.get(rule, ratios[""]),
             )
             for rule, count in run.waiting.items()
         }
@@ -192,6 +201,7 @@ def _benchmarks(folder: Path) -> Iterator[tuple[str, tuple[str, ...], float]]:
     for path in folder.rglob("*.tsv"):
         of, _, rule = path.stem.rpartition(".")
         where = (*path.parent.relative_to(folder).parts, *([of] if of else []))
-        with suppress(OSError, ValueError, KeyError), path.open(encoding="utf-8") as table:
+        with suppress(*_UNREADABLE), path.open(encoding="utf-8") as table:
             seconds = float(next(csv.DictReader(table, delimiter="\t"))["s"])
-            yield ("export_fused" if of == "fused" else rule), where, seconds
+            if rule != "tiles" and 0 < seconds < _LONGEST_S:  # nobody knows of how many shares tiles were
+                yield ("export_fused" if of == "fused" else rule), where, seconds

@@ -19,6 +19,9 @@ RECORDER, NAME = "apertura.runs.recorder", "apertura"
 """Module that is snakemake with a journal, and the name of its logger plugin."""
 
 _STEP = re.compile(r"\bapertura step ((?:[\w.-]+ ?)+)")
+LAST_S = float(1 << 33)
+"""Times from here on, in the year 2242, are none."""
+
 _LONGEST = 1 << 26  # bytes of a journal; 10^5 jobs write 3·10^7
 _NO_STEPS = {"all", "total"}
 
@@ -133,7 +136,8 @@ class Run:
     def take(self, line: Mapping[str, Any]) -> None:
         """Take a line of the journal; one that makes no sense is left out."""
         with suppress(KeyError, TypeError, ValueError, AttributeError):
-            self._take(str(line["event"]), float(line["at"]), line)
+            if 0 <= (at := float(line["at"])) < LAST_S:
+                self._take(str(line["event"]), at, line)
 
     def _take(self, event: str, at: float, line: Mapping[str, Any]) -> None:
         if event == "planned":

@@ -143,12 +143,14 @@ class Screen:
 
     def update(self, run: Run) -> None:
         """Show what is new."""
+        whole: Bar | None = None  # of many jobs; the same for all that have ended since
         for number, job in [] if self._quiet else run.jobs.items():
             told = self._told.get((number, job.begun_s))  # a job that is tried again begins anew
             if told is None and not self._live:
                 self._line(f"{_clock(job.begun_s)}  begun   {job.name}")
             if not told and not job.running:
-                self._ended(job, run)
+                whole = whole or (None if self._live else bars(self._campaign, run, self._outlook)[-1])
+                self._ended(job, whole)
             self._told[number, job.begun_s] = not job.running
         if self._live:
             from rich.constrain import Constrain
@@ -161,14 +163,13 @@ class Screen:
         done = f"{run.total} steps done in {span((run.ended_s or time.time()) - run.begun_s)}"
         self._line(done if run.planned else NOTHING)
 
-    def _ended(self, job: Job, run: Run) -> None:
+    def _ended(self, job: Job, whole: Bar | None) -> None:
         word = "failed" if job.failed else "done"
         if self._live:
             self._live.console.print(_line(word, job))
-            return
-        whole = bars(self._campaign, run, self._outlook)[-1]
-        left = f", {whole.left}" if not job.failed and (run.waiting or run.running) else ""
-        self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {whole.name}{left}")
+        elif whole:
+            left = f", {whole.left}" if not job.failed and whole.fraction < 1 else ""
+            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {whole.name}{left}")
 
     def _line(self, line: str) -> None:
         if not self._quiet:
