@@ -21,9 +21,12 @@ $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMa
 	$(BIN)/python -m compileall -q src
 	touch $@
 
+# Nothing is deleted but results that a run before has made: a folder `demo` without the mark is somebody's own.
+MARK := demo/.simulated-by-make
 demo: $(SETUP)
-	rm -rf demo
-	$(BIN)/apertura simulate demo
+	@test ! -e demo || test -e $(MARK) || { echo "error: demo/ was not made by make demo: move it away" >&2; exit 2; }
+	test -e demo || { rm -rf build/demo && $(BIN)/apertura simulate build/demo && touch build/$(MARK) && mv build/demo demo; }
+	$(BIN)/apertura clean demo --yes
 	$(BIN)/apertura run demo
 	$(BIN)/apertura verify demo
 
@@ -77,4 +80,5 @@ lock: $(SETUP)
 	    --no-annotate - --output-file requirements/uv.txt
 
 clean:
-	rm -rf $(VENV) demo build
+	test ! -e $(MARK) || rm -rf demo
+	rm -rf $(VENV) build

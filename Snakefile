@@ -1,5 +1,10 @@
 # `snakemake --directory CAMPAIGN` runs a campaign folder; `apertura run CAMPAIGN` does the same. No `configfile:`: YAML
 # from a stranger would run as code; the workflow reads and checks config/config.yaml itself.
+import os
+
+from apertura.signals import STATUS_FILE
+
+
 module apertura:
     snakefile:
         "workflow/Snakefile"
@@ -9,4 +14,5 @@ use rule * from apertura
 
 
 onsuccess:
-    shell("apertura summary 2> /dev/null || true")  # nothing to say before every image is there
+    if STATUS_FILE not in os.environ:  # `apertura run` says it on its own
+        shell("apertura summary 2> /dev/null || true")  # nothing to say before every image is there

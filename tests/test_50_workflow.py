@@ -247,6 +247,42 @@ def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number
 
 
 @pytest.mark.slow
+def test_a_run_tells_each_step_and_ends_with_what_its_images_say(tiny):
+    code, output = finished(apertura("run", tiny, "-n"))
+    assert code == 0
+    assert output.startswith("15 steps to do: ")
+    assert output.count("\n") == 1
+    assert not (tiny / "results/.run").exists()
+    code, output = finished(apertura("run", tiny))
+    assert code == 0, output
+    told = [line.split("  ") for line in output.splitlines()]
+    for word, count in (("begun", 15), ("done", 15), ("failed", 0)):
+        assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
+    assert "15 steps done in " in output
+    assert "f01 uav1-uav2" in output
+    assert "results/f01/fused/coherent_db.tif" in output
+    assert "\x1b" not in output
+    assert "Building DAG" not in output
+    assert "Building DAG" in (tiny / "results/logs/snakemake.log").read_text()
+    code, output = finished(apertura("run", tiny, "-q"))
+    assert code == 0
+    assert output.startswith("what to open")
+    assert "Building DAG" in finished(apertura("run", tiny, "-v"))[1]
+    assert "Building DAG" in finished(apertura("run", tiny, "-n", "-v"))[1]
+    assert "digraph" in finished(apertura("run", tiny, "--forceall", "--dag"))[1]
+    assert "ended well" in finished(apertura("status", tiny))[1]
+    assert not list((tiny / "results/.run").rglob("*.json"))
+
+
+@pytest.mark.slow
+def test_what_is_no_option_of_snakemake_is_one_message(tiny):
+    code, output = finished(apertura("run", tiny, "--no-such-option"))
+    assert code == 2
+    assert "error: snakemake: error: unrecognized arguments: --no-such-option\n" in output
+    assert "recorder" not in output
+
+
+@pytest.mark.slow
 def test_a_second_run_says_who_holds_the_campaign(tiny):
     larger(tiny)
     run = apertura("run", tiny, "--cores", 2)
@@ -269,5 +305,8 @@ def test_a_run_ends_with_2_where_the_campaign_is_wrong_also_if_a_step_finds_it(t
     path.write_bytes(data)
     code, output = finished(apertura("run", tiny))
     assert code == 2, output
-    assert "sha512" in output
+    assert output.count("uav1.sigmf-data: sha512") == 1
+    assert "log of the step: " in output
+    assert "results/logs/f01/uav1.ingest.log" in output
+    assert "results/logs/snakemake.log" in output
     assert "Traceback" not in output

@@ -22,7 +22,7 @@ from apertura.step_commands import app as step
 if TYPE_CHECKING:
     from apertura.campaign import Campaign
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="SAR images from campaign folders.")
+app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
 
@@ -102,11 +102,58 @@ def _options(
 
 
 @app.command(context_settings=PASS_ON)
-def run(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES, paranoid: Paranoid = False) -> None:
+def run(
+    context: typer.Context,
+    campaign: CampaignFolder,
+    cores: Cores = ALL_CORES,
+    paranoid: Paranoid = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only errors, and what to open")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
+) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
-    from apertura.workflow import run_workflow
+    from apertura.check.stale import forms_results
+    from apertura.workflow import Show, run_workflow
 
-    raise SystemExit(run_workflow(campaign, cores, *context.args, paranoid=paranoid))
+    show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
+    status = run_workflow(campaign, cores, *context.args, paranoid=paranoid, show=show)
+    if status == 0 and forms_results(["", *context.args]):
+        opened = _opened(campaign)
+        from apertura.steps.summary import is_finished, print_products, print_summary
+
+        if is_finished(opened):  # not after `--until`
+            print_products(opened) if quiet else print_summary(opened)
+    raise SystemExit(status)
+
+
+@app.command()
+def status(campaign: CampaignFolder = HERE) -> None:
+    """Tell what a run does, from another terminal: steps done, under way and left, time left, the last error."""
+    opened = _opened(campaign)
+    from apertura.runs.status import print_status
+
+    print_status(opened)
+
+
+@app.command("list")
+def list_results(campaign: CampaignFolder = HERE) -> None:
+    """List flights and pairs, and which of their results are finished, stale or missing, with their sizes."""
+    opened = _opened(campaign)
+    from apertura.runs.inventory import print_list
+
+    print_list(opened)
+
+
+@app.command()
+def clean(
+    campaign: CampaignFolder,
+    wip: Annotated[bool, typer.Option("--wip", help="only work in progress that a killed run has left")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask")] = False,
+) -> None:
+    """Remove what the workflow has made, and nothing else; not while a run holds the campaign."""
+    opened = _opened(campaign)
+    from apertura.runs.removal import clean as remove_results
+
+    remove_results(opened, unfinished_only=wip, agreed=yes)
 
 
 @app.command()

@@ -56,3 +56,15 @@ def leave_working_folder(path: Path) -> Path:
     absolute = path.absolute()
     os.chdir(Path(__file__).parent)
     return absolute
+
+
+def shipped() -> Path:
+    """Return where the root Snakefile lies, with profiles and tables: in the installed package, or beside its sources.
+
+    Examples
+    --------
+    >>> (shipped() / "Snakefile").is_file()
+    True
+    """
+    package = Path(__file__).parent
+    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())

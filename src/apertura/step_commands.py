@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from apertura.paths import leave_working_folder
+from apertura.progress import telling, told_at
 
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 
@@ -20,7 +21,9 @@ def _run(function: str, campaign: Path, *arguments: str, **options: object) -> N
     from apertura.campaign import Campaign
 
     started, campaign = Path.cwd(), leave_working_folder(campaign)
-    written = pkgutil.resolve_name(function)(Campaign.load(campaign), *arguments, **options)
+    opened = Campaign.load(campaign)
+    with telling(opened.result(*told_at([function.rpartition(":")[2], *arguments]))):
+        written = pkgutil.resolve_name(function)(opened, *arguments, **options)
     for path in [written] if isinstance(written, Path) else written:
         print(path.relative_to(started) if path.is_relative_to(started) else path)
 

@@ -2,29 +2,79 @@
 
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Literal
 
+from apertura.atomic import remove
 from apertura.campaign import Campaign
 from apertura.check import print_problems
-from apertura.check.stale import forms_results, stale_results
+from apertura.check.stale import forms_results, stale_lines, stale_results
 from apertura.lineage import STUDY
 from apertura.lock import hold
-from apertura.signals import STATUS_FILE
+from apertura.paths import shipped
+from apertura.progress import RUN
+from apertura.runs.expectation import Outlook
+from apertura.runs.failure import failures
+from apertura.runs.journal import JOURNAL, NAME, RECORDER, Reader, note
+from apertura.runs.screen import NOTHING, Screen, listed
+from apertura.signals import INTERRUPTED, STATUS_FILE
+
+Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
+_LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
 _LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
+_DRY_RUN = re.compile(r"-n|-np|--dry-?run")
+_LOG = "snakemake.log"
 
 
-def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False) -> int:
+@dataclass(frozen=True)
+class _Files:
+    """What a run keeps of itself."""
+
+    journal: Path
+    status: Path
+    log: Path
+
+    @classmethod
+    def of(cls, campaign: Campaign) -> "_Files":
+        """Return those of a run that forms results; what one before left is removed."""
+        folder, log = campaign.result(RUN), campaign.result("logs", _LOG)
+        remove(folder)
+        folder.mkdir(parents=True)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        return cls(campaign.result(RUN, "journal.jsonl"), campaign.result(RUN, "status"), log)
+
+    @classmethod
+    def apart(cls, folder: str) -> "_Files":
+        """Return those of a run that forms nothing."""
+        return cls(Path(folder, "journal.jsonl"), Path(folder, "status"), Path(folder, _LOG))
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What snakemake and its steps are told; rules call `apertura`, which need not be on the caller's PATH."""
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+        return {**os.environ, "PATH": path, STATUS_FILE: str(self.status), JOURNAL: str(self.journal)}
+
+    def status_of(self, status: int) -> int:
+        """Return snakemake's exit status, or 2 where no step has ended with a defect."""
+        told = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
+        return 2 if status == 1 and "1" not in told else status
+
+
+def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False, show: Show = "steps") -> int:
     """Run the workflow on a campaign folder; return its exit status.
 
     Parameters
@@ -37,6 +87,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         Further options and targets of snakemake.
     paranoid
         Read every source again, also those whose state is known.
+    show
+        Errors alone; a line for each step, with bars on a terminal; or all that snakemake says.
 
     Returns
     -------
@@ -48,42 +100,80 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     CampaignError
         If the campaign is not fit to run, or another run holds it.
     """
-    if print_problems(root, without=_ELSEWHERE if _runs_elsewhere(arguments) else (), stream=sys.stderr):
+    elsewhere = _runs_elsewhere(arguments)
+    if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
         return 2
-    campaign = Campaign.load(root)
-    if forms_results(["", *arguments]):
+    root = root.absolute()
+    campaign, forms = Campaign.load(root), forms_results(["", *arguments])
+    if forms:
         hold(root).close()
     stale = stale_results(campaign, paranoid=paranoid)
+    if show == "steps":
+        print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
     overtaken = [manifest for manifest in stale if not manifest.startswith(f"results/{STUDY}/")]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    folder, root = _workflow_folder(), root.absolute()
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "snakemake",
-        "--snakefile",
-        str(folder / "Snakefile"),
-        "--directory",
-        str(root),
-    ]
-    command += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores), *arguments, *forced]
-    here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
-    path = f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+    command = _command(root, cores, [*arguments, *forced])
+    if forms:
+        files, at_once = _Files.of(campaign), 0 if elsewhere else cores
+        note(files.journal, "start", cores=at_once)
+        screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
+        return _formed(root, command, files, screen, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
-        said = Path(scratch) / "status"
-        killed = _killed_for_memory()
-        status = _supervised(command, {**os.environ, "PATH": path, STATUS_FILE: str(said)})
-        told = set(said.read_text(encoding="utf-8").split()) if said.is_file() else set()
-        killed = _killed_for_memory() - killed
+        files = _Files.apart(scratch)
+        if show != "snakemake" and any(map(_DRY_RUN.fullmatch, arguments)):
+            return _previewed(root, command, files)
+        return files.status_of(_supervised(command, files.environment))
+
+
+def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen, *, aloud: bool) -> int:
+    """Run snakemake with its output in a file, and show what its journal tells."""
+    reader, killed, status = Reader(files.journal), _killed_for_memory(), INTERRUPTED
+    try:
+        with files.log.open("wb") as output, files.log.open("rb") as said, screen:
+
+            def look() -> None:
+                screen.update(reader.news())
+                if aloud:
+                    print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
+
+            status = files.status_of(_supervised(command, files.environment, output, look))
+            look()
+    finally:
+        note(files.journal, "end", status=status)
+    killed = _killed_for_memory() - killed
+    if status:
+        _say(*failures(root, reader.run, files.log))
     if status and killed:
         message = (
             f"out of memory: meanwhile the kernel has ended {killed} processes of this machine or job for lack of it"
         )
-        print(
-            f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.", file=sys.stderr
-        )
-    return 2 if status == 1 and "1" not in told else status
+        _say(f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.")
+    if not status:
+        screen.ended(reader.run)
+    return status
+
+
+def _previewed(root: Path, command: Sequence[str], files: "_Files") -> int:
+    """Say briefly what a run would do."""
+    with files.log.open("wb") as output:
+        status = files.status_of(_supervised(command, files.environment, output))
+    run = Reader(files.journal).news()
+    if status:
+        _say(*failures(root, run, files.log))
+    else:
+        print(f"{run.total} steps to do: {listed(run.planned)}" if run.planned else NOTHING)
+    return status
+
+
+def _say(*lines: str) -> None:
+    print(*lines, sep="\n", file=sys.stderr, flush=True)
+
+
+def _command(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
+    folder = shipped()
+    own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
+    own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
+    return [sys.executable, "-P", "-m", RECORDER, *own, *arguments]
 
 
 def _killed_for_memory() -> int:
@@ -100,20 +190,31 @@ def _runs_elsewhere(arguments: Sequence[str]) -> bool:
     return any(argument.startswith(("--executor", "--profile", "-e")) for argument in arguments)
 
 
-def _supervised(command: Sequence[str], environment: dict[str, str]) -> int:
+def _supervised(
+    command: Sequence[str],
+    environment: Mapping[str, str],
+    output: IO[bytes] | None = None,
+    look: Callable[[], None] = lambda: None,
+) -> int:
     """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
     process = subprocess.Popen(
         command,
         cwd=Path(__file__).parent,  # never the campaign's: see `leave_working_folder`
         env=environment,
+        stdout=output,
+        stderr=output,
         start_new_session=True,
         preexec_fn=_die_with_parent,  # noqa: PLW1509 - this process has no other threads
     )
     try:
-        return process.wait()
+        while process.poll() is None:
+            began_s = time.monotonic()
+            look()
+            time.sleep(max(_LOOK_S, _REST * (time.monotonic() - began_s)))
     except BaseException:
         _end(process)
         raise
+    return process.returncode
 
 
 def _die_with_parent() -> None:
@@ -128,9 +229,3 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)  # steps that outlive snakemake, too: work in progress survives it
     process.wait()
-
-
-def _workflow_folder() -> Path:
-    """Return where the root Snakefile lies: inside the installed package, or beside its sources."""
-    package = Path(__file__).parent
-    return next(root for root in (package / "_workflow", package.parents[1]) if (root / "Snakefile").is_file())

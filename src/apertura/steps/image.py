@@ -23,6 +23,7 @@ from apertura.load.budget import arithmetic_line, budget_of
 from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
+from apertura.progress import Counted, progress
 from apertura.provenance import sha256_file
 from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
@@ -119,8 +120,9 @@ class _Work:
         """Compute some tiles as planned."""
         line = self.formation.plan.setting.line
         print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
-        if windows:
-            compute_tiles(self.formation.image, windows, target, threads=self.threads)
+        with progress("tiles", len(windows)) as done:
+            if windows:
+                compute_tiles(self.formation.image, windows, Counted(target, done), threads=self.threads)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:

@@ -1,20 +1,43 @@
-"""`apertura summary`: what every image of a finished campaign says of itself, in one table with its flags below."""
+"""`apertura summary`: what every image of a finished campaign says of itself, its flags explained, and what to open."""
 
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
 from apertura.documents import undamaged
 from apertura.errors import shown
+from apertura.paths import shipped
 from apertura.store import open_listed
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
-_HEADINGS = ("flight", "image", "focus", "expected", "pairs in phase", "numerical error", "pulses", "dropped", "flags")
+_HEADINGS = ("image", "verdict", "lost", "budget", "in phase", "error <", "pulses", "flags")
+_WHOLE = {"image", "verdict", "lost", "error <", "pulses"}
+_WIDE = 120
+_OPENED = {
+    "db.tif": "in a GIS",
+    "coherent_db.tif": "in a GIS",
+    "noncoherent_db.tif": "in a GIS, added without phases",
+    "quicklook.png": "with what the image says of itself",
+}
+_MOST_FLIGHTS = 3
+_NOT_STATED = "not stated"
+_ROW = re.compile(r"^\| (`[a-z_`, ]+`) \| (.+?) \| (.+?) \| `.*\|$", re.MULTILINE)
+
+Reports = Mapping[tuple[str, str], Mapping[str, Any]]
+
+
+def is_finished(campaign: Campaign) -> bool:
+    """Return whether every image has its report."""
+    return all(campaign.result(*image, "image.json").is_file() for image in _images(campaign))
 
 
 def print_summary(campaign: Campaign) -> None:
-    """Print verdict, expected loss, coherence, numerical error, pulses and flags of each image; each flag once, whole.
+    """Print a row for each image, every flag once with what it means and what to look at, and which files to open.
 
     Raises
     ------
@@ -23,20 +46,48 @@ def print_summary(campaign: Campaign) -> None:
     """
     from rich.console import Console
 
-    reports = {
-        (flight.name, name): _report(campaign, flight.name, name)
-        for flight in campaign.image_flights
-        for name in (*flight.pairs, "fused")
-    }
-    console = Console(width=max(120, Console().width))
+    reports = {image: _report(campaign, *image) for image in _images(campaign)}
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(reports))
-    said: set[str] = set()
-    for (flight, _), report in reports.items():
-        for flag, line in report["flags"].items():
-            if line not in said:
-                said.add(line)
-                console.print(f"[yellow]{flag}[/yellow] (flight {flight}): ", end="")
-                console.print(line, markup=False)
+    silent = dict.fromkeys(cause for report in reports.values() for cause in _silent(report))
+    if silent:
+        console.print(f"not stated, so not in the budget; image.json tells what they would do: {', '.join(silent)}")
+    _print_flags(console, reports)
+    print_products(campaign)
+
+
+def print_products(campaign: Campaign) -> None:
+    """Print which files to open, of the first flights."""
+    print(f"what to open, in {campaign.root}:")
+    flights = campaign.image_flights
+    for flight in flights[:_MOST_FLIGHTS]:
+        for name, why in _OPENED.items():
+            path = campaign.result(flight.name, "fused", name)
+            if path.is_file():
+                print(f"  {campaign.relative(path)}  {why}")
+    if len(flights) > _MOST_FLIGHTS:
+        print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
+
+
+@cache
+def meanings() -> dict[str, tuple[str, str]]:
+    """Return flag → what it means, and what to look at first, as docs/flags.md tells them.
+
+    Examples
+    --------
+    >>> meanings()["saturated_radar"]
+    ('samples at the end stops of the converter', 'gain')
+    """
+    text = (shipped() / "docs" / "flags.md").read_text(encoding="utf-8")
+    rows = _ROW.findall(text)
+    return {name: (means, look) for names, means, look in rows for name in re.findall(r"[a-z_]+", names)}
+
+
+def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
+    for flight in campaign.image_flights:
+        yield from ((flight.name, name) for name in (*flight.pairs, "fused"))
 
 
 def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
@@ -47,29 +98,65 @@ def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
         return {**report, "flags": flags, "numerical_error_db": float(report["numerical_error_db"])}
 
 
-def _table(reports: dict[tuple[str, str], dict[str, Any]]) -> "Table":
+def _print_flags(console: "Console", reports: Reports) -> None:
+    """Print each flag with what it means and what to look at first, and below it what was measured of which images."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    raised: dict[str, dict[str, list[str]]] = {}
+    for (flight, name), report in reports.items():
+        for flag, line in report["flags"].items():
+            images = raised.setdefault(flag, {})
+            if name != "fused" or not any(known in line for known in images):  # it quotes its pairs
+                images.setdefault(line, []).append(f"{flight} {name}")
+    for flag, lines in raised.items():
+        means, look = meanings().get(flag, ("", ""))
+        console.print(Text.assemble((flag, "yellow"), f": {means}" if means else ""))
+        told = [f"{_some(images)}: {line}" for line, images in lines.items()]
+        for line in [*told, *([f"look at: {look}"] if look else [])]:
+            console.print(Padding(Text(line), (0, 0, 0, 4)))
+
+
+def _some(names: list[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _table(reports: Reports) -> "Table":
+    from rich import box
     from rich.table import Table
 
-    table = Table(title="what each image says of itself", title_justify="left")
+    table = Table(box=box.SIMPLE_HEAD, padding=0)
     for heading in _HEADINGS:
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading, overflow="fold", no_wrap=heading in _WHOLE)
     for (flight, name), report in reports.items():
         focus, pulses, coherence = (report.get(key) or {} for key in ("focus", "pulses", "coherence"))
-        lost = f", {abs(focus['loss_db']):.1f} dB lost" if "loss_db" in focus else ""
-        unstated = sum(line["stated"].startswith("not stated") for line in report.get("budget", ()))
-        silent = f", {unstated} causes not stated" if unstated else ""
-        expected = f"{abs(focus['expected_db']):.1f} dB{silent}" if "expected_db" in focus else ""
         mean, alone = coherence.get("mean"), len((report.get("fusion") or {}).get("left_out", ()))
-        together = "" if mean is None else f"{mean:.3f} (chance {coherence['chance']:.2f})"
+        together = "" if mean is None else f"{mean:.3f}"
+        used, dropped = pulses.get("used"), pulses.get("dropped") or 0
         table.add_row(
-            flight,
-            name,
-            f"{focus.get('verdict', '')}{lost}",
-            expected,
+            f"{flight} {name}",
+            focus.get("verdict", ""),
+            f"{abs(focus['loss_db']):.1f} dB" if "loss_db" in focus else "",
+            _expected(report),
             f"{together} {alone} left out".strip() if alone else together,
-            f"< {report['numerical_error_db']:.1f} dB",
-            str(pulses.get("used", "")),
-            str(pulses.get("dropped", "")),
-            ", ".join(report["flags"]) or "none",
+            f"{report['numerical_error_db']:.1f} dB",
+            "" if used is None else f"{used}/{used + dropped}",
+            str(len(report["flags"]) or "none"),
         )
     return table
+
+
+def _expected(report: Mapping[str, Any]) -> str:
+    """Return what the budget expects to be lost, and by what most."""
+    focus = report.get("focus") or {}
+    if "expected_db" not in focus:
+        return ""
+    stated = [line for line in report.get("budget", ()) if not line["stated"].startswith(_NOT_STATED)]
+    most = min(stated, key=lambda line: line["loss_db"], default=None)
+    by = f", {most['cause']}" if most and focus["expected_db"] < -0.05 else ""
+    return f"{abs(focus['expected_db']):.1f} dB{by}"
+
+
+def _silent(report: Mapping[str, Any]) -> list[str]:
+    """Return the causes of the budget whose size nobody has stated."""
+    return [line["cause"] for line in report.get("budget", ()) if line["stated"].startswith(_NOT_STATED)]

@@ -1,0 +1,71 @@
+"""How far a step is: told in a file while it works, rarely, and never at the step's cost."""
+
+import json
+
+import numpy as np
+import pytest
+
+from apertura import progress as told
+from apertura.progress import Counted, progress, telling, told_at
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands until it is moved on."""
+    now = [0.0]
+    monkeypatch.setattr(told.time, "monotonic", lambda: now[0])
+    return now
+
+
+def counted(path):
+    report = json.loads(path.read_text())
+    return report["done"], report["total"]
+
+
+def test_a_step_tells_at_most_once_a_second_and_in_the_end(tmp_path, clock):
+    path = tmp_path.joinpath(*told_at(["image", "f01", "uav1-uav2"]))
+    with telling(path):
+        with progress("tiles", 10) as done:
+            assert counted(path) == (0, 10)
+            done(3)
+            assert counted(path) == (0, 10)
+            clock[0] += 1.1
+            done(2)
+            assert counted(path) == (5, 10)
+            done(5)
+            assert counted(path) == (5, 10)
+        assert counted(path) == (10, 10)
+    assert not path.exists()
+
+
+def test_work_outside_a_step_tells_nothing_and_writes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with progress("tiles", 2) as done:
+        done(2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_takes_no_file_does_not_end_the_step(tmp_path):
+    (tmp_path / ".run").write_text("a file where a folder should be")
+    with telling(tmp_path.joinpath(*told_at(["cube"]))), progress("images", 2) as done:
+        done(2)
+
+
+def test_a_failing_step_leaves_no_progress_behind(tmp_path):
+    path = tmp_path.joinpath(*told_at(["echo", "f01", "a-a"]))
+    with pytest.raises(ZeroDivisionError), telling(path), progress("pulses", 0) as done:
+        done(1 // 0)
+    assert not path.exists()
+
+
+def test_tiles_that_dask_stores_are_counted(tmp_path):
+    from dask.array import ones
+
+    from apertura.focus.tiles import compute_tiles
+
+    finished = []
+    target = np.zeros((4, 6))
+    windows = [(slice(0, 2), slice(0, 2)), (slice(2, 4), slice(2, 4)), (slice(0, 2), slice(4, 6))]
+    compute_tiles(ones((4, 6), chunks=2), windows, Counted(target, finished.append), threads=2)
+    assert finished == [1, 1, 1]
+    assert target.sum() == 12

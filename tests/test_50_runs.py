@@ -1,0 +1,437 @@
+"""What a run shows of itself: its journal, bars, time left, why it failed; what is there, and what clean removes."""
+
+import io
+import json
+import os
+import shutil
+import subprocess
+import threading
+import time
+
+import pytest
+from folders import ROOT, copy_writable
+from rich.console import Console
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.lock import hold, holder
+from apertura.progress import told_at
+from apertura.runs.expectation import Outlook, Told, expected_seconds
+from apertura.runs.failure import failures
+from apertura.runs.inventory import print_list, states
+from apertura.runs.journal import Job, Reader, Run, note
+from apertura.runs.removal import clean
+from apertura.runs.screen import Bar, Screen, bars, table
+from apertura.runs.status import print_status
+
+PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}
+
+
+def begun(path, job, rule, *words, log=""):
+    note(path, "begun", job=job, rule=rule, step=[rule, *words], log=log)
+
+
+@pytest.fixture
+def journal(tmp_path):
+    """A run of five steps, of which one is done and one under way."""
+    path = tmp_path / "journal.jsonl"
+    note(path, "start", cores=2)
+    note(path, "planned", jobs=PLANNED)
+    begun(path, 1, "ingest", "f01", "uav1")
+    note(path, "finished", job=1)
+    begun(path, 2, "image", "f01", "uav1-uav1")
+    return path
+
+
+def test_a_journal_tells_what_is_done_under_way_and_to_come(journal):
+    run = Reader(journal).news()
+    assert [job.name for job in run.finished] == ["ingest f01 uav1"]
+    assert [job.name for job in run.running] == ["image f01 uav1-uav1"]
+    assert run.waiting == {"ingest": 1, "image": 1, "cube": 1}
+    assert (run.total, run.status, run.cores) == (5, None, 2)
+
+
+def test_a_line_that_is_being_written_is_read_when_it_is_whole(journal):
+    reader = Reader(journal)
+    reader.news()
+    line = json.dumps({"at": 5, "event": "finished", "job": 2}) + "\n"
+    for part in (line[:9], line[9:]):
+        assert len(reader.run.finished) == 1
+        with journal.open("a") as stream:
+            stream.write(part)
+        reader.news()
+    assert len(reader.run.finished) == 2
+
+
+def test_a_step_that_is_tried_again_is_under_way_and_not_failed(journal):
+    note(journal, "failed", job=2)
+    assert len(Reader(journal).news().failed) == 1
+    begun(journal, 2, "image", "f01", "uav1-uav1")
+    run = Reader(journal).news()
+    assert not run.failed
+    assert len(run.running) == 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[]",
+        "1",
+        '{"event": "begun"}',
+        '{"event": "planned", "at": 1, "jobs": []}',
+        '{"event": "planned", "at": 1, "jobs": {"a": "b"}}',
+        '{"event": "finished", "at": 1, "job": {}}',
+        '{"event": "end", "at": null, "status": 0}',
+        '{"event": "end", "at": NaN, "status": 0}',
+        '{"event": "finished", "at": 1e300, "job": 2}',
+        "[" * 5000,
+        "\x00\xff",
+    ],
+)
+def test_a_journal_of_a_stranger_is_only_data(journal, line):
+    before = Reader(journal).news()
+    with journal.open("a") as stream:
+        stream.write(line + "\n")
+    assert Reader(journal).news() == before
+
+
+def test_names_of_a_stranger_reach_the_terminal_without_control_codes():
+    assert Job("a", ("image", "\x1b[31mf01"), "", 0.0).name == r"image \x1b[31mf01"
+
+
+def test_more_samples_and_more_pixels_take_longer(finished_tiny):
+    assert expected_seconds(finished_tiny, "image", "f01", "uav1-uav2") > expected_seconds(finished_tiny, "scene")
+    assert expected_seconds(finished_tiny, "echo", "f01", "uav1-uav2") > expected_seconds(
+        finished_tiny, "echo", "f01", "uav1-uav1"
+    )
+
+
+def timed(campaign, factor):
+    """A run whose first image took so many times what was expected, and whose second is to come."""
+    seconds = factor * expected_seconds(campaign, "image", "f01", "uav1-uav1")
+    done = Job("image", ("image", "f01", "uav1-uav1"), "", 0.0, seconds)
+    return Run(planned={"image": 2}, jobs={1: done})
+
+
+def test_time_left_follows_what_has_been_measured(finished_tiny):
+    outlook = Outlook(finished_tiny, cores=2)
+    once, tenfold = (outlook.of_run(timed(finished_tiny, factor), {}) for factor in (1, 10))
+    assert tenfold == pytest.approx(10 * once)
+
+
+def test_what_was_timed_before_counts_until_the_run_has_times_of_its_own(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    campaign = Campaign.load(root)
+    expected = expected_seconds(campaign, "image", "f01", "uav1-uav1")
+    benchmark = root / "results/benchmarks/f01/uav1-uav1.image.tsv"
+    benchmark.parent.mkdir(parents=True, exist_ok=True)
+    benchmark.write_text(f"s\th:m:s\n{7 * expected}\t0:00:07\n")
+    waiting = Run(planned={"image": 1})
+    mean = (expected + expected_seconds(campaign, "image", "f01", "uav1-uav2")) / 2
+    assert Outlook(campaign, cores=2).of_run(waiting, {}) == pytest.approx(7 * mean)
+    assert Outlook(campaign, cores=2).of_run(timed(campaign, 1), {}) == pytest.approx(mean)
+
+
+def test_a_share_of_an_images_tiles_takes_its_share_of_the_time(finished_tiny):
+    outlook, shares = Outlook(finished_tiny, cores=0), (8, 80)
+    runs = [
+        Run(
+            planned={"tiles": 2 * count},
+            jobs={1: Job("tiles", ("tiles", "f01", "uav1-uav1", f"1-of-{count}"), "", 0.0)},
+        )
+        for count in shares
+    ]
+    few, many = (outlook.of_jobs(run, 0.0, {})[1] for run in runs)
+    assert few == pytest.approx(10 * many)
+
+
+def test_what_the_campaign_does_not_have_is_not_looked_for(finished_tiny):
+    for where in (("/", "**"), ("f01", "../../*"), ("f01", "uav1-uav1", "1-of-8", "more"), ()):
+        assert 0 < expected_seconds(finished_tiny, "image", *where) < 10
+    assert expected_seconds(finished_tiny, "image", "/", "**") < expected_seconds(
+        finished_tiny, "image", "f01", "uav1-uav1"
+    )
+
+
+@pytest.mark.parametrize("text", ["", "s\n", "s\nnan\n", "s\n1e300\n", "s\nx\n", "t\n1\n", "\x00", "s\n\n"])
+def test_a_benchmark_that_makes_no_sense_is_none(finished_tiny, tmp_path, text):
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    before = Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {})
+    (campaign.results / "benchmarks").mkdir(exist_ok=True)
+    (campaign.results / "benchmarks/scene.tsv").write_text(text)
+    assert Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {}) == before
+
+
+def tell(campaign, step, **report):
+    path = campaign.result(*told_at(step))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(report))
+
+
+def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_path, finished_tiny):
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    now = time.time()
+    job = Job("image", ("image", "f01", "uav1-uav1"), "", now - 100)
+    run = Run(planned={"image": 1}, jobs={1: job})
+    tell(campaign, job.step, what="tiles", done=10, total=40, since=now - 90, at=now)
+    bar, whole = bars(campaign, run, Outlook(campaign, cores=2))
+    assert (bar.told, bar.fraction) == ("10 of 40 tiles", 0.25)
+    assert bar.left_s == pytest.approx(270, rel=0.01)
+    assert whole.left_s == pytest.approx(270, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {"what": "tiles", "done": 10, "total": 40, "since": 5.0, "at": 9.0},  # of a step before
+        {"what": "tiles", "done": 50, "total": 40, "since": 2e9, "at": 2e9},
+        {"what": "tiles", "done": 0, "total": 0, "since": 2e9, "at": 2e9},
+        {"what": "tiles", "done": 1, "total": 4, "since": 2e9, "at": 1e300},
+        {"what": "tiles"},
+        [],
+    ],
+)
+def test_a_report_that_makes_no_sense_is_none(tmp_path, finished_tiny, report):
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+    job = Job("image", ("image", "f01", "uav1-uav1"), "", 1e9)
+    path = campaign.result(*told_at(job.step))
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(report))
+    assert Told.by(campaign, job) is None
+
+
+def test_a_step_that_names_another_folder_is_not_followed(finished_tiny):
+    assert Told.by(finished_tiny, Job("image", ("..", "..", "config", "x"), "", 0.0)) is None
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_ends(finished_tiny, journal):
+    stream, reader = io.StringIO(), Reader(journal)
+    with Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream) as screen:
+        screen.update(reader.news())
+        note(journal, "failed", job=2)
+        screen.update(reader.news())
+        screen.update(reader.news())
+    lines = [line.split("  ", 1)[1] for line in stream.getvalue().splitlines()]
+    assert [line.split(":")[0] for line in lines] == [
+        "begun   ingest f01 uav1",
+        "done    ingest f01 uav1",
+        "begun   image f01 uav1-uav1",
+        "failed  image f01 uav1-uav1",
+    ]
+    assert "1 of 5 steps, about" in lines[1]
+    assert "\x1b" not in stream.getvalue()
+
+
+def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm-256color")
+    stream = Terminal()
+    screen = Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream)
+    with pytest.raises(AttributeError), screen:  # whatever ends it
+        [screen.update(run) for run in (Reader(journal).news(), None)]
+    said = stream.getvalue()
+    assert "━" in said
+    assert "1 of 5 steps" in said
+    assert said.rfind("\x1b[?25h") > said.rfind("\x1b[?25l")
+
+
+def test_a_quiet_run_shows_nothing(finished_tiny, journal):
+    stream = Terminal()
+    with Screen(finished_tiny, Outlook(finished_tiny, 2), quiet=True, stream=stream) as screen:
+        screen.update(Reader(journal).news())
+        screen.ended(Reader(journal).news())
+    assert not stream.getvalue()
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_bars_fit_the_terminal(columns):
+    rows = [Bar(f"image {'f' * 30} uav1-uav{number}", "10 of 40 tiles", 0.25, 4000.0) for number in range(40)]
+    console = Console(width=columns, file=io.StringIO(), force_terminal=True, color_system=None)
+    console.print(table([*rows, Bar("3 of 43 steps", "", 0.1, 9000.0)]))
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= columns
+    assert len(lines) == 12 + 2
+    assert "and 28 more" in lines[-2]
+    assert "about 2.5 h left" in lines[-1]
+
+
+def failed(tmp_path, *logs):
+    run = Run()
+    for number, text in enumerate(logs):
+        (tmp_path / f"{number}.log").write_text(text)
+        run.jobs[number] = Job("echo", ("echo",), f"{number}.log", 0.0, 1.0, failed=True)
+    return "\n".join(failures(tmp_path, run, tmp_path / "snakemake.log"))
+
+
+def test_steps_that_fail_alike_say_it_once_with_every_log(tmp_path):
+    told = failed(tmp_path, "reading\nerror: codes.npy: gone\n", "error: codes.npy: gone\n")
+    assert told.count("codes.npy: gone") == 1
+    assert told.startswith("error: codes.npy: gone\n")
+    assert "0.log" in told
+    assert "1.log" in told
+    assert told.endswith("snakemake.log")
+
+
+def test_a_defect_and_a_killed_step_are_told_apart(tmp_path):
+    assert "a defect of ours" in failed(tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n")
+    assert "was it killed" in failed(tmp_path, "10 of 20 tiles to form\n")
+
+
+def test_what_the_workflow_says_is_told_where_no_step_failed(tmp_path):
+    run = Run(said=["MissingRuleException:\nno rule for \x1b[31mx"])
+    assert next(failures(tmp_path, run, tmp_path / "a.log")) == r"error: MissingRuleException: no rule for \x1b[31mx"
+
+
+@pytest.fixture
+def finished(finished_tiny, tmp_path):
+    """A finished campaign, to be spoilt at will."""
+    return Campaign.load(copy_writable(finished_tiny.root, tmp_path / "finished"))
+
+
+def files(root):
+    return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+
+
+def test_clean_leaves_what_was_there_before_the_run(finished, tiny, capsys):
+    clean(finished, unfinished_only=False, agreed=True)
+    assert files(finished.root) == files(tiny)
+    assert not finished.results.exists()
+
+
+def test_clean_keeps_what_the_workflow_has_not_made_and_says_so(finished, capsys):
+    for name in ("notes.txt", "f01/uav1-uav1/db.qgz", "f01/uav1-uav1/image.zarr/mine"):
+        (finished.results / name).write_text("mine")
+    clean(finished, unfinished_only=False, agreed=True)
+    assert files(finished.results) - {".run.lock"} == {
+        "notes.txt",
+        "f01/uav1-uav1/db.qgz",
+        "f01/uav1-uav1/image.zarr/mine",
+    }
+    assert "kept what it has not made: results/f01/uav1-uav1/db.qgz and 2 more" in capsys.readouterr().out
+
+
+def test_clean_of_unfinished_work_keeps_every_result(finished, capsys):
+    wip = finished.results / "f01/uav1-uav1/image.zarr.wip"
+    shutil.copytree(finished.results / "f01/uav1-uav1/image.zarr", wip)
+    before = files(finished.results)
+    clean(finished, unfinished_only=True, agreed=True)
+    assert {name for name in before - files(finished.results) if ".wip/" not in name} == set()
+    assert not wip.exists()
+    assert set(states(finished)["f01", "uav1-uav1"]["missing"]) == set()
+
+
+def test_clean_waits_for_no_run_and_no_step(finished):
+    before = files(finished.results)
+    with hold(finished.root), pytest.raises(CampaignError, match="another run holds this campaign"):
+        clean(finished, unfinished_only=False, agreed=True)
+    from apertura.store import writing
+
+    with (
+        writing(finished.stage("echo", "f01", "uav1-uav1")),
+        pytest.raises(CampaignError, match="a step still writes"),
+    ):
+        clean(finished, unfinished_only=False, agreed=True)
+    assert len(files(finished.results)) >= len(before) - 1  # the manifest of what is written again
+
+
+def test_clean_asks_and_without_anyone_to_ask_removes_nothing(finished, monkeypatch):
+    before = files(finished.results)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    with pytest.raises(CampaignError, match="--yes"):
+        clean(finished, unfinished_only=False, agreed=False)
+    assert before <= files(finished.results)
+
+
+@pytest.mark.parametrize("name", ["../../config/config.yaml", "../raw/codes.npy", "/etc/hostname", "out/secret"])
+def test_clean_follows_no_manifest_and_no_link_out_of_its_folder(finished, tmp_path, name):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "secret").write_text("kept")
+    (finished.results / "out").symlink_to(outside)
+    (finished.results / "evil.manifest.json").write_text(json.dumps({"files": {name: "0"}}))
+    clean(finished, unfinished_only=False, agreed=True)
+    assert (finished.root / "config/config.yaml").is_file()
+    assert (finished.root / "raw/codes.npy").is_file()
+    assert (outside / "secret").is_file()
+
+
+def test_list_tells_what_is_finished_stale_and_missing(finished, capsys):
+    (finished.results / "f01/uav1-uav1/image.manifest.json").unlink()
+    found = states(finished)
+    assert found["f01", "uav1"] == {"finished": ["raw", "track"], "stale": [], "missing": []}
+    assert found["f01", "uav1-uav1"] == {"finished": ["echo", "profile"], "stale": ["export"], "missing": ["image"]}
+    print_list(finished)
+    said = capsys.readouterr().out
+    assert "uav1-uav2" in said
+    assert "in results" in said
+
+
+def test_status_tells_from_another_terminal_what_a_run_does(finished, capsys):
+    path = finished.result(".run", "journal.jsonl")
+    path.parent.mkdir()
+    note(path, "start", cores=2)
+    note(path, "planned", jobs=PLANNED)
+    begun(path, 1, "image", "f01", "uav1-uav1")
+    with hold(finished.root):
+        print_status(finished)
+    said = capsys.readouterr().out
+    assert f"a run is under way: process {os.getpid()} on" in said
+    assert "image f01 uav1-uav1: " in said
+    assert "to come: 2 ingest, 1 image, 1 cube" in said
+    print_status(finished)
+    assert "was killed" in capsys.readouterr().out
+
+
+def test_status_after_a_failure_says_why(finished, capsys):
+    path = finished.result(".run", "journal.jsonl")
+    path.parent.mkdir()
+    (finished.results / "logs").mkdir()
+    (finished.results / "logs/a.log").write_text("error: the log of uav1 is empty\n")
+    note(path, "start", cores=2)
+    note(path, "planned", jobs=PLANNED)
+    begun(path, 1, "image", "f01", "uav1-uav1", log="results/logs/a.log")
+    note(path, "failed", job=1)
+    note(path, "end", status=2)
+    print_status(finished)
+    said = capsys.readouterr().out
+    assert "failed with 2" in said
+    assert said.count("error: the log of uav1 is empty") == 1
+    assert "results finished" in said
+
+
+def test_who_holds_a_campaign_may_be_asked_while_a_run_begins(tmp_path):
+    (tmp_path / "results").mkdir()
+    assert holder(tmp_path) is None
+    asking = True
+
+    def ask():
+        while asking:
+            holder(tmp_path)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        for _ in range(200):
+            hold(tmp_path).close()
+    finally:
+        asking = False
+        thread.join()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+def test_make_demo_leaves_a_folder_of_somebody_else_alone(tmp_path):
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name in ("requirements/uv.txt", "requirements/all.txt", "pyproject.toml", ".venv/.installed", "demo/notes.txt"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    done = subprocess.run(["make", "demo"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "error: demo/ was not made by make demo" in done.stderr
+    assert (tmp_path / "demo/notes.txt").read_text() == "mine"
