@@ -97,9 +97,7 @@ def show(root: Path, minutes: float, rows: list[dict[str, object]]) -> None:
     """Print a table, and write it beside the campaign."""
     bare = plain(root)
     front = sum(float(row["cpu_s"]) for row in rows if str(row["step"]).split()[0] in FRONT)
-    print(
-        f"\n{minutes:g} min, {bare['bytes'] / 1e9:.1f} GB recorded, free disk {shutil.disk_usage(root).free / 1e9:.0f} GB"
-    )
+    print(f"\n{minutes:g} min, {bare['bytes'] / 1e9:.1f} GB recorded")
     print(f"{'step':28}{'wall s':>9}{'CPU s':>9}{'peak MB':>9}{'load':>7}")
     for row in rows:
         print(f"{row['step']:28}{row['wall_s']:9.1f}{row['cpu_s']:9.1f}{row['peak_mb']:9.0f}{row['load']:7.1f}")

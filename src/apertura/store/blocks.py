@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.progress import progress
 from apertura.store.resuming import create, open_array
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
     create(wip, stage, {name: (max(1, min(chunk, rows)), *rest)}, packed=False)
     array, held, written = open_array(wip, name), np.empty((chunk, *rest), stage[name].dtype), 0
     filled = 0
-    for block in blocks:
+    for block in _counted(blocks, stage[name]):
         taken = 0
         while taken < len(block):
             count = min(chunk - filled, len(block) - taken)
@@ -53,6 +54,14 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
                 written, filled = written + filled, 0
     if written + filled != rows:
         raise ValueError(f"{written + filled} rows of {name}: must be {rows}")
+
+
+def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[NDArray[Any]]:
+    """Yield blocks, and tell how many rows are done."""
+    with progress(f"{array.dims[0]}s", len(array)) as done:
+        for block in blocks:
+            yield block
+            done(len(block))
 
 
 def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
