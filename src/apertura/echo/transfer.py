@@ -4,7 +4,7 @@ In two passes: the first finds what a flight's captures have in common and a few
 transfer functions, block by block. No more than a block of captures is held, however long the flight is.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from apertura.echo.resampling import Complexes, Floats, correct_clock
 from apertura.echo.second_path import second_path_flags
 from apertura.echo.sidelink import METHODS, choose, edges
 from apertura.echo.sidelink_state import SidelinkState, measure_blocks
+from apertura.progress import progress
 
 _STRETCH = 128  # neighbouring pulses that own code and phase are looked for in
 _CLOCK_STRETCH = 256
@@ -143,10 +144,8 @@ def transfer_by_sidelink(
     flight, the state of the sidelink on all.
     """
     receiver = _Receiver.measured(read, codes, numerology, symbol_samples, len(sidelink_m), accuracy_db)
-    every = np.arange(len(sidelink_m))
-    state = measure_blocks(
-        lambda: (receiver.channel("sidelink", some) for some in blocks_of(every)), f"{where}: sidelink"
-    )
+    with progress("sidelinks", len(sidelink_m)) as done:
+        state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
@@ -215,9 +214,11 @@ class _Receiver:
         cfo_hz = clock.cfo_of_pulses_hz(count)
         return cls(*kept, clock if decision.correct else None, cfo_hz, report, decision.flags)
 
-    def channel(self, name: str, captures: Pulses) -> Complexes:
-        """Return the symbols of a channel, (pulse, subcarrier) complex64, the code removed."""
-        return self.received(self.read(captures)[name], captures)
+    def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
+        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, the code removed."""
+        for some in blocks_of(np.arange(len(self.cfo_hz))):
+            yield self.received(self.read(some)["sidelink"], some)
+            done(len(some))
 
     def received(self, iq: Samples, captures: Pulses) -> Complexes:
         """Return the symbols of some captures' samples."""
