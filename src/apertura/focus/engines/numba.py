@@ -1,7 +1,7 @@
 """Backprojection by interpolation in an oversampled range table, compiled by numba."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numba
@@ -113,6 +113,11 @@ class Tables:
     step_m: float
     wavenumber_rad_m: float
     aperture: Aperture
+
+    def __getitem__(self, pulses: slice) -> "Tables":
+        """Return the tables of some pulses, as views."""
+        some = {"samples": self.samples[pulses], "start_m": self.start_m[pulses], "aperture": self.aperture[pulses]}
+        return replace(self, **some)
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
