@@ -198,8 +198,8 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
         if constexpr (kVariant == kAtEdge || kVariant == kWeightedAtEdge) {
           // integration.md, (3): the sector's weight at the pixel.
           const int64_t b = group + v / kParts, part = v % kParts * kLanes;
-          Lanes depth = load(kLaneX + part) * batch.depth_x[q][b] + load(kLaneY + part) * batch.depth_y[q][b] +
-                        batch.depth[q][b];
+          Lanes depth =
+              load(kLaneX + part) * batch.depth_x[q][b] + load(kLaneY + part) * batch.depth_y[q][b] + batch.depth[q][b];
           if constexpr (kTerrain) depth += load(patch.rise + b * 16 + part) * batch.depth_h[q];
           depth = within_unit(depth);
           depth *= depth * (3.0f - 2.0f * depth);

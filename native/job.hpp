@@ -16,7 +16,7 @@ struct BeamJob {
 
 // The sector that pixels are integrated over, docs/theory/integration.md (1) and (3).
 struct SectorJob {
-  const double* axis[2];         // of transmitter and receiver, (3, padded)
+  const double* axis[2];        // of transmitter and receiver, (3, padded)
   double centre, inner, outer;  // of s; from `inner` to `outer` off the centre the weight falls from 1 to 0
 };
 

@@ -35,7 +35,8 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
       const double along = (wx * ax + wy * ay + wz * az) * scale;
       const float inverse = float(1 / distance), length = __builtin_sqrtf(float(ax * ax + ay * ay + az * az));
       out.along[leg][q] = float(along), out.inverse[leg][q] = inverse, out.place[q] += float(along / distance);
-      // A direction turns by asin(reach / R) at most; second-order terms inside a block are below 1.5 / 2 of (delta / R)^2.
+      // A direction turns by asin(reach / R) at most; second-order terms inside a block are below 1.5 / 2 of (delta /
+      // R)^2.
       slack[q] += length * (reach * inverse < 1 ? 1.5708f * reach * inverse : 2);
       bend[q] += length * 0.75f * inside_block * inverse * inverse;
     }
@@ -61,7 +62,9 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
   float s_h = 0;
   for (int64_t leg = 0; leg < 2; leg++) {
     const double* axis = sector.axis[leg] + pulse + q;
-    const auto along_axis = [&](const double* v) { return float(v[0] * axis[0] + v[1] * axis[n] + v[2] * axis[2 * n]); };
+    const auto along_axis = [&](const double* v) {
+      return float(v[0] * axis[0] + v[1] * axis[n] + v[2] * axis[2 * n]);
+    };
     const float a_x = along_axis(patch.step_x), a_y = along_axis(patch.step_y), a_h = along_axis(patch.up);
     const Leg& w = origin.leg[leg];
     const float along = places.along[leg][q], inverse = places.inverse[leg][q], range = 1 / inverse;

@@ -73,7 +73,12 @@ def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -
 
 
 def reached(
-    beams: Beams | None, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], *, pulses: int
+    beams: Beams | None,
+    aperture: Aperture,
+    middle_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+    *,
+    pulses: int,
 ) -> NDArray[np.bool_]:
     """Return which blocks of pulses may weigh anything inside balls about places.
 
@@ -151,7 +156,7 @@ def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
     """Return which antennas have beams and what they see, in one line, and the flag `beam_misses`; neither without."""
-    if beams is None or illumination is None:
+    if beams is None or beams.antennas is None or illumination is None:
         return [], {}
     looking = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
     misses = f"{100 * illumination.unseen:.1f} % of the scene is seen by no pulse: its pixels are zero"

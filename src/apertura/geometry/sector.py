@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.geometry.aperture import Aperture
+from apertura.geometry.aperture import Aperture, Weigh
 
 TAPER = 0.1
 """The weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER times the half width."""
@@ -111,6 +111,10 @@ class Sector:
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight of each pulse at each point: as `place`, 0 to 1."""
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
+
+    def over(self, aperture: Aperture) -> Weigh:
+        """Return what weighs some pulses of an aperture at points."""
+        return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(
         self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]

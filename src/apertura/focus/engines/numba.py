@@ -50,7 +50,7 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     Source: docs/theory/planner.md, "Error" and "Cost".
     """
     signal, wanted = job.signal, asked_or(asked, "oversampling", OVERSAMPLINGS)
-    form_s = job.pixels * pulses * (_PIXEL_S + job.antennas * BEAM_S)
+    form_s = job.pixels * pulses * job.share * (_PIXEL_S + job.weights * BEAM_S)
     for oversampling in wanted:
         if oversampling < signal.oversampling and len(wanted) > 1:
             continue
