@@ -16,6 +16,8 @@ enum Variant {
   kWideWindow,       // shared curvature, wide windows
   kOwnCurvature,     // wide windows, each block has its own curvature
   kWeighted,         // the same, weighted by the antennas' beams: holds for all pulses that may go fast
+  kAtEdge,           // the same as kOwnCurvature, weighted by the edge of a sector
+  kWeightedAtEdge,   // weighted by both
   kExactPath,        // each pixel in float64 (exact.hpp)
   kSkipped,          // no echo, or no beam, reaches the patch
   kVariants
@@ -35,6 +37,9 @@ struct Batch {
   float shared_hh[kBatch];
   alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // (7)
   float weight_h[kBatch];
+  // Depth inside the sector, in widths of its edge: integration.md, (4).
+  alignas(64) float depth[kBatch][kBlocks], depth_x[kBatch][kBlocks], depth_y[kBatch][kBlocks];
+  float depth_h[kBatch];
   const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
   int64_t order[kVariants][kBatch];  // the pulses of each variant
   int64_t count[kVariants];
@@ -190,7 +195,17 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
         Lanes vr = re1[index[v]], vi = im1[index[v]], cosine, sine;
         if constexpr (kDegree == 2) vr += u[v] * re2[index[v]], vi += u[v] * im2[index[v]];
         vr = re0[index[v]] + u[v] * vr, vi = im0[index[v]] + u[v] * vi;
-        if constexpr (kVariant == kWeighted) {
+        if constexpr (kVariant == kAtEdge || kVariant == kWeightedAtEdge) {
+          // integration.md, (3): the sector's weight at the pixel.
+          const int64_t b = group + v / kParts, part = v % kParts * kLanes;
+          Lanes depth =
+              load(kLaneX + part) * batch.depth_x[q][b] + load(kLaneY + part) * batch.depth_y[q][b] + batch.depth[q][b];
+          if constexpr (kTerrain) depth += load(patch.rise + b * 16 + part) * batch.depth_h[q];
+          depth = within_unit(depth);
+          depth *= depth * (3.0f - 2.0f * depth);
+          vr *= depth, vi *= depth;
+        }
+        if constexpr (kVariant == kWeighted || kVariant == kWeightedAtEdge) {
           // (7): the gain of both antennas at the pixel.
           const int64_t b = group + v / kParts, part = v % kParts * kLanes;
           Lanes weight = load(kLaneX + part) * batch.weight_x[q][b] + load(kLaneY + part) * batch.weight_y[q][b] +

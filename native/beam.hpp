@@ -2,7 +2,7 @@
 // pixel by pixel where that would not do. docs/theory/engine.md, "Antennas", says how well; equation numbers are its.
 #pragma once
 #include "batch.hpp"
-#include "exact.hpp"
+#include "sector.hpp"
 
 namespace {
 
@@ -205,10 +205,11 @@ inline void weigh_patch(const ApertureJob& job, const Patch& patch, int64_t puls
   }
 }
 
-// (6) of one pulse at each pixel of a patch.
+// (6) of one pulse at each pixel of a patch, and the sector's weight.
 inline void weigh_pixels(const ApertureJob& job, const Positions& at, int64_t pulse, float* weight) {
   const int64_t n = job.padded;
   for (int64_t slot = 0; slot < kPixels; slot++) weight[slot] = 1;
+  if (job.sector) weigh_by_sector(job, at, pulse, weight);
   for (int64_t leg = 0; leg < 2; leg++) {
     const BeamJob* beam = job.beam[leg];
     if (!beam) continue;
@@ -224,12 +225,17 @@ inline void weigh_pixels(const ApertureJob& job, const Positions& at, int64_t pu
   }
 }
 
-// Sorts eight pulses by the variant they take.
+// Sorts eight pulses by the variant they take; `places` in a sector, or null.
 template <bool kTerrain>
-inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, Batch& batch) {
+inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses,
+                          const SectorPlaces* places, Batch& batch) {
   OriginPaths origin;
   Weighing weighing[kBatch];
   weigh_patch(job, patch, pulse, batch, weighing);
+  for (int64_t q = 0; places && q < pulses; q++) {
+    if (places->zone[q] == kOutside) weighing[q] = kDark;
+    if (places->zone[q] == kEdgePixelwise && weighing[q] == kSmooth) weighing[q] = kPixelwise;
+  }
   bool lit = false;
   for (int64_t q = 0; q < pulses; q++) lit |= weighing[q] != kDark;
   if (lit) find_origin_paths<kTerrain>(job, patch, pulse, origin);
@@ -240,7 +246,13 @@ inline void sort_weighted(const ApertureJob& job, const Patch& patch, int64_t pu
       variant = kSkipped;
     else if (weighing[q] == kSmooth && origin.holds[q])
       variant = expand_paths<kTerrain, true>(job, patch, origin, pulse, q, batch);
-    if (variant == kOwnCurvature) variant = kWeighted;
+    if (variant == kOwnCurvature) {
+      variant = kWeighted;
+      if (places && places->zone[q] == kEdge) {
+        fit_depth(job, patch, origin, *places, pulse, q, batch);
+        variant = kWeightedAtEdge;
+      }
+    }
     batch.order[variant][batch.count[variant]++] = q;
   }
 }

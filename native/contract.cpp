@@ -20,6 +20,11 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(BeamJob, samples_per_rad),
     APERTURA_FIELD(BeamJob, peak),
     {"BeamJob", 0, sizeof(BeamJob)},
+    APERTURA_FIELD(SectorJob, axis),
+    APERTURA_FIELD(SectorJob, centre),
+    APERTURA_FIELD(SectorJob, inner),
+    APERTURA_FIELD(SectorJob, outer),
+    {"SectorJob", 0, sizeof(SectorJob)},
     APERTURA_FIELD(ApertureJob, cells),
     APERTURA_FIELD(ApertureJob, transmitter),
     APERTURA_FIELD(ApertureJob, receiver),
@@ -40,6 +45,7 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(ApertureJob, wide_sum),
     APERTURA_FIELD(ApertureJob, phase_coefficients),
     APERTURA_FIELD(ApertureJob, beam),
+    APERTURA_FIELD(ApertureJob, sector),
     {"ApertureJob", 0, sizeof(ApertureJob)},
     APERTURA_FIELD(TableJob, samples),
     APERTURA_FIELD(TableJob, taps),
@@ -77,6 +83,7 @@ constexpr Constant kConstants[] = {
     {"curvature_span", apertura::kCurvatureSpan},
     {"weight_change", apertura::kWeightChange},
     {"weight_curvature", apertura::kWeightCurvature},
+    {"sector_bend", apertura::kSectorBend},
 };
 
 }  // namespace

@@ -14,6 +14,12 @@ struct BeamJob {
   double peak;  // largest |gain| of the product
 };
 
+// The sector that pixels are integrated over, docs/theory/integration.md (1) and (3).
+struct SectorJob {
+  const double* axis[2];        // of transmitter and receiver, (3, padded)
+  double centre, inner, outer;  // of s; from `inner` to `outer` off the centre the weight falls from 1 to 0
+};
+
 // A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".
 struct ApertureJob {
   const float* cells;         // (pulse, 2 (degree + 1), width): re, im of each polynomial coefficient
@@ -32,6 +38,7 @@ struct ApertureJob {
   int32_t wide_sum;             // 1: sums over pulses in float64
   float phase_coefficients[9];  // cosine (4), sine (4), half turns per cell
   const BeamJob* beam[2];       // of transmitter and receiver; null: the same in all directions
+  const SectorJob* sector;      // null: every pulse counts everywhere
 };
 
 // Range profiles to be turned into tables.

@@ -7,33 +7,57 @@
 
 namespace {
 
+// Sorts eight pulses by variant and sums those that go fast.
+template <class Phase, int64_t kDegree, bool kTerrain>
+void add_fast(const ApertureJob& job, const Patch& patch, int64_t pulse, int64_t pulses, const SectorPlaces* places,
+              bool weighted, Batch& batch, float* sum) {
+  bool edge = false;
+  for (int64_t q = 0; places && q < pulses; q++) edge |= places->zone[q] != kInside;
+  if (weighted) {
+    sort_weighted<kTerrain>(job, patch, pulse, pulses, places, batch);
+    add_pulses<Phase, kDegree, kTerrain, kWeighted>(job, patch, batch, sum);
+    if (edge) add_pulses<Phase, kDegree, kTerrain, kWeightedAtEdge>(job, patch, batch, sum);
+    return;
+  }
+  if (edge) {
+    sort_at_edge<kTerrain>(job, patch, pulse, pulses, *places, batch);
+    add_pulses<Phase, kDegree, kTerrain, kAtEdge>(job, patch, batch, sum);
+  } else {
+    sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
+  }
+  if constexpr (kLanes != 4) add_pulses<Phase, kDegree, kTerrain, kSharedCurvature>(job, patch, batch, sum);
+  if constexpr (kLanes != 4 && kTerrain) add_pulses<Phase, kDegree, true, kLinearHeights>(job, patch, batch, sum);
+  add_pulses<Phase, kDegree, kTerrain, kWideWindow>(job, patch, batch, sum);
+  add_pulses<Phase, kDegree, kTerrain, kOwnCurvature>(job, patch, batch, sum);
+}
+
 template <class Phase, int64_t kDegree, bool kTerrain>
 void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_t end, float* sum) {
   Batch batch;
   Positions at;
+  SectorPlaces places;
   alignas(64) float weight[kPixels];
-  const bool weighted = job.beam[0] || job.beam[1];
+  const bool weighted = job.beam[0] || job.beam[1], each = weighted || job.sector;
   bool gathered = false;
   for (int64_t pulse = begin; pulse < end; pulse += kBatch) {
     const int64_t pulses = end - pulse < kBatch ? end - pulse : kBatch;
-    if (weighted) {
-      sort_weighted<kTerrain>(job, patch, pulse, pulses, batch);
-      add_pulses<Phase, kDegree, kTerrain, kWeighted>(job, patch, batch, sum);
-    } else {
-      sort_pulses<kTerrain>(job, patch, pulse, pulses, batch);
-      if constexpr (kLanes != 4) add_pulses<Phase, kDegree, kTerrain, kSharedCurvature>(job, patch, batch, sum);
-      if constexpr (kLanes != 4 && kTerrain) add_pulses<Phase, kDegree, true, kLinearHeights>(job, patch, batch, sum);
-      add_pulses<Phase, kDegree, kTerrain, kWideWindow>(job, patch, batch, sum);
-      add_pulses<Phase, kDegree, kTerrain, kOwnCurvature>(job, patch, batch, sum);
+    if (job.sector) {
+      place_in_sector(job, patch, pulse, places);
+      int64_t outside = 0;
+      for (int64_t q = 0; q < pulses; q++) outside += places.zone[q] == kOutside;
+      job.counts[3] += outside == pulses ? pulses : 0;
+      if (outside == pulses) continue;
     }
+    add_fast<Phase, kDegree, kTerrain>(job, patch, pulse, pulses, job.sector ? &places : nullptr, weighted, batch, sum);
     if (batch.count[kExactPath] && !gathered) gather(job, patch, at), gathered = true;
     for (int64_t n = 0; n < batch.count[kExactPath]; n++) {
       const int64_t one = pulse + batch.order[kExactPath][n];
-      if (weighted) weigh_pixels(job, at, one, weight);
-      add_exact<Phase, kDegree>(job, patch, at, one, weighted ? weight : nullptr, sum);
+      if (each) weigh_pixels(job, at, one, weight);
+      add_exact<Phase, kDegree>(job, patch, at, one, each ? weight : nullptr, sum);
     }
     job.counts[0] += batch.count[kSharedCurvature] + batch.count[kLinearHeights] + batch.count[kWideWindow];
-    job.counts[1] += batch.count[kOwnCurvature] + batch.count[kWeighted];
+    job.counts[1] += batch.count[kOwnCurvature] + batch.count[kWeighted] + batch.count[kAtEdge];
+    job.counts[1] += batch.count[kWeightedAtEdge];
     job.counts[2] += batch.count[kExactPath];
     job.counts[3] += batch.count[kSkipped];
   }

@@ -53,6 +53,18 @@ inline Lanes floor(Lanes value) {
 #endif
 }
 
+// Each lane held between 0 and 1.
+inline Lanes within_unit(Lanes value) {
+#if defined(__AVX512F__)
+  return (Lanes)_mm512_min_ps(_mm512_max_ps((__m512)value, _mm512_setzero_ps()), _mm512_set1_ps(1));
+#elif defined(__AVX2__)
+  return (Lanes)_mm256_min_ps(_mm256_max_ps((__m256)value, _mm256_setzero_ps()), _mm256_set1_ps(1));
+#else
+  const Lanes zero{}, one = zero + 1.0f, above = value > zero ? value : zero;
+  return above < one ? above : one;
+#endif
+}
+
 // One truth per lane, from comparisons that a NaN never passes.
 #if defined(__AVX512F__)
 typedef __mmask16 LaneMask;

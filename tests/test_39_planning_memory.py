@@ -26,13 +26,14 @@ def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
     """The fewest whose tables fit beside all else; with less than all else takes, the job is refused as before."""
     one = plan(**LONG)
     assert one.setting.pulse_blocks == one.choices["pulse_blocks"] == 1
-    beside = one.memory_bytes - one.setting.table_bytes
+    held = one.setting.table_bytes + 3 * 8 * 20_000 * 120  # tables, and samples while they are read
+    beside = one.memory_bytes - held
     sums = 8 * 200 * 200  # the sum of blocks is held besides
-    split = plan(**LONG, memory_bytes=beside + sums + one.setting.table_bytes // 3 + 1)
+    split = plan(**LONG, memory_bytes=beside + sums + held // 3 + 1)
     assert split.setting.pulse_blocks == split.choices["pulse_blocks"] == 3
-    assert split.memory_bytes == beside + sums + one.setting.table_bytes // 3
+    assert split.memory_bytes == beside + sums + held // 3
     assert split.predicted_seconds > one.predicted_seconds
-    assert "of tables do not fit into" in split.reasons["pulse_blocks"]
+    assert "are more than the" in split.reasons["pulse_blocks"]
     assert (
         replace(split.setting, pulse_blocks=1, form_seconds=one.setting.form_seconds) == one.setting
     )  # nothing else changes
@@ -43,6 +44,16 @@ def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
     short = plan(**LONG, memory_bytes=beside // 2)
     with pytest.raises(CampaignError, match="imaging needs"):
         check_fits(short, free_disk=None, where="f01/a-b", memory=beside // 2)
+
+
+def test_a_long_flight_is_summed_in_blocks_whatever_memory_there_is():
+    """Neither its samples nor its tables are ever in memory together, so three times the flight takes no more."""
+    flights = [{**LONG, "aperture": monostatic(straight_track(count, length_m=count / 33))} for count in (10**5, 3 * 10**5)]
+    short, long = (plan(**flight, overrides={"presum": 1}) for flight in flights)
+    assert long.setting.pulse_blocks == pytest.approx(3 * short.setting.pulse_blocks, rel=0.3)
+    more = 200_000 * 500  # phase centres and axes of every pulse
+    assert long.memory_bytes - more == pytest.approx(short.memory_bytes, rel=0.1)
+    assert "more than the 536.9 MB" in long.reasons["pulse_blocks"]
 
 
 def test_pulse_blocks_can_be_asked_for_and_hold_64_pulses_or_more():

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.geometry.aperture import Aperture
+from apertura.geometry.sector import Sector
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,12 @@ class Beam:
         ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes), -1, 0)
         return np.stack([np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))])
 
+    @property
+    def cone_rad(self) -> float:
+        """Half the angle of the narrowest cone about the boresight that holds the pattern."""
+        widest = [float(np.cos(np.abs(angle[[0, -1]]).max())) for angle in (self.azimuth_rad, self.elevation_rad)]
+        return float(np.arccos(widest[0] if widest[0] < 0 else widest[0] * max(widest[1], 0.0)))
+
     def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
         return [
             ("azimuth", self.azimuth_rad, self.azimuth_gain),
@@ -109,12 +116,14 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """Beams of transmitter and receiver; None is isotropic.
+    """What weighs pulses: beams of transmitter and receiver, and the sector that pixels are integrated over.
 
     Attributes
     ----------
     transmit, receive
-        Each over the pulses that an image is formed from.
+        Each over the pulses that an image is formed from; None is isotropic.
+    sector
+        Over the same pulses; None integrates all of them.
 
     Examples
     --------
@@ -124,15 +133,29 @@ class Beams:
 
     transmit: Beam | None = None
     receive: Beam | None = None
+    sector: Sector | None = None
 
     def __getitem__(self, pulses: slice) -> "Beams":
         """Return the beams over some pulses."""
-        return Beams(*(beam and beam[pulses] for beam in (self.transmit, self.receive)))
+        return Beams(*(part and part[pulses] for part in (self.transmit, self.receive, self.sector)))
+
+    @property
+    def antennas(self) -> "Beams | None":
+        """The beams without the sector; None where there are none."""
+        return Beams(self.transmit, self.receive) if self.transmit or self.receive else None
+
+    @classmethod
+    def within(cls, sector: Sector | None, antennas: "Beams | None") -> "Beams | None":
+        """Return the beams of antennas inside a sector; None where there is neither."""
+        beams = antennas or cls()
+        return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (pulse, pixel) float64, the product of both gains; else as `Beam.gain`."""
+        """Return (pulse, pixel) float64, the product of both gains and the sector's; else as `Beam.gain`."""
         total = np.ones((len(aperture), len(pixels)))
         for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
             if beam is not None:
                 total *= beam.gain(position_m, pixels)
+        if self.sector is not None:
+            total *= self.sector.weight(aperture, pixels)
         return total

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.antenna.beam import Beams
+from apertura.antenna.beam import Beam, Beams
 from apertura.geometry.aperture import Aperture
 
 _PULSES = 1024
@@ -72,11 +72,91 @@ def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -
     return Illumination(np.rint(seen * (len(aperture) / len(few))).astype(np.int64), len(aperture))
 
 
+def reached(
+    beams: Beams | None,
+    aperture: Aperture,
+    middle_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+    *,
+    pulses: int,
+) -> NDArray[np.bool_]:
+    """Return which blocks of pulses may weigh anything inside balls about places.
+
+    Parameters
+    ----------
+    beams
+        Of every pulse; None reaches everything.
+    aperture
+        Of every pulse.
+    middle_m, radius_m
+        (place, 3) and (place,) float64, metres.
+    pulses
+        Of a block.
+
+    Returns
+    -------
+    ndarray
+        (block, place) bool. Where it is False the weight of each pulse is zero all over the ball.
+    """
+    count = -(-len(aperture) // pulses)
+    lit = np.ones((count, len(middle_m)), bool)
+    if beams is None:
+        return lit
+    for first in range(0, count, _AT_ONCE):
+        part = slice(first * pulses, (first + _AT_ONCE) * pulses)
+        lit[first : first + _AT_ONCE] = _reached(beams[part], aperture[part], middle_m, radius_m, pulses)
+    return lit
+
+
+def _reached(
+    beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
+) -> NDArray[np.bool_]:
+    starts = np.arange(0, len(aperture), pulses)
+    middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
+    block = np.arange(len(aperture)) // pulses
+    middle = aperture[middles]
+    radius = [
+        radius_m + np.maximum.reduceat(np.linalg.norm(leg - there[block], axis=1), starts)[:, None]
+        for leg, there in zip(aperture.legs, middle.legs, strict=True)
+    ]
+    lit = np.ones((len(starts), len(middle_m)), bool)
+    if beams.sector is not None:
+        there = beams.sector[middles]
+        turned = beams.sector.turned(there[block])
+        slack = there.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(turned, starts)[:, None]
+        lit &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
+    for beam, leg, around in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
+        if beam is not None:
+            lit &= _in_cone(beam, middles, starts, middle_m - leg[:, None], around)
+    return lit
+
+
+def _in_cone(
+    beam: Beam,
+    middles: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    away_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Return which balls (block, place) touch the cone that holds the pattern at any pulse of a block."""
+    ahead = beam.axes[:, 0]
+    there = ahead[middles]
+    turns = _angle((ahead * np.repeat(there, np.diff(starts, append=len(ahead)), axis=0)).sum(axis=1))
+    range_m = np.linalg.norm(away_m, axis=-1)
+    off = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
+    near = np.arcsin(np.minimum(1.0, radius_m / range_m))
+    return (radius_m >= range_m) | (off - near - np.maximum.reduceat(turns, starts)[:, None] < beam.cone_rad + 1e-6)
+
+
+def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
 def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
     """Return which antennas have beams and what they see, in one line, and the flag `beam_misses`; neither without."""
-    if beams is None or illumination is None:
+    if beams is None or beams.antennas is None or illumination is None:
         return [], {}
     looking = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
     misses = f"{100 * illumination.unseen:.1f} % of the scene is seen by no pulse: its pixels are zero"

@@ -90,11 +90,11 @@ def _formation(told: Told, pair: str, history: Any) -> Formation:
     profiles, beams = range_compress(history, GRID, told.terrain), told.beams.get(pair)
     models = GroundModels.of(told.terrain, None, GRID)
     job = imaging_job(history.aperture, history.frequency_hz, history.weight, GRID, models, beams=beams)
-    lit = None if beams is None else illuminate(beams, job.aperture, job.points_m)
+    lit = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     plan = make_plan(
         replace(job, illumination=lit), accuracy_db=ACCURACY_DB, overrides={"presum": told.presum}, where="atlas"
     )
-    return Formation(history, profiles, GRID, plan, _TILE_PX, beams)
+    return Formation(history, profiles, GRID, plan, _TILE_PX)
 
 
 def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np.complex64]]:
@@ -106,7 +106,7 @@ def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np
     def at(row: Floats, column: Floats) -> NDArray[np.complex64]:
         places = formation.positions_at(row, column)
         values = engine.form(tables, places, beams=formation.beams, **setting.form_options)
-        return np.asarray(values / len(formation.profiles))
+        return np.asarray(values / formation.count)
 
     return at
 

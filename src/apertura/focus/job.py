@@ -1,6 +1,8 @@
 """An imaging job as numbers: what the planner and the engines' predictions look at before anything is formed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import Illumination
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
+from apertura.geometry.sector import Sector
 from apertura.scene.ground_models import GroundModels
 
 
@@ -43,6 +46,35 @@ class Signal:
 
 
 @dataclass(frozen=True, eq=False)
+class Integration:
+    """Over how much of a flight pixels are integrated.
+
+    Attributes
+    ----------
+    sector
+        None: every pulse counts for every pixel.
+    count
+        Pulses that 1 stands for: all, or the most that a place of the scene takes inside the sector.
+    value, reason
+        What was chosen, and why, in a few words.
+    share
+        Of pixels × pulses that are summed.
+    report
+        What image.json says of it.
+    flags
+        Limits crossed → what was found.
+    """
+
+    sector: Sector | None
+    count: int
+    value: str
+    reason: str
+    share: float = 1.0
+    report: Mapping[str, Any] = field(default_factory=dict)
+    flags: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class Job:
     """What is to be imaged.
 
@@ -74,7 +106,9 @@ class Job:
         How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
         errors of tables weigh that much more. None before anything was recorded.
     beams, illumination
-        Of the antennas, where they have any, over all pulses.
+        Of the antennas, where they have any, and of the sector integrated; over all pulses.
+    integration
+        Over how much of the flight; None: all of it.
     recorded
         Whether the phase history is there, which the double sum reads.
     """
@@ -96,6 +130,7 @@ class Job:
     content_db: float | None = None
     beams: Beams | None = None
     illumination: Illumination | None = None
+    integration: Integration | None = None
     recorded: bool = True
 
     @property
@@ -112,6 +147,26 @@ class Job:
     def antennas(self) -> int:
         """How many of both antennas have a beam."""
         return 0 if self.beams is None else sum(beam is not None for beam in (self.beams.transmit, self.beams.receive))
+
+    @property
+    def weights(self) -> int:
+        """How many weights a pulse has at a pixel."""
+        return self.antennas + (self.sector is not None)
+
+    @property
+    def sector(self) -> Sector | None:
+        """Inside which pulses count; None: all of them."""
+        return None if self.beams is None else self.beams.sector
+
+    @property
+    def share(self) -> float:
+        """Of pixels × pulses that are summed."""
+        return 1.0 if self.integration is None else self.integration.share
+
+    @property
+    def count(self) -> int:
+        """Pulses that 1 stands for."""
+        return len(self.aperture) if self.integration is None else self.integration.count
 
     @property
     def band_hz(self) -> tuple[float, float]:

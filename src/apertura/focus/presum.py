@@ -44,6 +44,16 @@ class Presum:
     at: NDArray[np.float64]
     weight: "sparse.csr_array"
 
+    def part(self, virtual: slice) -> tuple["Presum", slice]:
+        """Return what makes some of the virtual pulses, and the pulses that it is given."""
+        weight = self.weight[virtual]
+        first, last = int(weight.indices.min(initial=weight.shape[1] - 1)), int(weight.indices.max(initial=0))
+        at = self.at[virtual]
+        # places between two pulses take both; those beyond an end go straight on from the two outermost
+        first = max(0, min(first, int(at[0]), weight.shape[1] - 2))
+        last = min(weight.shape[1], max(last, int(at[-1]) + 1, 1) + 1)
+        return Presum(self.factor, at - first, weight[:, first:last]), slice(first, last)
+
 
 def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = -72.0) -> Presum | None:
     """Return the filter for a factor, or None where the scene's Doppler band leaves no room for it.

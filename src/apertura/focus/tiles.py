@@ -1,8 +1,9 @@
 """An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise, product
+from itertools import product
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
@@ -15,6 +16,7 @@ from apertura.focus.engines import load_engine
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.presum import Presum, presummed
+from apertura.focus.reach import Reach, pulse_blocks_of
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
@@ -29,13 +31,13 @@ def image_array(
     terrain: Terrain,
     *,
     side_px: int,
-    beams: Beams | None = None,
-    presum: tuple[Presum, NDArray[np.float64]] | None = None,
+    weighing: "Weighing | None" = None,
 ) -> "Array":
     """Return an image, the mean over the pulses, as a dask array whose chunks are square tiles.
 
     Tables are prepared once per block of pulses and shared by all tiles; with several blocks each one's tables are
-    prepared when the tiles of the block before are done, so that one block's tables are held at a time. A tile is the
+    prepared when the tiles of the block before are done, so that one block's inputs and tables are held at a time. A
+    tile takes of a block the pulses that may add something to it, and of a block without any nothing. It is the
     same to the bit whichever others are computed, in whatever order, by threads, processes or a cluster.
 
     Parameters
@@ -48,56 +50,94 @@ def image_array(
         The scene; pixels lie on the terrain.
     side_px
         Of a tile, a multiple of 16 pixels.
-    beams
-        Weight of each pulse at each pixel by its antennas; none by default.
-    presum
-        Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
+    weighing
+        What weighs and sums pulses before and beside the engine; by default every pulse counts once.
 
     Returns
     -------
     dask.array.Array
-        (row, column) complex64; 1 is the amplitude of an echo seen by every pulse.
+        (row, column) complex64; 1 is the amplitude of an echo that every pulse counted sees, 0 what none sees.
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
 
     from apertura.focus.layer import TilesLayer
 
-    name = f"image-{uuid4().hex}"
-    graph = partial(_graph, name, inputs, setting, grid, terrain, side_px, beams, presum)
+    name, weighing = f"image-{uuid4().hex}", weighing or Weighing()
     chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
-    places = product(range(len(chunks[0])), range(len(chunks[1])))
-    return Array(HighLevelGraph({name: TilesLayer(name, graph, places)}, {name: set()}), name, chunks, np.complex64)
+    places = list(product(range(len(chunks[0])), range(len(chunks[1]))))
+    reach = Reach.of(weighing.beams, inputs.aperture, grid, terrain, list(grid.tiles(side_px)))
+    forming = _Forming(name, setting, grid, terrain, side_px, weighing, reach)
+    layer = TilesLayer(name, partial(_graph, forming, inputs), places)
+    return Array(HighLevelGraph({name: layer}, {name: set()}), name, chunks, np.complex64)
 
 
-def _graph(  # noqa: PLR0917
-    name: str,
-    inputs: PhaseHistory | Profiles,
-    setting: Setting,
-    grid: SceneGrid,
-    terrain: Terrain,
-    side_px: int,
-    beams: Beams | None,
-    presum: tuple[Presum, NDArray[np.float64]] | None,
-    places: Collection[tuple[int, int]],
-) -> dict[Any, Any]:
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """How pulses count.
+
+    Attributes
+    ----------
+    beams
+        Weight of each pulse at each pixel by its antennas and the sector integrated; none by default.
+    presum
+        Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
+    count
+        Pulses that the sum is divided by; all of them by default.
+    """
+
+    beams: Beams | None = None
+    presum: tuple[Presum, NDArray[np.float64]] | None = None
+    count: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Forming:
+    """What the tasks of all tiles share."""
+
+    name: str
+    setting: Setting
+    grid: SceneGrid
+    terrain: Terrain
+    side_px: int
+    weighing: Weighing
+    reach: Reach
+
+    def window(self, place: tuple[int, int]) -> tuple[slice, slice]:
+        rows, columns = (slice(at * self.side_px, (at + 1) * self.side_px) for at in place)
+        return rows, columns
+
+    def index(self, place: tuple[int, int]) -> int:
+        return place[0] * -(-self.grid.shape[1] // self.side_px) + place[1]
+
+
+def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collection[tuple[int, int]]) -> dict[Any, Any]:
     """Return the tasks of the tiles in some rows and columns of tiles, and of what they share."""
-    count, pulses = np.float32(len(inputs)), len(inputs) if presum is None else len(presum[0].at)
-    ends = [number * pulses // setting.pulse_blocks for number in range(setting.pulse_blocks + 1)]
-    graph: dict[Any, Any] = {f"{name}-inputs": inputs}
+    name, presum, beams = forming.name, forming.weighing.presum, forming.weighing.beams
+    count = np.float32(forming.weighing.count or len(inputs))
+    pulses = len(inputs) if presum is None else len(presum[0].at)
+    graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
+    sums: dict[tuple[int, int], Any] = {}  # place → key of what the blocks so far add up to
     before: list[Any] = []  # what must be done before the next block's tables are prepared
-    for number, block in enumerate(slice(*pair) for pair in pairwise(ends)):
-        tables, last = f"{name}-tables-{number}", block.stop == pulses
-        graph[tables] = (partial(_prepare, setting, presum, block), f"{name}-inputs", before)
+    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, whole=beams is None)):
+        parts = {place: forming.reach.within(forming.index(place), some) for place in places}
+        lit = {place: part for place, part in parts.items() if part is not None}
+        if not lit:
+            continue
+        first, last = min(part.start for part in lit.values()), max(part.stop for part in lit.values())
+        block = slice(some.start + first, some.start + last)  # what no tile takes is not even read
+        tables = f"{name}-tables-{number}"
+        graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
         before = []
-        for place in places:
-            rows, columns = (slice(at * side_px, (at + 1) * side_px) for at in place)
-            form = partial(_form, setting, grid[rows, columns], terrain, beams and beams[block], count)
-            sum_before = (f"{name}-{number - 1}", *place) if number else None
-            key = (name if last else f"{name}-{number}", *place)
-            graph[key] = (form, tables, sum_before)
+        for place, reached in lit.items():
+            part = slice(reached.start - first, reached.stop - first)
+            form, key = partial(_form, forming, place, block, part, count), (f"{name}-{number}", *place)
+            graph[key] = (form, tables, f"{name}-beams", sums.get(place))
             graph[f"{name}-done-{number}", *place] = (_nothing, key)
             before.append((f"{name}-done-{number}", *place))
+            sums[place] = key
+    for place in places:
+        graph[name, *place] = sums[place] if place in sums else (partial(_unseen, forming.grid[forming.window(place)]),)
     return graph
 
 
@@ -110,23 +150,35 @@ def _prepare(
 ) -> Any:
     """Return what all tiles share of a block of pulses."""
     if presum is not None and isinstance(inputs, Profiles):
-        inputs = presummed(inputs, *presum)
+        some, pulses = presum[0].part(block)
+        return load_engine(setting.engine).prepare(presummed(inputs[pulses], some, presum[1]), **setting.options)
     return load_engine(setting.engine).prepare(inputs[block], **setting.options)
 
 
 def _form(  # noqa: PLR0917
-    setting: Setting,
-    grid: SceneGrid,
-    terrain: Terrain,
-    beams: Beams | None,
+    forming: _Forming,
+    place: tuple[int, int],
+    block: slice,
+    part: slice,
     count: np.float32,
     tables: Any,
+    beams: Beams | None,
     sum_before: NDArray[np.complex64] | None,
 ) -> NDArray[np.complex64]:
     """Return one tile of the image of a block of pulses, added to that of the blocks before."""
-    image = load_engine(setting.engine).form(tables, terrain.positions(grid), beams=beams, **setting.form_options)
+    setting, grid = forming.setting, forming.grid[forming.window(place)]
+    if part != slice(0, block.stop - block.start):
+        tables = tables[part]
+    some = beams and beams[block.start + part.start : block.start + part.stop]
+    pixels = forming.terrain.positions(grid)
+    image = load_engine(setting.engine).form(tables, pixels, beams=some, **setting.form_options)
     tile = np.asarray(image / count, np.complex64)
     return tile if sum_before is None else sum_before + tile
+
+
+def _unseen(grid: SceneGrid) -> NDArray[np.complex64]:
+    """Return a tile that no pulse sees."""
+    return np.zeros(grid.shape, np.complex64)
 
 
 def _nothing(_done: Any) -> None:

@@ -1,5 +1,6 @@
 """The synthetic aperture of a pair: where both phase centres were at each pulse, and what follows from it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -7,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+
+Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
+"""Pulses and points (point, 3) → (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 256
 _STEPS_IN_A_ROW = 63
@@ -147,7 +151,9 @@ class Aperture:
         in_a_row = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
         return float(np.median(in_a_row, axis=1).max()) / wavelength_m, widest / wavelength_m
 
-    def resolution_cell_m(self, ground_m: NDArray[np.float64], *, band_hz: tuple[float, float]) -> float:
+    def resolution_cell_m(
+        self, ground_m: NDArray[np.float64], *, band_hz: tuple[float, float], weigh: Weigh | None = None
+    ) -> float:
         """Return the finest resolution cell of the scene along rows or columns, metres.
 
         Parameters
@@ -156,21 +162,33 @@ class Aperture:
             (row, column, 3) float64, metres: points spread over the scene, corners included; rows go south.
         band_hz
             Lowest and highest frequency.
+        weigh
+            Pulses and points → weights; points of which less than a half is left do not count. By default all count.
 
         Notes
         -----
         Source: docs/theory.md, eq. 8: the inverse of the widest spatial spectrum of a point.
         """
-        gradient = self[self.sample(64)].path_gradient(ground_m.reshape(-1, 3))
-        widest = 1e-9
+        points, some = ground_m.reshape(-1, 3), self.sample(64 if weigh is None else 1024)
+        gradient = self[some].path_gradient(points)
+        if weigh is not None:
+            gradient[weigh(some, points) < 0.5] = np.nan
+        seen = np.isfinite(gradient).all(axis=-1).any(axis=0)
+        gradient, widest = gradient[:, seen], 1e-9
         for side in (ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]):
             slope = gradient @ side / max(float(np.linalg.norm(side)), 1e-9)
             cycles = np.concatenate([slope * frequency / SPEED_OF_LIGHT_M_S for frequency in band_hz])
-            widest = max(widest, float(np.ptp(cycles, axis=0).max()))
+            if cycles.size:
+                widest = max(widest, float((np.nanmax(cycles, axis=0) - np.nanmin(cycles, axis=0)).max()))
         return 1 / widest
 
     def spectrum(
-        self, point_m: NDArray[np.float64], axes: NDArray[np.float64], *, frequency_hz: NDArray[np.float64]
+        self,
+        point_m: NDArray[np.float64],
+        axes: NDArray[np.float64],
+        *,
+        frequency_hz: NDArray[np.float64],
+        weigh: Weigh | None = None,
     ) -> NDArray[np.float64]:
         """Return how wide the spatial spectrum of a point is along some axes: its covariance, cycles² per m².
 
@@ -182,6 +200,8 @@ class Aperture:
             (axis, 3) float64, unit vectors.
         frequency_hz
             (frequency,) float64, samples of the band, each counting alike.
+        weigh
+            As of `resolution_cell_m`.
 
         Returns
         -------
@@ -189,7 +209,10 @@ class Aperture:
             (axis, axis) float64. The peak of a point whose noise power is ε of its own scatters by
             ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
         """
-        slope = self[self.sample(64)].path_gradient(point_m) @ axes.T
+        some = self.sample(64 if weigh is None else 1024)
+        slope = self[some].path_gradient(point_m) @ axes.T
+        if weigh is not None:
+            slope = slope[weigh(some, point_m[None])[:, 0] >= 0.5]
         cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
         return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
 

@@ -66,8 +66,9 @@ def backproject(
     terrain_model
         'auto', 'plane', 'tilted_plane' or 'dem': what stands for the ground.
     **choices
-        The others of `apertura.imaging.choices.ImagingChoices`: engine_options, presum, pulse_blocks, tile_px (side of
-        a tile, which is a chunk of the array, 256), window (over the subcarriers of a stage `echo`, 'hann').
+        The others of `apertura.imaging.choices.ImagingChoices`: engine_options, presum, pulse_blocks, integration,
+        tile_px (side of a tile, which is a chunk of the array, 256), window (over the subcarriers of a stage `echo`,
+        'hann').
 
     Returns
     -------
@@ -118,9 +119,10 @@ def backproject(
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
-    job = replace(_job(compressed, history, grid, GroundModels.of(ground, None, grid), beams), tile_px=asked.tile_px)
+    models = GroundModels.of(ground, None, grid)
+    job = replace(_job(compressed, history, grid, models, beams, asked.integrated), tile_px=asked.tile_px)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
-    formation = Formation(history, compressed, grid, plan, asked.tile_px, beams)
+    formation = Formation(history, compressed, grid, plan, asked.tile_px)
     attributes: dict[str, Any] = {}
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
@@ -175,13 +177,18 @@ def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.co
 
 
 def _job(
-    profiles: Profiles, history: PhaseHistory | None, grid: SceneGrid, ground: GroundModels, beams: Beams | None
+    profiles: Profiles,
+    history: PhaseHistory | None,
+    grid: SceneGrid,
+    ground: GroundModels,
+    beams: Beams | None,
+    integration: Any,
 ) -> Job:
+    weighed: dict[str, Any] = {"beams": beams, "integration": integration}
     if history is None:
-        job = profiles_job(profiles, grid, ground, beams=beams)
+        job = profiles_job(profiles, grid, ground, **weighed)
     else:
-        job = imaging_job(
-            history.aperture, history.frequency_hz, history.weight, grid, ground, history=history, beams=beams
-        )
-    lit = None if beams is None else illuminate(beams, job.aperture, job.points_m)
+        known = (history.aperture, history.frequency_hz, history.weight)
+        job = imaging_job(*known, grid, ground, history=history, **weighed)
+    lit = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     return replace(job, illumination=lit, memory_bytes=memory_limit())

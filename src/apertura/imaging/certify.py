@@ -90,13 +90,12 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
     overview, grid = survey(target, formation.windows), formation.grid
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
-    track = formation.profiles.aperture.tx_m
-    along = _direction(grid, track[-1] - track[0], peak.row, peak.column)
+    along = _direction(grid, _flown(formation, peak.row, peak.column), peak.row, peak.column)
     cuts = {
         name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
         for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
     }
-    terms = formation.contributions(peak.row, peak.column)[:, 0]
+    (terms,) = formation.contributions(peak.row, peak.column)
     return {
         "entropy": round(overview.entropy, 6),
         "noise_floor_db": overview.noise_floor_db,
@@ -104,7 +103,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             "x_m": round(x, 4),
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
-            "coherence_factor": coherence_factor(terms[terms != 0]),
+            "coherence_factor": coherence_factor(terms),
             **{
                 f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
                 for name, cut in cuts.items()
@@ -112,6 +111,14 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             },
         },
     }
+
+
+def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float64]:
+    """Return the vector from the transmitter's first to its last place that may see a pixel, metres."""
+    blocks = [(pulses, parts) for pulses, parts in formation.seeing(formation.positions_at([row], [column]))]
+    first, last = blocks[0][0].start + blocks[0][1][0][0].start, blocks[-1][0].start + blocks[-1][1][-1][0].stop - 1
+    track = formation.profiles.aperture.tx_m
+    return np.asarray(track[last] - track[first])
 
 
 def _direction(grid: SceneGrid, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:

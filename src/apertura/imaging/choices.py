@@ -9,6 +9,23 @@ from apertura.focus.engines import ENGINES, PATCH_PX, load_engine
 ACCURACY_DB = -60.0
 """Numerical error asked where nothing is known of other errors."""
 
+
+class Degrees(BaseModel):
+    """So much of a straight pass."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    degrees: float = Field(gt=0, le=180, description="integration angle of a straight pass, degrees")
+
+
+class Resolution(BaseModel):
+    """As much of a pass as a resolution needs."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    resolution_m: float = Field(gt=0, description="resolution along the flight that the angle shall give, m")
+
+
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
 """Choices that are the planner's where they are 'auto'."""
 
@@ -52,6 +69,11 @@ class ImagingChoices(BaseModel):
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
         "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
     )
+    integration: Literal["auto", "all"] | Degrees | Resolution = Field(
+        "auto",
+        description="how much of a pass a pixel is integrated over: auto, what the pixels' spacing carries; all; "
+        "{degrees: x} of a straight pass; {resolution_m: x} along the flight",
+    )
     terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
         "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
     )
@@ -60,6 +82,11 @@ class ImagingChoices(BaseModel):
     def planned(self) -> dict[str, Any]:
         """What the planner is asked."""
         return {name: getattr(self, name) for name in PLANNED}
+
+    @property
+    def integrated(self) -> Any:
+        """How much of a pass is asked for: 'auto', 'all', or a mapping."""
+        return self.integration if isinstance(self.integration, str) else self.integration.model_dump()
 
     @property
     def asked_db(self) -> float:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Weigh
 from apertura.imaging.echo_place import echo_elsewhere
 from apertura.imaging.formation import Formation
 from apertura.imaging.parts import PART_PX, part_images
@@ -34,7 +35,14 @@ def resolution_cell_m(formation: Formation) -> float:
     half = _half_band_hz(profiles)
     pixels = grid.sample_pixels(_CELL_POINTS)
     band = profiles.centre_frequency_hz - half, profiles.centre_frequency_hz + half
-    return profiles.aperture.resolution_cell_m(formation.positions_at(*pixels), band_hz=band)
+    return profiles.aperture.resolution_cell_m(
+        formation.positions_at(*pixels), band_hz=band, weigh=_sector_of(formation)
+    )
+
+
+def _sector_of(formation: Formation) -> Weigh | None:
+    sector = formation.beams and formation.beams.sector
+    return None if sector is None else sector.over(formation.profiles.aperture)
 
 
 def _half_band_hz(profiles: Profiles) -> float:
@@ -48,7 +56,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     here, axes = _axes(formation, row, column)
     half = _half_band_hz(profiles)
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
-    return profiles.aperture.spectrum(here, axes, frequency_hz=band)
+    return profiles.aperture.spectrum(here, axes, frequency_hz=band, weigh=_sector_of(formation))
 
 
 def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
@@ -70,8 +78,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     points = bright_points(target, formation.windows, apart_px=apart_px)
     terms = formation.contributions([point.row for point in points], [point.column for point in points])
     measured = [
-        _focus_of(column) if point.background <= SPECKLE else None
-        for point, column in zip(points, terms.T, strict=True)
+        point_focus(each) if point.background <= SPECKLE else None for point, each in zip(points, terms, strict=True)
     ]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
@@ -103,10 +110,6 @@ def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
     }
 
 
-def _focus_of(terms: NDArray[np.complex128]) -> PointFocus | None:
-    return point_focus(terms[terms != 0])
-
-
 def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:
     """Return what images of parts of the aperture say about the brightest places."""
     spacing_m = cell_m / _PLACES_PER_CELL
@@ -136,8 +139,10 @@ def _carrier(formation: Formation, point: BrightPoint) -> list[float]:
     """Return the spatial frequency of a point, east and north, at the middle of aperture and band, cycles per metre."""
     profiles = formation.profiles
     here, axes = _axes(formation, max(1.0, point.row), min(point.column, formation.grid.shape[1] - 2.0))
-    some = profiles.aperture[profiles.aperture.sample(64)]
-    slope = (some.path_gradient(here) @ axes.T).mean(axis=0)
+    weigh, some = _sector_of(formation), profiles.aperture.sample(64 if _sector_of(formation) is None else 1024)
+    gradient = profiles.aperture[some].path_gradient(here)
+    weight = np.ones(len(gradient)) if weigh is None else weigh(some, here[None])[:, 0]
+    slope = np.average(gradient, axis=0, weights=weight) @ axes.T
     cycles = slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
     return [float(f"{value:.8g}") for value in cycles]
 

@@ -1,25 +1,30 @@
 """What forms one image, opened once: inputs, scene, antennas and plan, handed to tiles, certificate and measures."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.antenna.beam import Beams
+from apertura.antenna.illumination import reached
 from apertura.contracts import Window
 from apertura.focus.band_limited import band_limited_image
 from apertura.focus.engines import PATCH_PX, load_engine, reference
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.tiles import image_array
+from apertura.focus.reach import PULSES, Reach, pulse_blocks_of
+from apertura.focus.tiles import Weighing, image_array
 from apertura.planning.plan import Plan
 from apertura.scene.grid import SceneGrid
 
 if TYPE_CHECKING:
     from dask.array.core import Array
 
-_PULSES_AT_ONCE = 64
+PULSES_READ = 1024
+"""Of a phase history at once, or of profiles where places are looked at closely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +40,9 @@ class Formation:
     grid
         Of the image.
     plan
-        How it is formed, and on which model of the ground.
+        How it is formed, on which model of the ground, and how pulses are weighed.
     side_px
         Of a tile.
-    beams
-        Of the antennas; None where they are isotropic.
     """
 
     history: PhaseHistory | None
@@ -47,12 +50,31 @@ class Formation:
     grid: SceneGrid
     plan: Plan
     side_px: int
-    beams: Beams | None = None
 
     @property
-    def windows(self) -> list[Window]:
-        """Every tile."""
+    def beams(self) -> Beams | None:
+        """What weighs pulses: antennas and the sector integrated; None where every pulse counts alike."""
+        return self.plan.beams
+
+    @property
+    def count(self) -> int:
+        """Pulses that 1 stands for."""
+        return self.plan.count or len(self.profiles)
+
+    @property
+    def tiles(self) -> list[Window]:
+        """Every tile of the grid."""
         return list(self.grid.tiles(self.side_px))
+
+    @cached_property
+    def windows(self) -> list[Window]:
+        """Every tile that a pulse may see, a whole one first if there is one; the others are not formed, and zero."""
+        tiles = self.tiles
+        reach = Reach.of(self.beams, self.profiles.aperture, self.grid, self.plan.terrain, tiles)
+        seen = [tile for tile, lit in zip(tiles, reach.seen, strict=True) if lit]
+        side = tuple(min(self.side_px, size) for size in self.grid.shape)
+        whole = next((tile for tile in seen if tuple(part.stop - part.start for part in tile) == side), None)
+        return tiles if whole is None else [whole, *(tile for tile in seen if tile is not whole)]
 
     @property
     def image(self) -> "Array":
@@ -73,32 +95,46 @@ class Formation:
         Where there are only profiles, by their band-limited interpolation in float64.
         """
         places = self.positions_at(*pixels.T)
-        if self.history is None:
-            total = band_limited_image(self.profiles, places, beams=self.beams)
-        else:
-            total = reference.form(self.history, places, beams=self.beams)
-        return np.asarray(total / len(self.profiles))
+        total = np.zeros(len(places), np.complex128)
+        for pulses, seen in self.seeing(places):
+            some = (self.history or self.profiles)[pulses]
+            for part, lit in seen:
+                weights = self.beams and self.beams[pulses][part]
+                total[lit] += _exact_sum(some[part], places[lit], weights)
+        return np.asarray(total / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
         """Return the planned image at (pixel, 2) rows and columns, forming just the patch of each.
 
         (pixel,) complex64, and mean |I|² over those patches, (pixel,) float64.
         """
-        setting, side = self.plan.setting, PATCH_PX
-        engine, inputs = load_engine(setting.engine), self._inputs(setting)
-        if isinstance(inputs, Profiles):
-            inputs = self.plan.inputs(inputs)
-        tables, values = engine.prepare(inputs, **setting.options), np.empty(len(pixels), np.complex64)
-        power = np.empty(len(pixels))
-        for index, (row, column) in enumerate(pixels):
-            top, left = row // side * side, column // side * side
-            places = self.plan.terrain.positions(self.grid[top : top + side, left : left + side])
-            patch = engine.form(tables, places, beams=self.beams, **setting.form_options) / len(self.profiles)
-            values[index], power[index] = patch[row - top, column - left], (np.abs(patch) ** 2).mean()
-        return values, power
+        first = pixels // PATCH_PX * PATCH_PX
+        windows = [tuple(slice(at, at + PATCH_PX) for at in corner) for corner in first.tolist()]
+        image = self.image_of(windows)
+        inside = pixels - first
+        values = np.array([patch[tuple(at)] for patch, at in zip(image, inside, strict=True)], np.complex64)
+        return values, np.array([(np.abs(patch) ** 2).mean() for patch in image])
 
-    def contributions(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
-        """Return what each pulse adds at fractional pixels, (pulse, pixel) complex128; 0 where it does not see one.
+    def image_of(self, windows: Sequence[Window]) -> list[NDArray[np.complex64]]:
+        """Return the planned image in windows that begin at patches of an engine, block of pulses by block."""
+        setting, beams, presum = self.plan.setting, self.beams, self.plan.presumming
+        engine, inputs = load_engine(setting.engine), self._inputs(setting)
+        if isinstance(inputs, Profiles) and presum is not None:
+            inputs = self.plan.inputs(inputs)
+        reach = Reach.of(beams, inputs.aperture, self.grid, self.plan.terrain, windows)
+        places = [self.plan.terrain.positions(self.grid[window]) for window in windows]
+        image = [np.zeros(place.shape[:2], np.complex64) for place in places]
+        for block in pulse_blocks_of(len(inputs), setting.pulse_blocks, whole=beams is None):
+            tables = engine.prepare(inputs[block], **setting.options)
+            for number, place in enumerate(places):
+                if (part := reach.within(number, block)) is not None:
+                    some = tables if part == slice(0, block.stop - block.start) else tables[part]
+                    weights = beams and beams[block][part]
+                    image[number] += engine.form(some, place, beams=weights, **setting.form_options) / self.count
+        return image
+
+    def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
+        """Return what each pulse that sees a fractional pixel adds to it, pixel by pixel, (pulse,) complex128.
 
         Raises
         ------
@@ -108,9 +144,36 @@ class Formation:
         if self.history is None:
             raise ValueError("profiles do not tell what each pulse adds")
         places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
-        parts = [slice(first, first + _PULSES_AT_ONCE) for first in range(0, len(self.history), _PULSES_AT_ONCE)]
-        beams = self.beams
-        return np.concatenate([reference.terms(self.history[part], places, beams and beams[part]) for part in parts])
+        parts: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
+        for pulses, seen in self.seeing(places):
+            some = self.history[pulses]
+            for part, lit in seen:
+                terms = reference.terms(some[part], places[lit], self.beams and self.beams[pulses][part])
+                for place, column_of in zip(np.flatnonzero(lit), terms.T, strict=True):
+                    parts[place].append(column_of[column_of != 0])
+        return [np.concatenate(part) for part in parts]
+
+    def seeing(self, places: NDArray[np.float64]) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
+        """Yield blocks of pulses to be read, each with the parts of it that may see some places, and which.
+
+        Parameters
+        ----------
+        places
+            (place, 3) float64, metres.
+        """
+        aperture, beams = self.profiles.aperture, self.beams
+        lit = reached(beams, aperture, places, np.zeros(len(places)), pulses=PULSES)
+        for first in range(0, len(aperture), PULSES_READ):
+            block = slice(first, min(first + PULSES_READ, len(aperture)))
+            length = block.stop - block.start
+            rows = lit[first // PULSES : -(-block.stop // PULSES)]
+            parts = [
+                (slice(number * PULSES, min(length, (number + 1) * PULSES)), row)
+                for number, row in enumerate(rows)
+                if row.any()
+            ]
+            if parts:
+                yield block, parts
 
     def _inputs(self, setting: Setting) -> PhaseHistory | Profiles:
         if load_engine(setting.engine).READS == "profiles":
@@ -121,12 +184,20 @@ class Formation:
 
     def _array(self, setting: Setting, *, presum: bool) -> "Array":
         inputs = self._inputs(setting)
+        summed = self.plan.presumming if presum and isinstance(inputs, Profiles) else None
         return image_array(
             inputs,
             setting,
             self.grid,
             self.plan.terrain,
             side_px=self.side_px,
-            beams=self.beams,
-            presum=self.plan.presumming if presum and isinstance(inputs, Profiles) else None,
+            weighing=Weighing(self.beams, summed, self.plan.count),
         )
+
+
+def _exact_sum(
+    inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None
+) -> NDArray[np.complex128]:
+    if isinstance(inputs, PhaseHistory):
+        return reference.form(inputs, places, beams=beams)
+    return band_limited_image(inputs, places, beams=beams)

@@ -1,5 +1,7 @@
 """From what is known of a pair and a scene to the planner's job."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,7 @@ from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job, Signal
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.range_profiles import RangeWindow
+from apertura.planning.integration import integrate
 from apertura.quality.measures import content_loss_db
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
@@ -18,6 +21,7 @@ from apertura.scene.terrain import Terrain
 
 _POINTS = 9
 _CONTENT_PIXELS = 128
+_CONTENT_PULSES = 16384  # of which the terms of so many pixels take 32 MB
 
 
 def imaging_job(
@@ -29,6 +33,7 @@ def imaging_job(
     *,
     history: PhaseHistory | None = None,
     beams: Beams | None = None,
+    integration: Any = "auto",
 ) -> Job:
     """Return the planner's job.
 
@@ -44,17 +49,23 @@ def imaging_job(
         What was recorded, where it is there: it tells how much errors weigh between the scene's targets.
     beams
         Of the antennas, where they have any.
+    integration
+        As `apertura.planning.integration.integrate` is asked.
 
     Returns
     -------
     Job
         With no limit of path or memory, and defaults of tiles and threads, to be replaced.
     """
-    window = RangeWindow.of(aperture, grid, ground.full, frequency_hz)
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
+    ground_m = grid.sample_points(_POINTS, ground.level.height_m)
+    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre}
+    settled = integrate(aperture, ground_m, **geometry, antennas=beams, asked=integration)
+    beams = Beams.within(settled.sector, beams)
+    window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams)
     return Job(
         aperture=aperture,
-        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
+        ground_m=ground_m,
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
@@ -65,24 +76,30 @@ def imaging_job(
         terrain=ground,
         content_db=None if history is None else _content_db(history, grid, ground.full, beams),
         beams=beams,
+        integration=settled,
     )
 
 
-def profiles_job(profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None) -> Job:
+def profiles_job(
+    profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None, integration: Any = "auto"
+) -> Job:
     """Return the planner's job of range profiles alone: their band is taken as full and flat, their echo as unseen.
 
     Parameters
     ----------
     profiles
         In the frame of the pixels.
-    grid, ground, beams
+    grid, ground, beams, integration
         As `imaging_job`.
     """
     bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
+    ground_m = grid.sample_points(_POINTS, ground.level.height_m)
+    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre}
+    settled = integrate(profiles.aperture, ground_m, **geometry, antennas=beams, asked=integration)
     return Job(
         aperture=profiles.aperture,
-        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
+        ground_m=ground_m,
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
@@ -91,13 +108,16 @@ def profiles_job(profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, b
         signal=Signal(centre, profiles.oversampling, profiles.step_m, samples),
         frame=grid.frame,
         terrain=ground,
-        beams=beams,
+        beams=Beams.within(settled.sector, beams),
+        integration=settled,
         recorded=False,
     )
 
 
-def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams: Beams | None) -> float:
-    """Return how much errors weigh at some random pixels of the scene."""
+def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams: Beams | None) -> float | None:
+    """Return how much errors weigh at some random pixels of the scene; None where a flight is too long to be read."""
+    if len(history) > _CONTENT_PULSES:
+        return None
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
     places = terrain.positions_at(grid, rows, columns)
     parts = [slice(first, first + 64) for first in range(0, len(history), 64)]

@@ -7,9 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
+from apertura.antenna.illumination import reached
 from apertura.focus.engines import ENGINES, load_engine
 from apertura.focus.engines.engine import Engine
 from apertura.focus.inputs import Profiles
+from apertura.focus.reach import PULSES
+from apertura.geometry.aperture import Aperture
+from apertura.imaging.formation import PULSES_READ
 
 PARTS = 8
 """Parts of the aperture."""
@@ -41,16 +45,29 @@ def part_images(
         pulses a part.
     """
     images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
+    aperture = profiles.aperture
     if len(profiles) < 4 * PARTS:
         return images[:0]
     engine = table_engine()
-    for number, block in enumerate(profiles.aperture.blocks(PARTS)):
-        for odd in range(2):
-            some = slice(block.start + odd, block.stop, 2)
-            for patch, where in enumerate(places):
-                tables = engine.prepare(_around(profiles[some], where))
-                images[patch, odd, number] = engine.form(tables, where, beams=beams and beams[some]) / len(profiles)
+    for patch, where in enumerate(places):
+        seen = _seeing(beams, aperture, where)
+        for number, block in enumerate(aperture[seen].blocks(PARTS)):
+            for first in range(seen.start + block.start, seen.start + block.stop, PULSES_READ):
+                last = min(first + PULSES_READ, seen.start + block.stop)
+                read = _around(profiles[first:last], where)
+                for odd in range(min(2, last - first)):
+                    tables = engine.prepare(read[odd::2])
+                    weights = beams and beams[first + odd : last : 2]
+                    images[patch, odd, number] += engine.form(tables, where, beams=weights) / len(profiles)
     return np.nan_to_num(images)
+
+
+def _seeing(beams: Beams | None, aperture: Aperture, places: NDArray[np.float64]) -> slice:
+    """Return the first to the last pulse that may see a patch."""
+    middle = places[PART_PX // 2, PART_PX // 2]
+    radius = np.linalg.norm(places - middle, axis=-1).max()
+    lit = np.flatnonzero(reached(beams, aperture, middle[None], np.array([radius]), pulses=PULSES)[:, 0])
+    return slice(int(lit[0]) * PULSES, min(int(lit[-1] + 1) * PULSES, len(aperture))) if lit.size else slice(0, 0)
 
 
 def table_engine() -> Engine:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.antenna.beam import Beams
 from apertura.echo.compression import centre_frequency, compress, range_step
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.geometry.aperture import Aperture
@@ -34,7 +35,7 @@ class RangeWindow:
     unambiguous
         Samples after which the profile repeats itself.
     farthest_m
-        (pulse,) float64, longest total path to the scene, metres.
+        (pulse,) float64, longest total path to what the pulse may add to, metres; -inf where that is nothing.
     """
 
     start_m: NDArray[np.float64]
@@ -43,9 +44,20 @@ class RangeWindow:
     unambiguous: int
     farthest_m: NDArray[np.float64]
 
+    @property
+    def contributing(self) -> NDArray[np.bool_]:
+        """(pulse,) bool: whether a pulse may add to anything; the profile of one that does not is never looked at."""
+        return np.isfinite(self.farthest_m)
+
     @classmethod
     def of(
-        cls, aperture: Aperture, grid: SceneGrid, terrain: Terrain, frequency_hz: NDArray[np.float64]
+        cls,
+        aperture: Aperture,
+        grid: SceneGrid,
+        terrain: Terrain,
+        frequency_hz: NDArray[np.float64],
+        *,
+        beams: Beams | None = None,
     ) -> "RangeWindow":
         """Return the window that a scene needs.
 
@@ -57,14 +69,18 @@ class RangeWindow:
             The scene.
         frequency_hz
             (subcarrier,) float64, ascending in equal steps.
+        beams
+            What weighs pulses: each pulse's window covers what it may add to. By default it covers all of the scene.
 
         Notes
         -----
         Source: docs/theory.md, eq. 4.
         """
-        nearest, farthest = swath(grid, terrain, aperture)
+        nearest, farthest = swath(grid, terrain, aperture, beams=beams)
         step, length = range_step(frequency_hz, oversampling=OVERSAMPLING)
-        samples = int(np.ceil((farthest - nearest).max() / step)) + 2 * GUARD_SAMPLES + 1
+        spans = farthest - nearest
+        samples = int(np.ceil(spans.max(initial=0.0, where=np.isfinite(spans)) / step)) + 2 * GUARD_SAMPLES + 1
+        nearest = np.where(np.isfinite(nearest), nearest, 0.0)
         return cls(nearest - GUARD_SAMPLES * step, samples, step, length, farthest)
 
 

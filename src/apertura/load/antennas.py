@@ -63,9 +63,9 @@ def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> 
 
 def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
     """Return what image.json says of a pair's antennas: what was stated, and how many pulses see the scene."""
-    if illumination is None:
-        return {}
     stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
+    if illumination is None or not stated:
+        return {}
     return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
 
 

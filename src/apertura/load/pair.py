@@ -88,7 +88,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
             return _expected(campaign, flight, pair, waveform)
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
         echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
-    history = phase_history_of(echo, campaign.settings.processing.window)
+    history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
     stated = echo.attrs.get("positions", {})

@@ -76,10 +76,11 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         ground,
         history=pair.history,
         beams=pair.beams,
+        integration=campaign.settings.processing.integrated,
     )
     return replace(
         job,
-        illumination=lit(campaign, pair.name, pair.beams, scene, pair.aperture),
+        illumination=lit(campaign, pair.name, job.beams, scene, pair.aperture),
         tile_px=campaign.settings.processing.tile_px,
         threads=threads,
         path_limit_m=pair.path_limit_m,

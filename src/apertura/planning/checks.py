@@ -34,7 +34,8 @@ def check_geometry(job: Job) -> dict[str, str]:
             f"{int(over.sum())} of {len(aperture)} pulses are sent or received above the scene: echoes from both sides "
             "mix"
         )
-    cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz)
+    weigh = None if job.sector is None else job.sector.over(aperture)
+    cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz, weigh=weigh)
     if job.spacing_m > cell_m:
         flags["spacing_coarse"] = (
             f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"

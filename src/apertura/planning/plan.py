@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import Illumination
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import Profiles
+from apertura.focus.job import Integration
 from apertura.focus.presum import Presum, presummed
 from apertura.scene.terrain import Terrain
 
@@ -60,7 +62,7 @@ class Plan:
         The low-pass sum over pulses, and the point they are aligned to; settings of `fallbacks` go without.
     terrain
         The ground that is imaged on: as it is, a plane through it, or level.
-    illumination
+    beams, integration, illumination
         Of the job.
     """
 
@@ -76,6 +78,8 @@ class Plan:
     terrain: Terrain
     presum: Presum | None = field(default=None, repr=False)
     middle_m: NDArray[np.float64] | None = field(default=None, repr=False)
+    beams: Beams | None = field(default=None, repr=False)
+    integration: Integration | None = field(default=None, repr=False)
     illumination: Illumination | None = field(default=None, repr=False)
 
     @property
@@ -92,6 +96,11 @@ class Plan:
     def choices(self) -> dict[str, Any]:
         """Choice → value: all that the image's pixels depend on, and no prediction."""
         return {decision.name: decision.value for decision in self.decisions} | {"ground": self.terrain.spec}
+
+    @property
+    def count(self) -> int | None:
+        """Pulses that 1 stands for; None: all of them."""
+        return None if self.integration is None or self.integration.sector is None else self.integration.count
 
     @property
     def presumming(self) -> tuple[Presum, NDArray[np.float64]] | None:

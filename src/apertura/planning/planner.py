@@ -8,7 +8,7 @@ from apertura.antenna.illumination import decide_antennas
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.focus.engines.engine import Setting, power_sum_db
-from apertura.focus.job import Job
+from apertura.focus.job import Integration, Job
 from apertura.focus.presum import PRESUM_S, Presum, design, presum_error_db
 from apertura.planning.checks import check_geometry
 from apertura.planning.memory import block_decision, bytes_needed
@@ -61,13 +61,15 @@ def make_plan(
         flags["prediction_misses"] = (
             f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
         )
+    integrated = job.integration or Integration(None, len(job.aperture), "all", "every pulse counts for every pixel")
     memory, disk = bytes_needed(job, chosen, presum)
-    blocks = block_decision(chosen, job, asked="pulse_blocks" in asked)
+    blocks = block_decision(chosen, job, presum, asked="pulse_blocks" in asked)
     return Plan(
         setting=chosen,
         fallbacks=search.fallbacks(chosen),
         decisions=(
             *search.decisions(chosen, accuracy_db),
+            Decision("integration", integrated.value, integrated.reason),
             presumming,
             blocks,
             terrain,
@@ -78,10 +80,12 @@ def make_plan(
         predicted_seconds=chosen.table_seconds + chosen.form_seconds / min(job.threads, job.tiles),
         memory_bytes=memory,
         disk_bytes=disk,
-        flags=flags | missed,
+        flags={**flags, **missed, **integrated.flags},
         terrain=job.terrain.called(str(terrain.value)),
         presum=presum,
         middle_m=job.points_m[len(job.points_m) // 2],
+        beams=job.beams,
+        integration=integrated,
         illumination=job.illumination,
     )
 
@@ -102,7 +106,7 @@ def _decide_presum(
     if job.beams is not None:
         if asked is not None:
             raise _no_presum(asked, search.where)
-        return keep("the antennas weigh every pulse for itself")
+        return keep(f"{'the antennas weigh' if job.antennas else 'the sector weighs'} every pulse for itself")
     if every_pulse.engine == "reference":
         return keep("the double sum takes every pulse")
     limit_db = accuracy_db - MARGIN_DB - search.content_db - 3
@@ -131,10 +135,10 @@ def _decide_presum(
 
 def _no_presum(asked: int, where: str) -> CampaignError:
     return CampaignError(
-        f"presum is {asked}, and the antennas have beams",
+        f"presum is {asked}, and the antennas have beams or only a part of the flight is integrated",
         where=f"{where}.presum",
-        expected="1 or auto: every pulse is weighed by the antennas that sent and received it",
-        remedy="Leave presum to the planner, or set the nodes' antennas to null.",
+        expected="1 or auto: every pulse is weighed for itself, by the antennas and by its place in the sector",
+        remedy="Leave presum to the planner, or set the nodes' antennas to null and processing.integration to all.",
     )
 
 

@@ -1,21 +1,30 @@
 """Total paths from each pulse to the scene, bounded by blocks of pixels."""
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.antenna.beam import Beams
+from apertura.antenna.illumination import reached
 from apertura.geometry.aperture import Aperture
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
+_MOST_PULSES = 16384  # whose paths are taken each
 
 
-def swath(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def swath(
+    grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, beams: Beams | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the shortest and longest total path from each pulse to the scene.
 
-    At most 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
-    total path changes by at most twice the radius.
+    About 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
+    total path changes by at most twice the radius. Of a long flight some pulses stand for those about them: a path
+    changes by at most what both antennas move.
 
     Parameters
     ----------
@@ -23,11 +32,14 @@ def swath(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> tuple[NDArra
         The scene and its ground.
     aperture
         In the grid's processing frame.
+    beams
+        What weighs pulses: blocks of pixels to which a pulse cannot add do not count.
 
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each; never longer, never shorter than any pixel's path.
+        (pulse,) float64 metres each; never longer, never shorter than any pixel's path. Infinite and minus infinite for
+        a pulse that adds to none.
 
     Examples
     --------
@@ -37,20 +49,46 @@ def swath(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> tuple[NDArra
     >>> bool(near[0] <= 41.02), bool(far[0] >= 59.0)
     (True, True)
     """
-    middle_m, radius_m = _balls(grid, terrain)
+    side = (
+        -(-max(grid.shape) // _BLOCKS) if beams is None else math.isqrt(grid.shape[0] * grid.shape[1] // _BLOCKS**2) + 1
+    )
+    middle_m, radius_m = balls(grid, terrain, list(grid.tiles(side)))
+    every = 1 + (len(aperture) - 1) // _MOST_PULSES
     nearest, farthest = np.empty((2, len(aperture)))
-    for first in range(0, len(aperture), _PULSES_AT_ONCE):
-        pulses = slice(first, first + _PULSES_AT_ONCE)
-        path = aperture[pulses].path(middle_m)
-        nearest[pulses], farthest[pulses] = (path - 2 * radius_m).min(axis=1), (path + 2 * radius_m).max(axis=1)
+    for first in range(0, len(aperture), every * _PULSES_AT_ONCE):
+        pulses = slice(first, first + every * _PULSES_AT_ONCE)
+        near, far = _spans(aperture[pulses], beams and beams[pulses], middle_m, radius_m, every)
+        nearest[pulses], farthest[pulses] = near, far
     return nearest, farthest
 
 
-def _balls(grid: SceneGrid, terrain: Terrain) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return middles (block, 3) and radii (block,), metres, of balls that hold the pixels of the scene."""
-    blocks = list(grid.tiles(-(-max(grid.shape) // _BLOCKS)))
-    centre = np.array([[(part.start + part.stop - 1) / 2 for part in block] for block in blocks])
-    half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in block] for block in blocks])
-    low, high = np.array([[(height := terrain.heights(grid[block])).min(), height.max()] for block in blocks]).T
+def _spans(
+    aperture: Aperture,
+    beams: Beams | None,
+    middle_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+    every: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the swath of some pulses, `every` so many of which one stands for those about it."""
+    block = np.arange(len(aperture)) // every
+    middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
+    moved = sum(
+        np.linalg.norm(leg - there[block], axis=1) for leg, there in zip(aperture.legs, middle.legs, strict=True)
+    )
+    path = middle.path(middle_m)
+    near, far = path - 2 * radius_m, path + 2 * radius_m
+    if beams is not None:
+        dark = ~reached(beams, aperture, middle_m, radius_m, pulses=every)
+        near[dark], far[dark] = np.inf, -np.inf
+    return near.min(axis=1)[block] - moved, far.max(axis=1)[block] + moved
+
+
+def balls(
+    grid: SceneGrid, terrain: Terrain, windows: Sequence[tuple[slice, slice]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return middles (window, 3) and radii (window,), metres, of balls that hold the pixels of windows of a scene."""
+    centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
+    half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
+    low, high = np.array([[(height := terrain.heights(grid[window])).min(), height.max()] for window in windows]).T
     middle_m = grid.positions_at(centre[:, 0], centre[:, 1], (low + high) / 2)
     return middle_m, np.sqrt((half_m**2).sum(axis=1) + ((high - low) / 2) ** 2)

@@ -61,6 +61,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
             **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
+            **work.report,
         }
         lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
         focus = focus_report(work.formation, target)
@@ -116,6 +117,18 @@ class _Work:
     empty: xr.Dataset
     threads: int
 
+    @property
+    def report(self) -> dict[str, Any]:
+        """What image.json says of which pulses and which tiles count."""
+        integration, formation = self.formation.plan.integration, self.formation
+        empty = 1 - len(formation.windows) / len(formation.tiles)
+        tiles = {"tiles": {"formed": len(formation.windows), "empty_share": round(empty, 6)}}
+        return (
+            tiles
+            if integration is None
+            else {**tiles, "integration": {"chosen": integration.value, **integration.report}}
+        )
+
     def compute(self, windows: list[Window], target: Any) -> None:
         """Compute some tiles as planned."""
         line = self.formation.plan.setting.line
@@ -132,7 +145,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         raise TypeError("an open echo stage holds a phase history")
     plan = plan_pair(campaign, opened, scene, threads=threads)
     side_px = campaign.settings.processing.tile_px
-    formation = Formation(opened.history, profiles_of(profile), scene.grid, plan, side_px, opened.beams)
+    formation = Formation(opened.history, profiles_of(profile, lazy=True), scene.grid, plan, side_px)
     # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(

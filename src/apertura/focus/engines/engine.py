@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from apertura.focus.job import Job
 
 BEAM_S = 1.2e-7
-"""Seconds that `Beams.weight` takes for a pixel, a pulse and an antenna."""
+"""Seconds that `Beams.weight` takes for a pixel, a pulse and an antenna or the sector."""
 
 
 class EngineOptions(BaseModel):
@@ -89,7 +89,8 @@ class Engine(Protocol):
         (job, pulses=, asked=) → settings with predicted error and cost; `pulses` may be fewer than the job's, `asked`
         holds options that a person asks for.
     prepare
-        (inputs, **options) → what all tiles share.
+        (inputs, **options) → what all tiles share; ``[pulses]`` of it, a slice from a multiple of 64 on, is that of
+        some pulses.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from apertura.antenna.beam import Beam, Beams
+from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.native_beams import weights_of
 from apertura.focus.engines.native_binding import (
     INSTRUCTION_SETS,
     ApertureJob,
-    BeamJob,
     TableJob,
     available,
     call,
@@ -122,7 +122,7 @@ def form(
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local): any surface. A tile of
         a larger grid that begins at multiples of 16 pixels gets the same bits as in the whole.
     beams
-        Weight of each pulse at each pixel by its antennas; none by default. A beam that misses a patch costs little.
+        Weight of each pulse at each pixel; none by default. A beam or sector that misses a patch costs little.
     accumulate
         Type of the sum over blocks of pulses.
     tolerance_rad
@@ -147,7 +147,7 @@ def form(
 
     Notes
     -----
-    Source: docs/theory/engine.md, "Paths" and "Antennas".
+    Source: docs/theory/engine.md, "Paths" and "Antennas"; docs/theory/integration.md, "Edges".
     """
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
@@ -157,45 +157,19 @@ def form(
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
     padded = tables.first_path_m.size
-    antennas = (None, None) if beams is None else (beams.transmit, beams.receive)
-    weights = [_weight(beam, len(tables.cells), padded) for beam in antennas]
-    pointers = (ctypes.POINTER(BeamJob) * 2)()
-    for leg, weight in enumerate(weights):
-        if weight is not None:
-            pointers[leg] = ctypes.pointer(weight[0])
+    antennas, sector, _held = weights_of(beams, len(tables.cells), padded)
     job = ApertureJob(
         *(array.ctypes.data for array in (tables.cells, tables.transmitter_m, tables.receiver_m, tables.first_path_m)),
         pixels.ctypes.data, image.ctypes.data, tally.ctypes.data,
         len(tables.cells), padded, tables.cells.shape[2], *image.shape,
         1 / tables.cell_m, tables.carrier_rad_per_cell, tolerance_rad,
         tables.degree, tables.phase_polynomial, accumulate == "complex128",
-        (ctypes.c_float * 9)(*tables.phase_coefficients), pointers,
+        (ctypes.c_float * 9)(*tables.phase_coefficients), antennas, sector,
     )  # fmt: skip
     call("apertura_image", job)
     if counts is not None:
         counts += tally
     return image
-
-
-def _weight(beam: Beam | None, pulses: int, padded: int) -> tuple[BeamJob, list[NDArray[np.generic]]] | None:
-    """Return what the kernel reads of a beam, and the arrays that it points into."""
-    if beam is None:
-        return None
-    if len(beam.axes) != pulses:
-        raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
-    axes = np.pad(beam.axes, [(0, padded - pulses), (0, 0), (0, 0)], mode="edge")
-    axes = np.ascontiguousarray(np.moveaxis(axes, 0, -1), np.float64)
-    angles = (beam.azimuth_rad, beam.elevation_rad)
-    gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
-    job = BeamJob(
-        axes.ctypes.data,
-        (ctypes.c_void_p * 2)(*(gain.ctypes.data for gain in gains)),
-        (ctypes.c_int64 * 2)(*(gain.size for gain in gains)),
-        (ctypes.c_double * 2)(*(angle[0] for angle in angles)),
-        (ctypes.c_double * 2)(*((angle.size - 1) / (angle[-1] - angle[0]) for angle in angles)),
-        float(np.prod([np.abs(gain).max() for gain in gains])),
-    )
-    return job, [axes, *gains]
 
 
 def _expand(

@@ -33,6 +33,12 @@ class BeamJob(ctypes.Structure):
     ]
 
 
+class SectorJob(ctypes.Structure):
+    """native/job.hpp, SectorJob."""
+
+    _fields_ = [("axis", _pointer * 2), *((name, _double) for name in ("centre", "inner", "outer"))]
+
+
 class ApertureJob(ctypes.Structure):
     """native/job.hpp, ApertureJob."""
 
@@ -44,6 +50,7 @@ class ApertureJob(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("degree", "phase_polynomial", "wide_sum")),
         ("phase_coefficients", ctypes.c_float * 9),
         ("beam", ctypes.POINTER(BeamJob) * 2),
+        ("sector", ctypes.POINTER(SectorJob)),
     ]
 
 
@@ -66,7 +73,7 @@ def layout() -> dict[str, str]:
     'byte 8, 8 bytes'
     """
     lines: dict[str, str] = {}
-    for struct in (BeamJob, ApertureJob, TableJob):
+    for struct in (BeamJob, SectorJob, ApertureJob, TableJob):
         for name, *_ in struct._fields_:
             field = getattr(struct, name)
             lines[f"{struct.__name__}.{name}"] = _place(field.offset, field.size)

@@ -39,6 +39,8 @@ class KernelConstants:
     weight_change, weight_curvature
         Of the beam's peak: how much antenna weights may differ between the nodes of a patch, first and second
         difference, to be taken as a polynomial.
+    sector_bend
+        Of the width of a sector's edge: how much a pixel's place in it may bend inside a block to be taken as linear.
 
     Notes
     -----
@@ -58,6 +60,7 @@ class KernelConstants:
     curvature_span: float = 4.5
     weight_change: float = 0.12
     weight_curvature: float = 0.025
+    sector_bend: float = 0.002
 
 
 KERNEL = KernelConstants()

@@ -25,7 +25,7 @@ TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
 WIDE_SUM_DB = -105.0
 """Below this error the sum over pulses is float64; in float32 it errs by about -115 dB."""
 
-_PULSES = 48  # from which the scene is looked at
+_PULSES, _PULSES_OF_SECTOR = 48, 512  # from which the scene is looked at
 _WORST_TO_RMS = 1 / 3
 _FLOAT32_RAD = 2e-6
 _SILENT = 1e-20
@@ -35,6 +35,7 @@ _SILENT = 1e-20
 _CELL_S = 1.5e-9
 _SHARED_S, _WIDE_S, _EXACT_S = {1: 2.4e-10, 2: 2.8e-10}, {1: 2.9e-10, 2: 3.7e-10}, {1: 3.2e-9, 2: 3.8e-9}
 _BEAM_S, _EDGE_S, _DARK_S = 6.7e-10, 3.4e-8, 1.2e-10
+_SECTOR_S = 6.7e-10  # per pixel and pulse at the edge of a sector, on top
 
 
 _BLOCK_REACH = np.sqrt(2) * (KERNEL.patch_side - KERNEL.block_side) / 2
@@ -68,13 +69,17 @@ class View:
 @lru_cache(maxsize=8)
 def view_of(job: Job) -> View:
     """Return how a job's scene is seen."""
-    some = job.aperture.sample(_PULSES)
+    some = job.aperture.sample(_PULSES if job.sector is None else _PULSES_OF_SECTOR)
     aperture, points = job.aperture[some], job.points_m
     right, down = (_pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
     range_m = np.stack([np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs])
     gradient = aperture.path_gradient(points)
     slope = np.stack([(gradient * step).sum(-1) for step in (right, down)])
     seen = NO_BEAMS if job.beams is None else patch_weights(job.beams[some], aperture, np.stack([right, down]), points)
+    if job.sector is not None:
+        lit = job.sector[some].weight(aperture, points) > 0
+        if lit.any():
+            range_m, slope = range_m[:, lit][..., None], slope[:, lit][..., None]
     return View(range_m, slope, job.spacing_m, seen)
 
 
@@ -175,7 +180,7 @@ def _setting(  # noqa: PLR0917
             "tolerance_rad": tolerance_rad,
         },
         error_db,
-        job.pixels * pulses * pixel_seconds(shares, degree, view.weights),
+        job.pixels * pulses * job.share * pixel_seconds(shares, degree, view.weights),
         table_seconds=_CELL_S * coefficients,
         table_bytes=8 * coefficients,
         reasons=_reasons(table_db, paths_db, beams_db if view.weights.antennas else None, shares),
@@ -187,7 +192,7 @@ def pixel_seconds(shares: tuple[float, float, float], degree: int, seen: PatchWe
     each = (_SHARED_S[degree], _WIDE_S[degree], _EXACT_S[degree])
     plain = sum(share * seconds for share, seconds in zip(shares, each, strict=True))
     if not seen.antennas:
-        return plain
+        return plain + seen.edge * (1 - shares[2]) * _SECTOR_S
     weighed = plain + (1 - shares[2]) * _BEAM_S + shares[2] * (_EDGE_S - each[2])
     return seen.smooth * weighed + seen.pixelwise * _EDGE_S + seen.dark * _DARK_S
 

@@ -4,7 +4,7 @@ A cell holds the least-squares polynomial of the profile over itself, multiplied
 middle; what is left of the carrier inside the cell is a short polynomial too (docs/theory/engine.md).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -62,6 +62,18 @@ class Tables:
     phase_coefficients: NDArray[np.float32]
     degree: int
     error_db: float
+
+    def __getitem__(self, pulses: slice) -> "Tables":
+        """Return the tables of pulses from a multiple of a batch on."""
+        first, last, _ = pulses.indices(len(self.cells))
+        padded = slice(first, first - (first - last) // KERNEL.batch * KERNEL.batch)
+        return replace(
+            self,
+            cells=self.cells[first:last],
+            transmitter_m=np.ascontiguousarray(self.transmitter_m[:, padded]),
+            receiver_m=np.ascontiguousarray(self.receiver_m[:, padded]),
+            first_path_m=self.first_path_m[padded],
+        )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ class PatchWeights:
         RMS error of the polynomials, relative to the RMS of the weights.
     antennas
         How many beams there are.
+    edge
+        Part at the smooth edge of the sector, of what is not outside of it.
     """
 
     smooth: float = 1.0
@@ -29,6 +31,7 @@ class PatchWeights:
     dark: float = 0.0
     error: float = 0.0
     antennas: int = 0
+    edge: float = 0.0
 
 
 NO_BEAMS = PatchWeights()
@@ -60,13 +63,20 @@ def patch_weights(
     half_patch = (KERNEL.patch_side - 1) / 2  # pixels
     across = half_patch * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
     nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
-    gain = beams.weight(aperture, nodes.reshape(-1, 3)).reshape(len(aperture), 3, 3, len(place_m))
+    weight = None if beams.sector is None else beams.sector.weight(aperture, place_m)
+    lit = np.array([]) if weight is None else weight > 0
+    edge = float((weight[lit] < 1).mean()) if weight is not None and lit.any() else 0.0
+    if beams.antennas is None:
+        return PatchWeights(edge=edge)
+    gain = beams.antennas.weight(aperture, nodes.reshape(-1, 3)).reshape(len(aperture), 3, 3, len(place_m))
     curvature = [np.abs(np.diff(gain, 2, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
     change = [np.abs(np.diff(gain.take([0, 2], axis), axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
     dark, everywhere = (gain == 0).all(axis=(1, 2)), (gain != 0).all(axis=(1, 2))
     smooth = everywhere & (np.maximum(*change) <= KERNEL.weight_change)
     smooth &= np.maximum(*curvature) <= KERNEL.weight_curvature
     beta = np.where(smooth, np.hypot(*curvature), 0.0)
+    if lit.any():
+        gain, beta, smooth, dark = np.moveaxis(gain, -1, 1)[lit], beta[lit], smooth[lit], dark[lit]
     error = np.hypot((3 / 16) ** 2 / 2 * beta, 1.4 / (9 * np.sqrt(3)) * beta**1.5)  # inside a block, between nodes
     strength = float((gain**2).mean())
     return PatchWeights(
@@ -75,4 +85,5 @@ def patch_weights(
         float(dark.mean()),
         float(np.sqrt((error**2).mean() / strength)) if strength else 0.0,
         sum(beam is not None for beam in (beams.transmit, beams.receive)),
+        edge,
     )

@@ -1,7 +1,7 @@
 """Backprojection by interpolation in an oversampled range table, compiled by numba."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numba
@@ -50,7 +50,7 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     Source: docs/theory/planner.md, "Error" and "Cost".
     """
     signal, wanted = job.signal, asked_or(asked, "oversampling", OVERSAMPLINGS)
-    form_s = job.pixels * pulses * (_PIXEL_S + job.antennas * BEAM_S)
+    form_s = job.pixels * pulses * job.share * (_PIXEL_S + job.weights * BEAM_S)
     for oversampling in wanted:
         if oversampling < signal.oversampling and len(wanted) > 1:
             continue
@@ -113,6 +113,11 @@ class Tables:
     step_m: float
     wavenumber_rad_m: float
     aperture: Aperture
+
+    def __getitem__(self, pulses: slice) -> "Tables":
+        """Return the tables of some pulses, as views."""
+        some = {"samples": self.samples[pulses], "start_m": self.start_m[pulses], "aperture": self.aperture[pulses]}
+        return replace(self, **some)
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:

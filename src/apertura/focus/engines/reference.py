@@ -31,8 +31,8 @@ def available() -> bool:
 
 def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
     """Return its one setting, as `apertura.focus.engines.engine.Engine` describes."""
-    each = job.subcarriers * _SUBCARRIER_S + job.antennas * BEAM_S
-    return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * each)]
+    each = job.subcarriers * _SUBCARRIER_S + job.weights * BEAM_S
+    return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * job.share * each)]
 
 
 def prepare(history: PhaseHistory) -> PhaseHistory:
