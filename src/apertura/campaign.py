@@ -123,6 +123,8 @@ class Campaign:
             del node["antennas"]  # echo asks only whether there are beams, image what they are
         beams = self.antennas(pair) if pair else {}
         segments = [list(segment) for segment in self.segments_of(flight, pair)]
+        antennas = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
+        weighing = {"antennas": antennas} if beams else {}
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
                 "waveform": settings["waveform"],
@@ -135,18 +137,14 @@ class Campaign:
             "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
             "scene": {"scene": settings["scene"]},
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
-            "profile": {"window": processing["window"]},
+            "profile": {name: processing[name] for name in ("window", "integration")} | weighing,
             "assess": {"fusion": processing["fusion"]},
             "image": {
                 name: value
                 for name, value in processing.items()
                 if name not in {"window", "sidelink", "false_alarms_per_s", "fusion"}
             }
-            | (
-                {"antennas": {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}}
-                if beams
-                else {}
-            ),
+            | weighing,
         }
         return chosen.get(stage, {})
 

@@ -165,14 +165,17 @@ def _layers(campaign: Campaign) -> Result:
 
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
-    sources = (campaign.manifest("echo", flight, pair), *_ground(campaign))
-    return Result(campaign.manifest("profile", flight, pair), sources, campaign.relevant("profile"))
+    sources = (campaign.manifest("echo", flight, pair), *_ground(campaign), *_patterns(campaign, pair))
+    return Result(campaign.manifest("profile", flight, pair), sources, campaign.relevant("profile", pair))
+
+
+def _patterns(campaign: Campaign, pair: str) -> list[str]:
+    return [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
 
 
 def _image(campaign: Campaign, flight: str, pair: str) -> Result:
     stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
-    patterns = [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
-    sources = (*stages, *_ground(campaign), *patterns)
+    sources = (*stages, *_ground(campaign), *_patterns(campaign, pair))
     return Result(campaign.manifest("image", flight, pair), sources, campaign.relevant("image", pair))
 
 

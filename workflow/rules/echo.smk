@@ -60,7 +60,7 @@ rule profile:
     resources:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
     params:
-        settings=campaign.relevant("profile"),
+        settings=lambda wildcards: campaign.relevant("profile", wildcards.pair),
         code=code_of("profile"),
     message:
         "{wildcards.flight}: compressing {wildcards.pair} in range"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,15 @@ RIVAL_DB = -6.0
 
 _GROUPS = 16
 _OVERSAMPLING = 8
+_PULSES_AT_ONCE = 64
+
+
+class Pulses(Protocol):
+    """(pulse, subcarrier) complex64: an array, or what reads slices of one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, pulses: slice, /) -> Complexes: ...
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class PathOffset:
 
 
 def estimate_path_offset(
-    transfer: Complexes,
+    transfer: Pulses,
     frequency_hz: Floats,
     *,
     path_m: Floats,
@@ -66,7 +76,8 @@ def estimate_path_offset(
     Parameters
     ----------
     transfer
-        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, no path offset taken out.
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, no path offset taken out. An array, or what
+        reads slices of one from a file.
     frequency_hz
         (subcarrier,) float64, RF, equally spaced, ascending.
     path_m
@@ -113,7 +124,7 @@ def estimate_path_offset(
     return PathOffset(mean_m, std_m, contrast_db, len(transfer), flags)
 
 
-def reflector_history(transfer: Complexes, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
+def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
     """Return the echo (pulse,) complex128 of a reflector: its phase is constant if path and clocks are right.
 
     Parameters
@@ -130,7 +141,8 @@ def reflector_history(transfer: Complexes, frequency_hz: Floats, *, path_m: Floa
     >>> reflector_history(echo, frequency, path_m=path).round(4) + 0.0
     array([2.+0.j, 2.+0.j])
     """
-    return np.asarray(_aligned(transfer, frequency_hz, path_m).mean(axis=1), np.complex128)
+    parts = (slice(first, first + _PULSES_AT_ONCE) for first in range(0, len(transfer), _PULSES_AT_ONCE))
+    return np.concatenate([_aligned(transfer[part], frequency_hz, path_m[part]).mean(axis=1) for part in parts])
 
 
 def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
@@ -138,11 +150,22 @@ def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArr
     return np.asarray(transfer * np.exp(2j * np.pi * (turns % 1.0)))
 
 
-def _aligned_groups(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
+def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
     """Return (group, subcarrier): pulses turned to the predicted path, added within each part of the flight."""
     taper = np.hanning(frequency_hz.size + 2)[1:-1]
-    parts = np.array_split(np.arange(len(transfer)), min(_GROUPS, len(transfer)))
-    return np.array([_aligned(transfer[part], frequency_hz, path_m[part]).mean(0) * taper for part in parts])
+    edges = np.linspace(0, len(transfer), min(_GROUPS, len(transfer)) + 1).astype(int)
+    return np.array(
+        [_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in zip(edges[:-1], edges[1:], strict=True)]
+    )
+
+
+def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
+    """Return (subcarrier,) the mean of pulses first to last, turned to the predicted path, a block at a time."""
+    total = np.zeros(len(frequency_hz), np.complex128)
+    for start in range(first, last, _PULSES_AT_ONCE):
+        part = slice(start, min(start + _PULSES_AT_ONCE, last))
+        total += _aligned(transfer[part], frequency_hz, path_m[part]).sum(axis=0)
+    return total / (last - first)
 
 
 def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search_m: float) -> tuple[Floats, Floats]:

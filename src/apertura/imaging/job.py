@@ -10,7 +10,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency
 from apertura.focus.engines import reference
 from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.job import Job, Signal
+from apertura.focus.job import Integration, Job, Signal
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.range_profiles import RangeWindow
 from apertura.planning.integration import integrate
@@ -58,14 +58,11 @@ def imaging_job(
         With no limit of path or memory, and defaults of tiles and threads, to be replaced.
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
-    ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre}
-    settled = integrate(aperture, ground_m, **geometry, antennas=beams, asked=integration)
-    beams = Beams.within(settled.sector, beams)
+    settled, beams = integrated(aperture, centre, grid, ground, beams=beams, asked=integration)
     window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams)
     return Job(
         aperture=aperture,
-        ground_m=ground_m,
+        ground_m=grid.sample_points(_POINTS, ground.level.height_m),
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
@@ -78,6 +75,25 @@ def imaging_job(
         beams=beams,
         integration=settled,
     )
+
+
+def integrated(
+    aperture: Aperture,
+    centre_hz: float,
+    grid: SceneGrid,
+    ground: GroundModels,
+    *,
+    beams: Beams | None,
+    asked: Any = "auto",
+) -> tuple[Integration, Beams | None]:
+    """Return over how much of a flight a scene's pixels are integrated, and all that weighs pulses: `beams` and that.
+
+    Parameters as `imaging_job`; `asked` is its `integration`, `centre_hz` the middle of the band.
+    """
+    ground_m = grid.sample_points(_POINTS, ground.level.height_m)
+    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre_hz}
+    settled = integrate(aperture, ground_m, **geometry, antennas=beams, asked=asked)
+    return settled, Beams.within(settled.sector, beams)
 
 
 def profiles_job(

@@ -12,6 +12,7 @@ from apertura.echo.calibration import estimate_path_offset, reflector_history
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import frame_from_map
+from apertura.imaging.stages import Rows
 from apertura.lineage import result_of
 from apertura.provenance import canonical_json, chained_sha256, code_sha256
 from apertura.quality.measures import coherence_factor
@@ -86,7 +87,7 @@ def _asked(campaign: Campaign) -> Calibration:
 def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: str) -> dict[str, Any]:
     reflector = frame_from_map(campaign.settings.scene.crs, *asked.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
-    transfer, frequency = echo.transfer.values, echo.frequency.values
+    transfer, frequency = Rows(echo.transfer), echo.frequency.values
     offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=asked.search_m, where=where)
     history = reflector_history(transfer, frequency, path_m=path_m + offset.offset_m)
     phase = np.unwrap(np.angle(history))

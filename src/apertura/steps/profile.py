@@ -10,12 +10,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
+from apertura.digests import digest_of
 from apertura.echo.compression import centre_frequency
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
 from apertura.imaging.stages import aperture_of, phase_history_of
 from apertura.lineage import result_of
+from apertura.load.pair import open_pair
+from apertura.load.plan import range_window
 from apertura.load.scene import OpenScene, open_scene
+from apertura.provenance import merged
 from apertura.scene.clearance import check_antennas
 from apertura.settings import CONFIG
 from apertura.steps.stamping import stamped
@@ -28,7 +32,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
     aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
     check_antennas(scene.grid, scene.terrain, aperture, where=where)
-    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency)
+    window = range_window(campaign, open_pair(campaign, flight, pair, echo=source), scene)
     _check_prefix(window.farthest_m, source.path_limit.values, where=where)
     _check_unambiguous(window)
     asked = campaign.settings.processing.window
@@ -42,8 +46,12 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "oversampling": window.unambiguous / len(frequency),
         "window": asked,
     }
-    settings, parents = {**campaign.relevant("profile"), **scene.spec}, [source, *scene.parents]
-    how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": scene.inputs}
+    settings, parents = {**campaign.relevant("profile", pair), **scene.spec}, [source, *scene.parents]
+    patterns = {
+        key: digest_of(campaign.root, campaign.relative(path)) for key, path in campaign.pattern_files(pair).items()
+    }
+    inputs = merged(scene.inputs, patterns)
+    how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
     with writing(folder) as wip:
         write_blocks(wip, stage, "profile", _compressed(source, asked, window, scene))
@@ -54,8 +62,11 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
 def _compressed(
     source: xr.Dataset, asked: str, window: RangeWindow, scene: OpenScene
 ) -> Iterator[NDArray[np.complex64]]:
-    """Yield the profiles of some pulses at a time: those of one chunk of the echo, so that each is read once."""
+    """Yield the profiles of one chunk of the echo at a time; zeros where none of its pulses adds to the scene."""
     for part in blocks_of_rows(source, "transfer"):
+        if not window.contributing[part].any():
+            yield np.zeros((part.stop - part.start, window.samples), np.complex64)
+            continue
         history = phase_history_of(source.isel(pulse=part), asked)
         here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
         yield range_compress(history, scene.grid, scene.terrain, window=here).samples
