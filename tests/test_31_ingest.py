@@ -342,7 +342,7 @@ def test_metadata_that_are_not_sigmf_are_refused_by_key(tmp_path, change, expect
 def test_metadata_that_are_not_json_are_refused(tmp_path):
     (tmp_path / "a.sigmf-meta").write_text('{"global": ')
     (tmp_path / "a.sigmf-data").write_bytes(b"1234")
-    with pytest.raises(CampaignError, match="not valid SigMF: Invalid JSON"):
+    with pytest.raises(CampaignError, match="not valid SigMF: no JSON: parse error"):
         open_recording((tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -154,9 +155,7 @@ def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> N
     """Return (group, subcarrier): pulses turned to the predicted path, added within each part of the flight."""
     taper = np.hanning(frequency_hz.size + 2)[1:-1]
     edges = np.linspace(0, len(transfer), min(_GROUPS, len(transfer)) + 1).astype(int)
-    return np.array(
-        [_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in zip(edges[:-1], edges[1:], strict=True)]
-    )
+    return np.array([_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in pairwise(edges)])
 
 
 def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
