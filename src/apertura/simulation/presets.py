@@ -112,9 +112,9 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
 def flight(*, pulses: int = 300_000) -> CampaignSpecification:
     """Return a whole flight: ten minutes at 500 Hz and 5 m/s past 410 m of ground, one transmitter, two receivers.
 
-    A receiver records two channels of 2160 samples per pulse, 5.2 GB; the image has 4096 × 4096 pixels.
+    A receiver records two channels of 2256 samples per pulse, 5.4 GB; the image has 4096 × 4096 pixels.
     """
-    waveform = WaveformSpecification(1024, 1.2e9, 100e3, 10.3125e-6, 3.75e-6, 153.6e6, 500.0)
+    waveform = WaveformSpecification(1024, 1.2e9, 100e3, 10.3125e-6, 4.375e-6, 153.6e6, 500.0)
     nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0))}
     tracks, half_m = {"uav1": Straight((0.0, -270.0, 80.0), (5.0, 0.0, 0.0))}, 5.0 * (pulses - 1) / 500.0 / 2
     for name, ahead_m in (("uav2", 12.0), ("uav3", -15.0)):
