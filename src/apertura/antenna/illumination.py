@@ -150,7 +150,7 @@ def _in_pattern(
         angle[:] = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
     elevation = np.pi / 2 - above
     inside = (elevation + near > beam.elevation_rad[0]) & (elevation - near < beam.elevation_rad[-1])
-    return (radius_m >= range_m) | (inside & (off - near < beam.cone_rad))
+    return np.asarray((radius_m >= range_m) | (inside & (off - near < beam.cone_rad)))
 
 
 def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
