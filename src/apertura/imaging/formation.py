@@ -109,7 +109,7 @@ class Formation:
         (pixel,) complex64, and mean |I|² over those patches, (pixel,) float64.
         """
         first = pixels // PATCH_PX * PATCH_PX
-        windows = [tuple(slice(at, at + PATCH_PX) for at in corner) for corner in first.tolist()]
+        windows = [(slice(row, row + PATCH_PX), slice(column, column + PATCH_PX)) for row, column in first.tolist()]
         image = self.image_of(windows)
         inside = pixels - first
         values = np.array([patch[tuple(at)] for patch, at in zip(image, inside, strict=True)], np.complex64)

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 from rich.filesize import decimal
 
+from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.echo.compression import centre_frequency
 from apertura.errors import CampaignError
 from apertura.focus.job import Job
-from apertura.imaging.job import imaging_job, integrated
-from apertura.imaging.range_profiles import RangeWindow
+from apertura.imaging.job import imaging_job, settle
 from apertura.load.antennas import lit
 from apertura.load.budget import budget_of
 from apertura.load.pair import OpenPair
@@ -90,12 +90,14 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
     )
 
 
-def range_window(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWindow:
-    """Return the total paths that a pair's profiles must cover: of each pulse, those of what it may add to."""
-    ground, centre_hz = GroundModels.of(scene.terrain, scene.level, scene.grid), centre_frequency(pair.frequency_hz)
-    asked = campaign.settings.processing.integrated
-    _, beams = integrated(pair.aperture, centre_hz, scene.grid, ground, beams=pair.beams, asked=asked)
-    return RangeWindow.of(pair.aperture, scene.grid, ground.full, pair.frequency_hz, beams=beams)
+def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
+    """Return what weighs the pulses of a pair over the scene, antennas and the sector integrated; None where all count.
+
+    As `job_of` settles it, without a look at the echo: what profiles must cover follows from it.
+    """
+    centre_hz, asked = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
+    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=asked)
+    return Beams.within(settled.sector, pair.beams)
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:

@@ -17,7 +17,7 @@ from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_co
 from apertura.imaging.stages import aperture_of, phase_history_of
 from apertura.lineage import result_of
 from apertura.load.pair import open_pair
-from apertura.load.plan import range_window
+from apertura.load.plan import weighing
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import merged
 from apertura.scene.clearance import check_antennas
@@ -32,7 +32,8 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
     aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
     check_antennas(scene.grid, scene.terrain, aperture, where=where)
-    window = range_window(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams)
     _check_prefix(window.farthest_m, source.path_limit.values, where=where)
     _check_unambiguous(window)
     asked = campaign.settings.processing.window
