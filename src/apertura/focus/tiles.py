@@ -134,7 +134,13 @@ def _nothing(_done: Any) -> None:
 
 
 def compute_tiles(
-    image: "Array", windows: Sequence[Window], target: Any, *, threads: int, seconds_between_reports: float = 0.1
+    image: "Array",
+    windows: Sequence[Window],
+    target: Any,
+    *,
+    threads: int,
+    scheduler: str = "threads",
+    seconds_between_reports: float = 0.1,
 ) -> None:
     """Compute some tiles of an image and write each as soon as it is done.
 
@@ -148,6 +154,8 @@ def compute_tiles(
         (y, x) array that takes blocks: numpy or zarr.
     threads
         How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
+    scheduler
+        'threads', or the address of a `distributed` scheduler whose workers form the tiles: the same bits.
     seconds_between_reports
         How often the progress bar is redrawn.
 
@@ -164,5 +172,11 @@ def compute_tiles(
     from dask.diagnostics.progress import ProgressBar
 
     parts = [image[window] for window in windows]
+    if scheduler != "threads":
+        from apertura.focus.cluster import formed_elsewhere
+
+        for number, tile in formed_elsewhere(parts, scheduler):
+            target[windows[number]] = tile
+        return
     with ProgressBar(dt=seconds_between_reports):
         store(parts, [target] * len(parts), regions=list(windows), lock=False, scheduler="threads", num_workers=threads)
