@@ -25,8 +25,8 @@ _WORKERS_S = 10.0
 def formed_elsewhere(tiles: Sequence["Array"], scheduler: str) -> Iterator[tuple[int, NDArray[np.complex64]]]:
     """Yield each tile with its number as soon as a worker has formed it.
 
-    Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes back. A
-    worker that dies is made up for by the others.
+    Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes
+    back. A worker that dies is made up for by the others.
 
     Parameters
     ----------

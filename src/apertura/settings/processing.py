@@ -26,8 +26,8 @@ class Processing(ImagingChoices):
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
     scheduler: str = Field(
         "threads",
-        description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever runs "
-        "this names the same in DASK_SCHEDULER_ADDRESS",
+        description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "
+        "runs this names the same in DASK_SCHEDULER_ADDRESS",
     )
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
