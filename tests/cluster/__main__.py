@@ -75,7 +75,8 @@ def disturbed(root: Path, folder: Path) -> Path:
         run = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
     try:
         for disturb in (cancel_a_job, drain_a_node, kill_a_node):
-            print(f"{time.perf_counter() - began:4.0f} s: {disturb(folder / 'slurm', run.poll)}", flush=True)
+            done = disturb(folder / "slurm", run.poll)
+            print(f"{time.perf_counter() - began:4.0f} s: {done}", flush=True)
         status = run.wait(600)
     except BaseException:
         run.terminate()

@@ -84,12 +84,13 @@ def start(node: str) -> None:
 
 
 def kill(root: Path, node: str) -> None:
-    """Kill a node: its daemon and all that runs in its jobs, outright."""
+    """Kill a node: its daemons and all that runs in its jobs, outright."""
     _end(root / f"slurmd.{node}.pid", signal.SIGKILL)
-    for job in said("squeue", "-h", "-t", "running", "-w", node, "-o", "%A").split():
+    jobs = said("squeue", "-h", "-t", "running", "-w", node, "-o", "%A").split()
+    for job in [f"slurmstepd: [{job}." for job in jobs] + [f"SLURM_JOB_ID={job}\0" for job in jobs]:
         for path in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                if f"SLURM_JOB_ID={job}\0".encode() in (path / "environ").read_bytes() + b"\0":
+                if job.encode() in (path / "cmdline").read_bytes() + (path / "environ").read_bytes():
                     os.kill(int(path.name), signal.SIGKILL)
 
 
