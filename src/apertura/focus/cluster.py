@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from apertura.errors import CampaignError
 from apertura.focus.engines import ENGINES
 from apertura.provenance import code_sha256
-
-if TYPE_CHECKING:
-    from dask.array.core import Array
 
 KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
@@ -22,7 +19,9 @@ _CONNECT_S = 5.0
 _WORKERS_S = 10.0
 
 
-def formed_elsewhere(tiles: Sequence["Array"], scheduler: str) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+def formed_elsewhere(
+    graph: Any, keys: Sequence[tuple[Any, ...]], scheduler: str
+) -> Iterator[tuple[int, NDArray[np.complex64]]]:
     """Yield each tile with its number as soon as a worker has formed it.
 
     Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes
@@ -30,8 +29,8 @@ def formed_elsewhere(tiles: Sequence["Array"], scheduler: str) -> Iterator[tuple
 
     Parameters
     ----------
-    tiles
-        Parts of an image, from `apertura.focus.tiles.image_array`.
+    graph, keys
+        Tasks of an image of `apertura.focus.tiles.image_array`, and those that are tiles.
     scheduler
         Address of a running scheduler, ``tcp://host:port``.
 
@@ -43,7 +42,7 @@ def formed_elsewhere(tiles: Sequence["Array"], scheduler: str) -> Iterator[tuple
     with _connected(scheduler) as client:
         from distributed import as_completed
 
-        futures = client.compute(list(tiles))
+        futures = client.get(graph, list(keys), sync=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
         done = as_completed(futures, loop=client.loop, with_results=True)
         del futures  # so that a tile leaves its worker when it has come

@@ -168,15 +168,30 @@ def compute_tiles(
     >>> target.sum()
     np.float64(4.0)
     """
-    from dask.array.core import store
     from dask.diagnostics.progress import ProgressBar
+    from dask.threaded import get
 
-    parts = [image[window] for window in windows]
+    places = [
+        {int(end - size): at for at, (end, size) in enumerate(zip(np.cumsum(sizes), sizes, strict=True))}
+        for sizes in image.chunks
+    ]
+    keys = [
+        (image.name, *(place[part.start] for place, part in zip(places, window, strict=True))) for window in windows
+    ]
+    graph = image.dask.cull(set(keys))
     if scheduler != "threads":
         from apertura.focus.cluster import formed_elsewhere
 
-        for number, tile in formed_elsewhere(parts, scheduler):
+        for number, tile in formed_elsewhere(graph, keys, scheduler):
             target[windows[number]] = tile
         return
+    written = {
+        ("written", *key): (partial(_write, target, window), key) for key, window in zip(keys, windows, strict=True)
+    }
     with ProgressBar(dt=seconds_between_reports):
-        store(parts, [target] * len(parts), regions=list(windows), lock=False, scheduler="threads", num_workers=threads)
+        get({**graph, **written}, list(written), num_workers=threads)
+
+
+def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
+    """Write one tile where it belongs."""
+    target[window] = tile
