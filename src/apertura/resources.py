@@ -60,8 +60,8 @@ class Demand:
     ----------
     base_mb
         Resident memory whatever the work; what was measured on small work, and half as much again.
-    pulse_bytes, pixel_bytes
-        Memory per pulse, and per pixel in memory at once.
+    pulse_bytes, pixel_bytes, tile_bytes
+        Memory per pulse, per pixel in memory at once, and per tile to be formed.
     profile_share
         Memory per byte of range profiles in memory at once.
     threads
@@ -77,6 +77,7 @@ class Demand:
     base_mb: float
     pulse_bytes: float = 0.0
     pixel_bytes: float = 0.0
+    tile_bytes: float = 0.0
     profile_share: float = 0.0
     threads: int = 1
     recorded_s: float = 0.0
@@ -84,7 +85,17 @@ class Demand:
     sum_s: float = 0.0
 
 
-_IMAGE = Demand(900, pulse_bytes=1000, pixel_bytes=30, profile_share=3.0, threads=4, recorded_s=30, pixel_s=5, sum_s=3)
+_IMAGE = Demand(
+    900,
+    pulse_bytes=1000,
+    pixel_bytes=30,
+    tile_bytes=15_000,
+    profile_share=3.0,
+    threads=4,
+    recorded_s=30,
+    pixel_s=5,
+    sum_s=3,
+)
 
 DEMANDS: Mapping[str, Demand] = {
     "ingest": Demand(500, pulse_bytes=500, recorded_s=60),
@@ -217,7 +228,7 @@ class RuleResources:
         work, demand = self._work(wildcards), self.demand
         grows = demand.pulse_bytes * work.pulses
         grows += demand.pixel_bytes * min(work.pixels, _AT_ONCE_PIXELS)
-        grows += demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
+        grows += demand.tile_bytes * work.tiles + demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
         return math.ceil(_BESIDE_MB + demand.base_mb + grows / 1e6) << attempt - 1
 
     def runtime(self, wildcards: Any, attempt: int) -> int:
