@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run bench paper stability test test-slow attack lint format lock clean
+.PHONY: setup demo run bench paper stability test test-slow attack cluster-test lint format lock clean
 
 setup: $(SETUP)
 
@@ -55,6 +55,11 @@ attack: $(SETUP)
 	$(BIN)/python -m tests.attack.faults --kills 300 --errors 50 --full 10
 	$(BIN)/python benchmarks/kills.py - 100
 	$(BIN)/python benchmarks/mistakes.py build/mistakes --base sample
+
+# A campaign on a Slurm of two nodes on this machine, one job cancelled, one node drained, one killed: 5 minutes.
+cluster-test: $(SETUP)
+	$(BIN)/uv pip install --quiet --python $(BIN)/python snakemake-executor-plugin-slurm
+	$(BIN)/python -m tests.cluster
 
 lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks

@@ -1,6 +1,7 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,11 @@ class Campaign:
     def image_flights(self) -> tuple[Flight, ...]:
         """Flights that become images."""
         return tuple(flight for flight in self.flights if flight.kind == "image")
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """The settings as JSON values, but for those that say where to compute and change no result."""
+        return self.settings.model_dump(mode="json", exclude={"processing": {"scheduler"}})
 
     @property
     def results(self) -> Path:
@@ -112,15 +118,23 @@ class Campaign:
 
     def segments_of(self, flight: str, pair: str) -> list[tuple[str, str]]:
         """Return start and end (UTC) of the parts of the track that image a pair; none: all of it."""
-        own = (segment for segment in self.segments if (segment.flight, segment.pair) == (flight, pair))
-        return sorted((segment.start, segment.end) for segment in own)
+        return self._segments.get((flight, pair), [])
+
+    @cached_property
+    def _segments(self) -> dict[tuple[str, str], list[tuple[str, str]]]:
+        own: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        for segment in sorted(self.segments, key=lambda one: (one.start, one.end)):
+            own.setdefault((segment.flight, segment.pair), []).append((segment.start, segment.end))
+        return own
 
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
-        settings = self.settings.model_dump(mode="json")
-        processing, nodes = settings["processing"], {name: settings["nodes"][name] for name in pair.split("-") if name}
-        for node in nodes.values():
-            del node["antennas"]  # echo asks only whether there are beams, image what they are
+        settings, processing = self.values, self.values["processing"]
+        nodes = {  # echo asks only whether there are beams, image what they are
+            node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
+            for node in pair.split("-")
+            if node
+        }
         beams = self.antennas(pair) if pair else {}
         segments = [list(segment) for segment in self.segments_of(flight, pair)]
         antennas = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
@@ -150,15 +164,18 @@ class Campaign:
 
     def flight(self, name: str) -> Flight:
         """Return the flight called `name`; raise CampaignError with the names there are if it is none of them."""
-        flights = {flight.name: flight for flight in self.flights}
-        if name not in flights:
+        if name not in self._flights:
             raise CampaignError(
                 f"no flight {name!r}",
                 where=self.root / FLIGHTS,
-                expected=f"one of {', '.join(flights)}",
+                expected=f"one of {', '.join(self._flights)}",
                 remedy="Correct the flight's name, or add its line.",
             )
-        return flights[name]
+        return self._flights[name]
+
+    @cached_property
+    def _flights(self) -> dict[str, Flight]:
+        return {flight.name: flight for flight in self.flights}
 
     def _recorded(self, flight: str, name: str) -> Path:
         return inside(self.root, f"raw/{flight}/{name}", where=self.root)

@@ -218,8 +218,7 @@ def _speed_accuracy(campaign: Campaign) -> Result:
 def _whole(campaign: Campaign) -> Result:
     nodes = [(flight.name, node) for flight in campaign.flights for node in flight.nodes]
     recorded = [campaign.relative(path) for at in nodes for path in campaign.raw_files(*at).values()]
-    settings = campaign.settings.model_dump(mode="json")
-    return Result(campaign.manifest("whole", STUDY), (*recorded, *_heights(campaign)), settings)
+    return Result(campaign.manifest("whole", STUDY), (*recorded, *_heights(campaign)), campaign.values)
 
 
 def charted(campaign: Campaign) -> tuple[str, str]:

@@ -16,9 +16,10 @@ rule speed_accuracy:
         "results/benchmarks/study/speed_accuracy.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["speed_accuracy"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=asked["speed_accuracy"].mem_mb,
+        runtime=asked["speed_accuracy"].runtime,
     params:
         code=code_of("speed_accuracy"),
         charted=" ".join(charted(campaign)),
@@ -42,11 +43,12 @@ rule whole_chart:
         "results/benchmarks/study/whole.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["whole_chart"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=asked["whole_chart"].mem_mb,
+        runtime=asked["whole_chart"].runtime,
     params:
-        settings=result_of(campaign, "whole").settings,
+        settings=campaign.values,
         code=code_of("whole"),
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"

@@ -9,9 +9,10 @@ rule cube:
         "results/benchmarks/cube.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["cube"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=asked["cube"].mem_mb,
+        runtime=asked["cube"].runtime,
     params:
         code=code_of("cube"),
     message:

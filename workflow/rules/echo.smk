@@ -9,9 +9,10 @@ rule echo:
         "results/benchmarks/{flight}/{pair}.echo.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["echo"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        mem_mb=asked["echo"].mem_mb,
+        runtime=asked["echo"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("echo", wildcards.pair, flight=wildcards.flight),
         code=code_of("echo"),
@@ -33,9 +34,10 @@ rule calibrate:
         "results/benchmarks/{flight}/calibrate.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["calibrate"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+        mem_mb=asked["calibrate"].mem_mb,
+        runtime=asked["calibrate"].runtime,
     params:
         settings=campaign.relevant("calibration"),
         code=code_of("calibration"),
@@ -56,9 +58,10 @@ rule profile:
         "results/benchmarks/{flight}/{pair}.profile.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["profile"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        mem_mb=asked["profile"].mem_mb,
+        runtime=asked["profile"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("profile", wildcards.pair),
         code=code_of("profile"),

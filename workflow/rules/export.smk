@@ -22,9 +22,10 @@ rule export:
         "results/benchmarks/{flight}/{pair}.export.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["export"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+        mem_mb=asked["export"].mem_mb,
+        runtime=asked["export"].runtime,
     params:
         settings=campaign.settings.campaign,
         code=code_of("export"),
@@ -57,9 +58,10 @@ rule export_fused:
         "results/benchmarks/{flight}/fused.export.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["export_fused"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+        mem_mb=asked["export_fused"].mem_mb,
+        runtime=asked["export_fused"].runtime,
     params:
         settings=campaign.settings.campaign,
         code=code_of("fused"),

@@ -15,9 +15,10 @@ rule scene:
         "results/benchmarks/scene.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["scene"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
+        mem_mb=asked["scene"].mem_mb,
+        runtime=asked["scene"].runtime,
     params:
         settings=result_of(campaign, "scene").settings,
         code=code_of("scene"),
@@ -38,9 +39,10 @@ rule terrain:
         "results/benchmarks/terrain.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["terrain"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1000 * attempt,
+        mem_mb=asked["terrain"].mem_mb,
+        runtime=asked["terrain"].runtime,
     params:
         settings=campaign.relevant("terrain"),
         code=code_of("terrain"),
@@ -62,9 +64,10 @@ rule layers:
         "results/benchmarks/layers.tsv"
     conda:
         "../../environment.yml"
-    threads: 2
+    threads: asked["layers"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1000 * attempt,
+        mem_mb=asked["layers"].mem_mb,
+        runtime=asked["layers"].runtime,
     params:
         code=code_of("layers"),
     message:
@@ -84,9 +87,10 @@ rule tiles:
         "results/benchmarks/{flight}/{pair}.tiles.{scatteritem}.tsv"
     conda:
         "../../environment.yml"
-    threads: 4
+    threads: asked["tiles"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=asked["tiles"].mem_mb,
+        runtime=asked["tiles"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
         code=code_of("image"),
@@ -113,9 +117,10 @@ rule image:
         "results/benchmarks/{flight}/{pair}.image.tsv"
     conda:
         "../../environment.yml"
-    threads: 4
+    threads: asked["image"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        mem_mb=asked["image"].mem_mb,
+        runtime=asked["image"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
         code=code_of("image"),
@@ -137,9 +142,10 @@ rule assess:
         "results/benchmarks/{flight}/assess.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["assess"].threads
     resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+        mem_mb=asked["assess"].mem_mb,
+        runtime=asked["assess"].runtime,
     params:
         settings=campaign.relevant("assess"),
         code=code_of("assessment"),

@@ -14,9 +14,10 @@ rule ingest:
         "results/benchmarks/{flight}/{node}.ingest.tsv"
     conda:
         "../../environment.yml"
-    threads: 1
+    threads: asked["ingest"].threads
     resources:
-        mem_mb=lambda wildcards, input: 300 + int(3 * input.size_mb),
+        mem_mb=asked["ingest"].mem_mb,
+        runtime=asked["ingest"].runtime,
     params:
         settings=campaign.relevant("raw"),
         code=code_of("raw"),

@@ -186,7 +186,13 @@ def _nothing(_done: Any) -> None:
 
 
 def compute_tiles(
-    image: "Array", windows: Sequence[Window], target: Any, *, threads: int, seconds_between_reports: float = 0.1
+    image: "Array",
+    windows: Sequence[Window],
+    target: Any,
+    *,
+    threads: int,
+    scheduler: str = "threads",
+    seconds_between_reports: float = 0.1,
 ) -> None:
     """Compute some tiles of an image and write each as soon as it is done.
 
@@ -200,6 +206,8 @@ def compute_tiles(
         (y, x) array that takes blocks: numpy or zarr.
     threads
         How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
+    scheduler
+        'threads', or the address of a `distributed` scheduler whose workers form the tiles: the same bits.
     seconds_between_reports
         How often the progress bar is redrawn.
 
@@ -212,9 +220,30 @@ def compute_tiles(
     >>> target.sum()
     np.float64(4.0)
     """
-    from dask.array.core import store
     from dask.diagnostics.progress import ProgressBar
+    from dask.threaded import get
 
-    parts = [image[window] for window in windows]
+    places = [
+        {int(end - size): at for at, (end, size) in enumerate(zip(np.cumsum(sizes), sizes, strict=True))}
+        for sizes in image.chunks
+    ]
+    keys = [
+        (image.name, *(place[part.start] for place, part in zip(places, window, strict=True))) for window in windows
+    ]
+    graph = image.dask.cull(set(keys))
+    if scheduler != "threads":
+        from apertura.focus.cluster import formed_elsewhere
+
+        for number, tile in formed_elsewhere(graph, keys, scheduler):
+            target[windows[number]] = tile
+        return
+    written = {
+        ("written", *key): (partial(_write, target, window), key) for key, window in zip(keys, windows, strict=True)
+    }
     with ProgressBar(dt=seconds_between_reports):
-        store(parts, [target] * len(parts), regions=list(windows), lock=False, scheduler="threads", num_workers=threads)
+        get({**graph, **written}, list(written), num_workers=threads)
+
+
+def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
+    """Write one tile where it belongs."""
+    target[window] = tile

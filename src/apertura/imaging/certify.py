@@ -29,6 +29,7 @@ def certified(
     *,
     accuracy_db: float,
     threads: int,
+    scheduler: str = "threads",
     rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Return what bounds the error; form tiles that are worse than asked again with the next better settings first.
@@ -43,6 +44,8 @@ def certified(
         Error asked.
     threads
         Tiles in work at once.
+    scheduler
+        Who forms tiles again, as `compute_tiles` takes it.
     rewriting
         Told of tiles before they are formed again, so that a run that is killed meanwhile begins them as planned.
     """
@@ -59,8 +62,8 @@ def certified(
         print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {setting.line}", flush=True)  # noqa: T201
         image = formation.image_by(setting)
         rewriting([*uncertified, *worse])
-        compute_tiles(image, uncertified, target, threads=threads)
-        compute_tiles(image, worse, target, threads=threads)
+        for tiles in (uncertified, worse):
+            compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
         redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     line = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure), {accuracy_db:.1f} dB asked"
     return {

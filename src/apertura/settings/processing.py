@@ -1,8 +1,9 @@
 """Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector."""
 
+import re
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from apertura.imaging.choices import ImagingChoices
 from apertura.settings.section import Metres3, Name, Section
@@ -23,9 +24,21 @@ class Processing(ImagingChoices):
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
+    scheduler: str = Field(
+        "threads",
+        description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "
+        "runs this names the same in DASK_SCHEDULER_ADDRESS",
+    )
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
+
+    @field_validator("scheduler")
+    @classmethod
+    def _scheduler_is_an_address(cls, text: str) -> str:
+        if text != "threads" and not re.fullmatch(r"tcp://[A-Za-z0-9_.-]+:[0-9]{1,5}", text):
+            raise ValueError("neither threads nor an address tcp://host:port")
+        return text
 
 
 class Calibration(Section):

@@ -55,6 +55,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
                 target,
                 accuracy_db=plan.accuracy_db,
                 threads=threads,
+                scheduler=work.scheduler,
                 rewriting=partial(mark_rewritten, wip, "image", work.formation.windows),
             ),
             **measures(work.formation, target),
@@ -116,6 +117,7 @@ class _Work:
     formation: Formation
     empty: xr.Dataset
     threads: int
+    scheduler: str
 
     @property
     def report(self) -> dict[str, Any]:
@@ -133,9 +135,11 @@ class _Work:
         """Compute some tiles as planned."""
         line = self.formation.plan.setting.line
         print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
+        image = self.formation.image
         with progress("tiles", len(windows)) as done:
             if windows:
-                compute_tiles(self.formation.image, windows, Counted(target, done), threads=self.threads)
+                counted = Counted(target, done)
+                compute_tiles(image, windows, counted, threads=self.threads, scheduler=self.scheduler)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
@@ -160,4 +164,5 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
     )
-    return _Work(campaign.stage("image", flight, pair), echo, opened, scene, formation, empty, threads)
+    scheduler = campaign.settings.processing.scheduler
+    return _Work(campaign.stage("image", flight, pair), echo, opened, scene, formation, empty, threads, scheduler)

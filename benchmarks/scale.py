@@ -1,0 +1,121 @@
+"""What a campaign of many flights costs before its first step, and when nothing is left to do.
+
+    python benchmarks/scale.py [FOLDER] [FLIGHTS ...]
+
+For 10, 100 and 1000 FLIGHTS, a campaign folder each in FOLDER (a temporary one without): two nodes that record 24 pulses, the
+same ones in every flight (hard links). Each line is a command on that folder, with its wall and CPU seconds and the
+largest resident memory of one of its processes. First nothing is there; then all results are: placeholders with
+manifests that say truly what they were made from.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+BIN = Path(sys.executable).parent
+FLIGHTS = (10, 100, 1000)
+BATCH = 10
+
+
+def campaign_of(root, flights):
+    """Simulate one flight and give it so many names."""
+    from apertura.simulation import ImageGrid, preset, simulate
+
+    if (root / "config").is_dir():
+        return root
+    simulate(root, replace(preset("demo", pulses=24), scene=ImageGrid("EPSG:32632", half_width_m=1.2, spacing_m=0.05)), seed=3)
+    names = [f"f{number:05d}" for number in range(1, flights + 1)]
+    for name in names:
+        (root / "raw" / name).mkdir()
+        for file in (root / "raw" / "f01").iterdir():
+            os.link(file, root / "raw" / name / file.name)
+    table = root / "config" / "flights.tsv"
+    head, line, *_ = table.read_text(encoding="utf-8").splitlines()
+    table.write_text("\n".join([head, *(line.replace("f01", name, 1) for name in names)]) + "\n", encoding="utf-8")
+    return root
+
+
+def finish(root):
+    """Put a file in the place of every result, with the manifest that its step would write."""
+    from apertura.atomic import write_json
+    from apertura.campaign import Campaign
+    from apertura.digests import Sources
+    from apertura.export import exports_in
+    from apertura.lineage import results_of
+    from apertura.steps.code import code_of
+    from apertura.store import record_files
+
+    beside = {
+        "scene": ["scene.json"],
+        "assessment": ["assessment.json"],
+        "calibration": ["calibration.json"],
+        **{kind: [one.file for one in exports_in(kind)] for kind in ("fused", "layers")},
+        "export": [one.file for one in exports_in("pair")],
+    }
+    beside["export"], beside["fused"] = [*beside["export"], "image.json"], [*beside["fused"], "image.json"]
+    campaign, code = Campaign.load(root), cache(code_of)
+
+    class Made:
+        def __init__(self, name, result):
+            sources = Sources.of(root, result.sources).digests
+            self.record = lambda: {"sources": sources, "settings": result.settings_sha256, "code": code(name)}
+
+    for name, result in results_of(campaign):
+        if "study" in result.manifest:
+            continue
+        manifest = root / result.manifest
+        manifest.parent.mkdir(parents=True, exist_ok=True)
+        files = [manifest.parent / file for file in beside.get(name, [])]
+        for file in files:
+            write_json(file, {"stands for": file.name})
+        record_files(manifest, files, Made(name, result))
+
+
+def measured(name, *command, cwd):
+    """Run a command, print what it took, and return what it said."""
+    began = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(list(map(str, command)), cwd=cwd, stdout=said, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - began
+        said.seek(0)
+        text = said.read()
+    cpu = usage.ru_utime + usage.ru_stime
+    print(f"{name:<44}{wall:>9.1f}{cpu:>9.1f}{usage.ru_maxrss / 1024:>9.0f}", flush=True)
+    if status:
+        sys.exit(text)
+    return text
+
+
+def measure(root, flights):
+    apertura = BIN / "apertura"
+    snakemake = (BIN / "snakemake", "--directory", root, "--cores", "2", "-n", "--quiet", "rules")
+    home = Path(__file__).parents[1]
+    print(f"\n{flights} flights{'wall s':>37}{'CPU s':>9}{'MiB':>9}")
+    measured("apertura check, nothing made", apertura, "check", root, cwd=home)
+    measured("snakemake -n", *snakemake, cwd=home)
+    batch = f"all=1/{BATCH}"
+    measured(f"snakemake -n --batch {batch}", *snakemake, "--batch", batch, cwd=home)
+    measured("apertura run -n, nothing made", apertura, "run", root, "-n", "--quiet", "rules", cwd=home)
+    measured("(placeholders for all results)", sys.executable, __file__, "--finish", root, cwd=home)
+    measured("apertura check, all made", apertura, "check", root, cwd=home)
+    measured("apertura run -n, all made", apertura, "run", root, "-n", "--quiet", "rules", cwd=home)
+
+
+def main():
+    if sys.argv[1:2] == ["--finish"]:
+        finish(Path(sys.argv[2]))
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
+        for flights in map(int, sys.argv[2:] or FLIGHTS):
+            measure(campaign_of(folder / f"flights-{flights}", flights), flights)
+
+
+if __name__ == "__main__":
+    main()

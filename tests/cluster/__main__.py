@@ -1,0 +1,148 @@
+"""A campaign of two flights on a real Slurm of two nodes: one job cancelled, one node drained, one killed.
+
+    python -m tests.cluster [FOLDER]
+
+Simulates the campaign, runs a copy of it here and one on the cluster by ``profiles/slurm``, disturbs that, and compares
+every product byte for byte. Says what is missing, and does nothing, where Slurm is not installed. Ends with an error
+where the run fails or the bytes differ.
+"""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import yaml
+
+from tests.cluster import slurm
+
+ROOT = Path(__file__).parents[2]
+APERTURA = Path(sys.executable).parent / "apertura"
+RULES = ("tiles", "image")
+"""Long enough to be met while they run."""
+
+
+def main() -> None:
+    plugin = importlib.util.find_spec("snakemake_executor_plugin_slurm")
+    reason = slurm.missing() or (None if plugin else "pip install 'apertura[slurm]'")
+    if reason:
+        print(f"no cluster test: {reason}")
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
+        campaign = simulated(folder)
+        expected = products(here(Path(shutil.copytree(campaign, folder / "here"))))
+        with slurm.running(folder / "slurm"):
+            made = products(disturbed(Path(shutil.copytree(campaign, folder / "there")), folder))
+        report(folder / "slurm" / "jobs.log")
+    differ = sorted(str(name) for name in made.keys() | expected.keys() if made.get(name) != expected.get(name))
+    if differ:
+        sys.exit(f"{len(differ)} of {len(expected)} files differ: {', '.join(differ[:5])}")
+    print(f"{len(made)} files, the same bytes as here")
+
+
+def simulated(folder: Path) -> Path:
+    """Two flights whose images take a while: by the double sum, in many tiles."""
+    from apertura.simulation import ImageGrid, preset, simulate
+
+    plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.03))
+    (flight,) = plan.flights
+    root = simulate(folder / "campaign", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3)
+    config = root / "config" / "config.yaml"
+    choices = {"processing": {"tile_px": 32, "engine": "reference"}}
+    config.write_text(config.read_text(encoding="utf-8") + yaml.safe_dump(choices), encoding="utf-8")
+    return root
+
+
+def here(root: Path) -> Path:
+    began = time.perf_counter()
+    subprocess.run([APERTURA, "run", root, "--cores", "2"], check=True, capture_output=True)
+    print(f"on this machine: {time.perf_counter() - began:.0f} s", flush=True)
+    return root
+
+
+def disturbed(root: Path, folder: Path) -> Path:
+    """Run a campaign on the cluster, and see to it that not all goes well."""
+    began, log = time.perf_counter(), folder / "run.log"
+    command = [APERTURA, "run", root, "--cores", "2", "--profile", ROOT / "profiles" / "slurm"]
+    command += ["--set-scatter", "tiles=2", "--latency-wait", "5"]
+    with log.open("w") as said:
+        run = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+    try:
+        for disturb in (cancel_a_job, drain_a_node, kill_a_node):
+            done = disturb(folder / "slurm", run.poll)
+            print(f"{time.perf_counter() - began:4.0f} s: {done}", flush=True)
+        status = run.wait(600)
+    except BaseException:
+        run.terminate()
+        run.wait(60)
+        sys.stderr.write(log.read_text())
+        raise
+    print(f"on the cluster: {time.perf_counter() - began:.0f} s, status {status}", flush=True)
+    if status:
+        sys.exit(log.read_text())
+    return root
+
+
+def cancel_a_job(_: Path, ended: Callable[[], int | None]) -> str:
+    job, node = met(ended)
+    slurm.said("scancel", job)
+    return f"job {job} on {node} cancelled"
+
+
+def drain_a_node(_: Path, ended: Callable[[], int | None]) -> str:
+    job, node = met(ended)
+    slurm.drain(node)
+    slurm.wait_for("drained", lambda: slurm.state(node) == "drained", 120)
+    slurm.resume(node)
+    return f"{node} drained under job {job}, which ended, and resumed"
+
+
+def kill_a_node(root: Path, ended: Callable[[], int | None]) -> str:
+    job, node = met(ended)
+    slurm.kill(root, node)
+    slurm.wait_for("down", lambda: slurm.state(node) == "down", 120)
+    slurm.start(node)
+    slurm.wait_for("up", lambda: slurm.state(node) in {"idle", "mixed", "allocated"})
+    return f"{node} killed with job {job}, missed by the controller, and started again"
+
+
+def met(ended: Callable[[], int | None]) -> tuple[str, str]:
+    """Wait for a long job that runs; return it and its node."""
+    found: dict[str, str] = {}
+
+    def meet() -> bool:
+        if ended() is not None:
+            raise RuntimeError("the run ended before it was disturbed")
+        for rule in RULES:
+            found.update(slurm.jobs(rule))
+        return bool(found)
+
+    slurm.wait_for("a job", meet, 300)
+    return next(iter(found.items()))
+
+
+def products(root: Path) -> dict[Path, bytes]:
+    """Return path → bytes of all results but logs, timings, and hidden files and folders."""
+    results = root / "results"
+    files = [(path.relative_to(results), path) for path in results.rglob("*") if path.is_file()]
+    kept = [(name, path) for name, path in files if name.parts[0] not in {"logs", "benchmarks"}]
+    return {name: path.read_bytes() for name, path in kept if not any(part.startswith(".") for part in name.parts)}
+
+
+def report(jobs: Path) -> None:
+    """Print how many jobs came to which end."""
+    ends: dict[str, int] = {}
+    for line in jobs.read_text().splitlines():
+        state = line.split("JobState=")[1].split()[0]
+        ends[state] = ends.get(state, 0) + 1
+    print("jobs of Slurm: " + ", ".join(f"{count} {state}" for state, count in sorted(ends.items())))
+
+
+if __name__ == "__main__":
+    main()

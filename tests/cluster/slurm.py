@@ -1,0 +1,121 @@
+"""A Slurm of two nodes on this machine, from Debian's packages: started, asked, disturbed and ended."""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+CONF = Path("/etc/slurm/slurm.conf")  # a job's own srun is told of no other
+OURS = "# Written by tests/cluster"
+NODES = ("node1", "node2")
+_PROGRAMS = ("slurmctld", "slurmd", "srun", "sbatch", "squeue", "munged")
+_PACKAGES = "slurmctld slurmd slurm-client munge"
+
+
+def missing() -> str | None:
+    """Return why there can be no Slurm here, and what to do; None where there can."""
+    if any(shutil.which(program) is None for program in _PROGRAMS):
+        return f"Slurm is not installed: apt-get install --no-install-recommends {_PACKAGES}"
+    if os.geteuid():
+        return f"{CONF} has to be written: run this as root, in a container"
+    if CONF.is_file() and not CONF.read_text(encoding="utf-8").startswith(OURS):
+        return f"{CONF} is that of another Slurm: move it away if this machine is not part of one"
+    return None
+
+
+def said(*command: str) -> str:
+    """Return what a command prints."""
+    return subprocess.run(command, text=True, capture_output=True, check=True).stdout.strip()
+
+
+def wait_for(what: str, happened: Callable[[], object], timeout_s: float = 60.0) -> None:
+    """Wait until something has happened."""
+    until = time.monotonic() + timeout_s
+    while not happened():
+        if time.monotonic() > until:
+            raise TimeoutError(f"{what}: not within {timeout_s:.0f} s")
+        time.sleep(0.2)
+
+
+@contextmanager
+def running(root: Path) -> Iterator[None]:
+    """Run a Slurm whose files lie in a folder."""
+    for folder in ("ctld", "log", *(f"spool/{node}" for node in NODES)):
+        (root / folder).mkdir(parents=True, exist_ok=True)
+    _munge()
+    template = Path(__file__).with_name("slurm.conf.in").read_text(encoding="utf-8")
+    host = said("hostname", "-s")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20 // 2 - 256
+    settings = {"ROOT": str(root), "HOST": host, "CPUS": str(os.cpu_count()), "MEM": str(memory)}
+    for name, value in settings.items():
+        template = template.replace(f"@{name}@", value)
+    CONF.parent.mkdir(exist_ok=True)
+    CONF.write_text(template, encoding="utf-8")
+    try:
+        said("slurmctld", "-i")
+        for node in NODES:
+            start(node)
+        wait_for("both nodes idle", lambda: all(state(node) == "idle" for node in NODES))
+        yield
+    finally:
+        for name in (*(f"slurmd.{node}" for node in NODES), "slurmctld"):
+            _end(root / f"{name}.pid", signal.SIGTERM)
+        CONF.unlink()
+
+
+def _munge() -> None:
+    def works() -> bool:
+        return subprocess.run("munge -n | unmunge", shell=True, capture_output=True, check=False).returncode == 0
+
+    if not works():
+        Path("/run/munge").mkdir(exist_ok=True)
+        shutil.chown("/run/munge", "munge", "munge")
+        said("su", "-s", "/bin/sh", "munge", "-c", "/usr/sbin/munged")
+        wait_for("munge", works)
+
+
+def start(node: str) -> None:
+    """Start the daemon of a node."""
+    said("slurmd", "-N", node)
+
+
+def kill(root: Path, node: str) -> None:
+    """Kill a node: its daemons and all that runs in its jobs, outright."""
+    _end(root / f"slurmd.{node}.pid", signal.SIGKILL)
+    jobs = said("squeue", "-h", "-t", "running", "-w", node, "-o", "%A").split()
+    for job in [f"slurmstepd: [{job}." for job in jobs] + [f"SLURM_JOB_ID={job}\0" for job in jobs]:
+        for path in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if job.encode() in (path / "cmdline").read_bytes() + (path / "environ").read_bytes():
+                    os.kill(int(path.name), signal.SIGKILL)
+
+
+def state(node: str) -> str:
+    """Return the state of a node, such as idle, mixed, drained, down."""
+    return said("sinfo", "-h", "-n", node, "-o", "%T").rstrip("*")
+
+
+def drain(node: str) -> None:
+    """Let a node take no further job."""
+    said("scontrol", "update", f"nodename={node}", "state=drain", "reason=test")
+
+
+def resume(node: str) -> None:
+    """Let a node take jobs again."""
+    said("scontrol", "update", f"nodename={node}", "state=resume")
+
+
+def jobs(rule: str) -> dict[str, str]:
+    """Return job → node of those that run a rule or a group of rules."""
+    lines = said("squeue", "-h", "-t", "running", "-o", "%A %N %k").splitlines()
+    found = (line.split(" ", 2) for line in lines)
+    return {job: node for job, node, comment in found if comment.startswith((f"rule_{rule}", f"group_{rule}"))}
+
+
+def _end(pid_file: Path, number: signal.Signals) -> None:
+    with suppress(OSError, ValueError):
+        os.kill(int(pid_file.read_text(encoding="ascii")), number)
