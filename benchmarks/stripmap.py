@@ -91,15 +91,14 @@ def _powers(turn: NDArray[np.complex128], count: int) -> NDArray[np.complex128]:
     return powers[:, :count]
 
 
-def profiles_of(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> Profiles:
-    """Return the profiles of a flight, compressed block by block into an array."""
+def compress_into(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> None:
+    """Compress a flight block by block into an array."""
     for first in range(0, len(history), AT_ONCE):
         block = slice(first, min(first + AT_ONCE, len(history)))
         part = RangeWindow(
             window.start_m[block], window.samples, window.step_m, window.unambiguous, window.farthest_m[block]
         )
         into[block] = range_compress(history[block], grid, FLAT, window=part).samples
-    return _profiles(into, window.start_m, window.step_m, window.unambiguous, history)
 
 
 def _profiles(samples: Any, start_m: Any, step_m: float, unambiguous: int, history: PhaseHistory) -> Profiles:
@@ -116,7 +115,9 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
     plan = make_plan(job, accuracy_db=-60.0)
     window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
     planned = time.process_time()
-    profiles = profiles_of(history, window, grid, np.empty((len(flight), window.samples), np.complex64))
+    samples = np.empty((len(flight), window.samples), np.complex64)
+    compress_into(history, window, grid, samples)
+    profiles = _profiles(samples, window.start_m, window.step_m, window.unambiguous, history)
     formation = Formation(history, profiles, grid, plan, 256)
     image = np.zeros(grid.shape, np.complex64)
     ready = time.process_time()
@@ -173,7 +174,7 @@ def long_flight(pulses: int, pixels: int, folder: Path) -> None:
     for first in range(0, pulses, AT_ONCE):
         transfer[first : first + AT_ONCE] = flight[first : first + AT_ONCE]
     echo = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
-    profiles_of(replace(history, transfer=Rows(echo.transfer)), window, grid, profile)  # type: ignore[arg-type]
+    compress_into(replace(history, transfer=Rows(echo.transfer)), window, grid, profile)  # type: ignore[arg-type]
     np.savez(folder / "window.npz", start=window.start_m, step=window.step_m, over=window.unambiguous)
     print(f"{window.samples} samples, {int((~window.contributing).sum())} pulses add to nothing")
 
