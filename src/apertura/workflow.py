@@ -67,7 +67,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         "--directory",
         str(root),
     ]
-    command += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores), *arguments, *forced]
+    command += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
+    command += [*profiles_found(arguments), *forced]
     here = Path(sys.executable).parent  # rules call `apertura`, which need not be on the caller's PATH
     path = f"{here}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
     with tempfile.TemporaryDirectory() as scratch:
@@ -93,6 +94,23 @@ def _killed_for_memory() -> int:
         return int(counters.get("oom_kill", 0))
     except (OSError, ValueError):
         return 0
+
+
+def profiles_found(arguments: Sequence[str]) -> list[str]:
+    """Return options of snakemake with the profile's whole path: it lies here or beside the workflow, or is a name.
+
+    Snakemake is started in another folder than the caller's.
+
+    Examples
+    --------
+    >>> [Path(word).is_dir() for word in profiles_found(["-n", "--profile=profiles/slurm"])]
+    [False, False, True]
+    """
+    found = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--profile=") else [one])]
+    for at, word in enumerate(found[1:], 1):
+        whole = (place / word for place in (Path.cwd(), _workflow_folder()) if found[at - 1] == "--profile")
+        found[at] = next((str(path) for path in whole if path.exists()), word)
+    return found
 
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
