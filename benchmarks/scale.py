@@ -2,10 +2,10 @@
 
     python benchmarks/scale.py [FOLDER] [FLIGHTS ...]
 
-For 10, 100 and 1000 FLIGHTS, a campaign folder each in FOLDER (a temporary one without): two nodes that record 24 pulses, the
-same ones in every flight (hard links). Each line is a command on that folder, with its wall and CPU seconds and the
-largest resident memory of one of its processes. First nothing is there; then all results are: placeholders with
-manifests that say truly what they were made from.
+For 10, 100 and 1000 FLIGHTS, a campaign folder each in FOLDER (a temporary one without): two nodes that record 24
+pulses, the same ones in every flight (hard links). Each line is a command on that folder, with its wall and CPU
+seconds and the largest resident memory of one of its processes. First nothing is there; then all results are:
+placeholders with manifests that say truly what they were made from.
 """
 
 import os
@@ -28,7 +28,8 @@ def campaign_of(root, flights):
 
     if (root / "config").is_dir():
         return root
-    simulate(root, replace(preset("demo", pulses=24), scene=ImageGrid("EPSG:32632", half_width_m=1.2, spacing_m=0.05)), seed=3)
+    scene = ImageGrid("EPSG:32632", half_width_m=1.2, spacing_m=0.05)
+    simulate(root, replace(preset("demo", pulses=24), scene=scene), seed=3)
     names = [f"f{number:05d}" for number in range(1, flights + 1)]
     for name in names:
         (root / "raw" / name).mkdir()

@@ -15,6 +15,9 @@ from folders import ROOT, copy_writable, edit_config
 from apertura.campaign import Campaign
 from apertura.resources import DEMANDS, Resources
 
+BESIDE_MB = 2 * 135
+"""Snakemake, which starts the job, and Snakemake again, which starts the step: measured."""
+
 PAIR = SimpleNamespace(flight="f01", pair="uav1-uav2")
 
 
@@ -79,7 +82,7 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
         with path.open() as lines:
             used = float(next(csv.DictReader(lines, delimiter="\t"))["max_rss"])
         predicted = asked[rule].mem_mb(job, 1)
-        assert math.isnan(used) or used * 1.048576 <= predicted, (rule, used, predicted)
+        assert math.isnan(used) or used * 1.048576 + BESIDE_MB <= predicted, (rule, used, predicted)
         assert predicted <= 4 * max(used, 1000), (rule, used, predicted)
         seen.add(rule)
     assert seen == set(DEMANDS) - {"calibrate", "terrain", "speed_accuracy", "whole_chart"}

@@ -3,7 +3,7 @@
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -21,7 +21,7 @@ class Interrupted(SystemExit):
 def leave_status(status: int) -> None:
     """Tell the run that this step belongs to, if any, how the step ended."""
     if STATUS_FILE in os.environ and status:
-        with Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as said:
+        with suppress(OSError), Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as said:  # on another node
             said.write(f"{status}\n")
 
 

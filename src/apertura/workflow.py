@@ -112,7 +112,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
     overtaken = [manifest for manifest in stale if not manifest.startswith(f"results/{STUDY}/")]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    command = _command(root, cores, [*arguments, *forced])
+    command = _command(root, cores, [*profiles_found(arguments), *forced])
     if forms:
         files, at_once = _Files.of(campaign), 0 if elsewhere else cores
         note(files.journal, "start", cores=at_once)
@@ -183,6 +183,23 @@ def _killed_for_memory() -> int:
         return int(counters.get("oom_kill", 0))
     except (OSError, ValueError):
         return 0
+
+
+def profiles_found(arguments: Sequence[str]) -> list[str]:
+    """Return options of snakemake with the profile's whole path: it lies here or beside the workflow, or is a name.
+
+    Snakemake is started in another folder than the caller's.
+
+    Examples
+    --------
+    >>> [Path(word).is_dir() for word in profiles_found(["-n", "--profile=profiles/slurm"])]
+    [False, False, True]
+    """
+    found = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--profile=") else [one])]
+    for at, word in enumerate(found[1:], 1):
+        whole = (place / word for place in (Path.cwd(), shipped()) if found[at - 1] == "--profile")
+        found[at] = next((str(path) for path in whole if path.exists()), word)
+    return found
 
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
