@@ -8,6 +8,7 @@ import pytest
 from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all, require_files
 
 from apertura.campaign import Campaign
+from apertura.ingest.sample_file import SampleFile
 from apertura.load.pair import open_pair
 from apertura.steps import echo, ingest, profile, scene
 
@@ -347,3 +348,26 @@ def test_segments_without_a_pulse_are_named_with_the_times_there_are(tiny):
         assert "segments.tsv" in message
         assert "between 2025-05-14T09:30:00" in message
     assert nothing_half_written(tiny)
+
+
+def test_a_recording_that_changed_since_it_was_ingested_is_not_read_by_its_old_captures(tiny):
+    """The raw stage refers to the recorder's file under its hash; samples are not copied."""
+    campaign = Campaign.load(tiny)
+    ingest_all(campaign)
+    stage = tiny / "results/f01/uav1/raw.zarr"
+    held = sum(path.stat().st_size for path in stage.rglob("*") if path.is_file())
+    assert held < 20_000 < (tiny / "raw/f01/uav1.sigmf-data").stat().st_size
+    edit_data(tiny, "uav1", lambda iq: iq.sort())
+    message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
+    assert "raw/f01/uav1.sigmf-data: changed since it was ingested" in message
+    assert not list((tiny / "results").rglob("echo*"))
+
+
+def test_a_recording_that_ends_while_it_is_read_is_an_error_and_no_signal(tiny):
+    file = SampleFile(tiny / "raw/f01/uav1.sigmf-data", channels=1)
+    whole = len(file)
+    file.read(whole - 5, whole)
+    with file.path.open("r+b") as stream:
+        stream.truncate(4 * (whole - 2))
+    message = complaint(lambda: file.read(whole - 5, whole))
+    assert f"uav1.sigmf-data: ends at sample {whole - 2}, while it is read" in message
