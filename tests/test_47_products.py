@@ -9,12 +9,13 @@ import rasterio
 import xarray as xr
 from rio_cogeo.cogeo import cog_validate
 
-from apertura.export import product_files
+from apertura.export import exports_in, product_files
 from apertura.provenance import sha256_file
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": PAIRS}))
-RASTERS = [name for name in PRODUCTS if name.startswith("f01") and name.endswith(".tif")]
+LAYERS = [f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers")]
+RASTERS = [name for name in PRODUCTS if name.endswith(".tif") and name not in LAYERS]
 RECORDED = [
     *(f"raw/f01/uav1.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.csv")),
     *(f"raw/f01/uav2.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.pos")),
@@ -28,13 +29,14 @@ def tags_of(campaign, name):
 
 def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
-    files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in {".tif", ".png"}}
+    opened = {".tif", ".png", ".geojson"}
+    files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in opened}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
-    assert len(RASTERS) == 12
+    assert (len(RASTERS), len(LAYERS)) == (12, 10)
     assert files | reports == set(PRODUCTS)
 
 
-@pytest.mark.parametrize("name", RASTERS)
+@pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
 def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
     path = finished_tiny.results / name
     valid, errors, warnings = cog_validate(str(path), strict=True, quiet=True)
@@ -43,10 +45,11 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
         np.testing.assert_allclose(tuple(raster.bounds), finished_tiny.settings.scene.bounds_m, atol=1e-3)
         assert raster.crs.to_epsg() == 32632
         assert raster.transform.a == -raster.transform.e == 0.1
-        assert raster.dtypes[0] == ("complex64" if name.endswith("slc.tif") else "float32")
+        kinds = {"slc.tif": "complex64", "coherent_slc.tif": "complex64", "mask.tif": "uint8"}
+        assert raster.dtypes[0] == kinds.get(path.name, "float32")
 
 
-@pytest.mark.parametrize("name", RASTERS)
+@pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
 def test_a_raster_says_where_it_comes_from(finished_tiny, name):
     tags, pair = tags_of(finished_tiny, name), name.split("/")[1]
     spec = json.loads(tags["APERTURA_RUNSPEC"])

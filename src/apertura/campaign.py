@@ -122,6 +122,8 @@ class Campaign:
         for node in nodes.values():
             del node["antennas"]  # echo asks only whether there are beams, image what they are
         beams = self.antennas(pair) if pair else {}
+        stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
+        antennas = {"antennas": stated} if stated else {}
         segments = [list(segment) for segment in self.segments_of(flight, pair)]
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
@@ -142,11 +144,8 @@ class Campaign:
                 for name, value in processing.items()
                 if name not in {"window", "sidelink", "false_alarms_per_s", "fusion"}
             }
-            | (
-                {"antennas": {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}}
-                if beams
-                else {}
-            ),
+            | antennas,
+            "layers": {"integration": processing["integration"], **antennas},
         }
         return chosen.get(stage, {})
 
