@@ -79,6 +79,14 @@ def point_history(pulses: int = 96) -> PhaseHistory:
     return PhaseHistory(echo, frequency, np.full(200, 1 / 200), np.zeros(pulses), flown)
 
 
+def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarriers: int = 64) -> PhaseHistory:
+    """Echoes of targets (target, 3) of any flight, 96 MHz about 1.25 GHz."""
+    frequency = 1.2e9 + 1.5e6 * np.arange(subcarriers)
+    echo = sum(np.exp(-2j * np.pi * frequency * aperture.path(target)[:, None] / C) for target in targets_m)
+    weight = np.full(subcarriers, 1 / subcarriers)
+    return PhaseHistory(np.asarray(echo, np.complex64), frequency, weight, np.zeros(len(aperture)), aperture)
+
+
 UTM_GRID = SceneGrid("EPSG:32632", 500020.0, 5400060.0, 0.5, (70, 90))
 
 # A bent bistatic flight somewhere on Earth, axes aligned with nothing

@@ -137,7 +137,8 @@ class Beams:
 
     def __getitem__(self, pulses: slice) -> "Beams":
         """Return the beams over some pulses."""
-        return Beams(*(part and part[pulses] for part in (self.transmit, self.receive, self.sector)))
+        transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
+        return Beams(transmit, receive, self.sector and self.sector[pulses])
 
     @property
     def antennas(self) -> "Beams | None":

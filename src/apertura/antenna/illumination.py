@@ -127,25 +127,30 @@ def _reached(
         lit &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
     for beam, leg, around in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
         if beam is not None:
-            lit &= _in_cone(beam, middles, starts, middle_m - leg[:, None], around)
+            lit &= _in_pattern(beam, middles, starts, middle_m - leg[:, None], around)
     return lit
 
 
-def _in_cone(
+def _in_pattern(
     beam: Beam,
     middles: NDArray[np.int64],
     starts: NDArray[np.int64],
     away_m: NDArray[np.float64],
     radius_m: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return which balls (block, place) touch the cone that holds the pattern at any pulse of a block."""
-    ahead = beam.axes[:, 0]
-    there = ahead[middles]
-    turns = _angle((ahead * np.repeat(there, np.diff(starts, append=len(ahead)), axis=0)).sum(axis=1))
+    """Return which balls (block, place) may touch the pattern at any pulse of a block: its cone and its elevations."""
     range_m = np.linalg.norm(away_m, axis=-1)
-    off = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
-    near = np.arcsin(np.minimum(1.0, radius_m / range_m))
-    return (radius_m >= range_m) | (off - near - np.maximum.reduceat(turns, starts)[:, None] < beam.cone_rad + 1e-6)
+    near = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
+    off, above = (np.empty(range_m.shape) for _ in range(2))
+    for axis, angle in ((0, off), (2, above)):
+        each = beam.axes[:, axis]
+        there = each[middles]
+        turned = _angle((each * np.repeat(there, np.diff(starts, append=len(each)), axis=0)).sum(axis=1))
+        near += np.maximum.reduceat(turned, starts)[:, None]
+        angle[:] = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
+    elevation = np.pi / 2 - above
+    inside = (elevation + near > beam.elevation_rad[0]) & (elevation - near < beam.elevation_rad[-1])
+    return np.asarray((radius_m >= range_m) | (inside & (off - near < beam.cone_rad)))
 
 
 def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:

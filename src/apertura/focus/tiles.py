@@ -119,16 +119,18 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
     graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
     sums: dict[tuple[int, int], Any] = {}  # place → key of what the blocks so far add up to
     before: list[Any] = []  # what must be done before the next block's tables are prepared
-    for number, block in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, whole=beams is None)):
-        parts = {place: forming.reach.within(forming.index(place), block) for place in places}
-        if not any(parts.values()):
+    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, whole=beams is None)):
+        parts = {place: forming.reach.within(forming.index(place), some) for place in places}
+        lit = {place: part for place, part in parts.items() if part is not None}
+        if not lit:
             continue
+        first, last = min(part.start for part in lit.values()), max(part.stop for part in lit.values())
+        block = slice(some.start + first, some.start + last)  # what no tile takes is not even read
         tables = f"{name}-tables-{number}"
         graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
         before = []
-        for place, part in parts.items():
-            if part is None:
-                continue
+        for place, reached in lit.items():
+            part = slice(reached.start - first, reached.stop - first)
             form, key = partial(_form, forming, place, block, part, count), (f"{name}-{number}", *place)
             graph[key] = (form, tables, f"{name}-beams", sums.get(place))
             graph[f"{name}-done-{number}", *place] = (_nothing, key)

@@ -16,7 +16,7 @@ from apertura.imaging.checks import check_inputs
 from apertura.imaging.choices import ACCURACY_DB, ImagingChoices
 from apertura.imaging.formation import Formation
 from apertura.imaging.job import imaging_job, profiles_job
-from apertura.imaging.range_profiles import range_compress
+from apertura.imaging.range_profiles import RangeWindow, range_compress
 from apertura.imaging.stages import inputs_of
 from apertura.planning.memory import memory_limit
 from apertura.planning.planner import make_plan
@@ -118,9 +118,9 @@ def backproject(
     ground = _ground(terrain, grid)
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
-    compressed = range_compress(inputs, grid, ground) if isinstance(inputs, PhaseHistory) else inputs
     models = GroundModels.of(ground, None, grid)
-    job = replace(_job(compressed, history, grid, models, beams, asked.integrated), tile_px=asked.tile_px)
+    job = replace(_job(inputs, grid, models, beams, asked.integrated), tile_px=asked.tile_px)
+    compressed = _compressed(inputs, grid, ground, job.beams)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
     formation = Formation(history, compressed, grid, plan, asked.tile_px)
     attributes: dict[str, Any] = {}
@@ -176,19 +176,21 @@ def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.co
     return error_bound(values, exact, np.ones(len(pixels)), power=power)
 
 
+def _compressed(inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: Terrain, beams: Beams | None) -> Profiles:
+    if isinstance(inputs, Profiles):
+        return inputs
+    window = RangeWindow.of(inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams)
+    return range_compress(inputs, grid, ground, window=window)
+
+
 def _job(
-    profiles: Profiles,
-    history: PhaseHistory | None,
-    grid: SceneGrid,
-    ground: GroundModels,
-    beams: Beams | None,
-    integration: Any,
+    inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: GroundModels, beams: Beams | None, integration: Any
 ) -> Job:
     weighed: dict[str, Any] = {"beams": beams, "integration": integration}
-    if history is None:
-        job = profiles_job(profiles, grid, ground, **weighed)
+    if isinstance(inputs, Profiles):
+        job = profiles_job(inputs, grid, ground, **weighed)
     else:
-        known = (history.aperture, history.frequency_hz, history.weight)
-        job = imaging_job(*known, grid, ground, history=history, **weighed)
+        known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
+        job = imaging_job(*known, grid, ground, history=inputs, **weighed)
     lit = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     return replace(job, illumination=lit, memory_bytes=memory_limit())

@@ -41,7 +41,7 @@ def resolution_cell_m(formation: Formation) -> float:
 
 
 def _sector_of(formation: Formation) -> Weigh | None:
-    sector = formation.beams and formation.beams.sector
+    sector = None if formation.beams is None else formation.beams.sector
     return None if sector is None else sector.over(formation.profiles.aperture)
 
 

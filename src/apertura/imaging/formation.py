@@ -95,15 +95,12 @@ class Formation:
         Where there are only profiles, by their band-limited interpolation in float64.
         """
         places = self.positions_at(*pixels.T)
-        if self.history is None:
-            total = band_limited_image(self.profiles, places, beams=self.beams)
-        else:
-            total = np.zeros(len(places), np.complex128)
-            for pulses, seen in self.seeing(places):
-                some = self.history[pulses]
-                for part, lit in seen:
-                    weights = self.beams and self.beams[pulses][part]
-                    total[lit] += reference.form(some[part], places[lit], beams=weights)
+        total = np.zeros(len(places), np.complex128)
+        for pulses, seen in self.seeing(places):
+            some = (self.history or self.profiles)[pulses]
+            for part, lit in seen:
+                weights = self.beams and self.beams[pulses][part]
+                total[lit] += _exact_sum(some[part], places[lit], weights)
         return np.asarray(total / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
@@ -112,7 +109,7 @@ class Formation:
         (pixel,) complex64, and mean |I|² over those patches, (pixel,) float64.
         """
         first = pixels // PATCH_PX * PATCH_PX
-        windows = [tuple(slice(at, at + PATCH_PX) for at in corner) for corner in first.tolist()]
+        windows = [(slice(row, row + PATCH_PX), slice(column, column + PATCH_PX)) for row, column in first.tolist()]
         image = self.image_of(windows)
         inside = pixels - first
         values = np.array([patch[tuple(at)] for patch, at in zip(image, inside, strict=True)], np.complex64)
@@ -196,3 +193,11 @@ class Formation:
             side_px=self.side_px,
             weighing=Weighing(self.beams, summed, self.plan.count),
         )
+
+
+def _exact_sum(
+    inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None
+) -> NDArray[np.complex128]:
+    if isinstance(inputs, PhaseHistory):
+        return reference.form(inputs, places, beams=beams)
+    return band_limited_image(inputs, places, beams=beams)

@@ -10,18 +10,43 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency
 from apertura.focus.engines import reference
 from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.job import Job, Signal
+from apertura.focus.job import Integration, Job, Signal
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.range_profiles import RangeWindow
 from apertura.planning.integration import integrate
 from apertura.quality.measures import content_loss_db
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import Terrain
+from apertura.scene.terrain import FlatGround, Terrain
 
 _POINTS = 9
 _CONTENT_PIXELS = 128
 _CONTENT_PULSES = 16384  # of which the terms of so many pixels take 32 MB
+
+
+def settle(
+    aperture: Aperture,
+    centre_hz: float,
+    grid: SceneGrid,
+    level: FlatGround,
+    *,
+    antennas: Beams | None = None,
+    asked: Any = "auto",
+) -> Integration:
+    """Return over how much of a flight the pixels of a scene are integrated.
+
+    Parameters
+    ----------
+    aperture, centre_hz
+        Phase centres in the frame of the pixels; middle of the band.
+    grid, level
+        The scene, on level ground.
+    antennas, asked
+        As of `apertura.planning.integration.integrate`.
+    """
+    points_m = grid.sample_points(_POINTS, level.height_m)
+    geometry: dict[str, Any] = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre_hz}
+    return integrate(aperture, points_m, **geometry, antennas=antennas, asked=asked)
 
 
 def imaging_job(
@@ -59,8 +84,7 @@ def imaging_job(
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre}
-    settled = integrate(aperture, ground_m, **geometry, antennas=beams, asked=integration)
+    settled = settle(aperture, centre, grid, ground.level, antennas=beams, asked=integration)
     beams = Beams.within(settled.sector, beams)
     window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams)
     return Job(
@@ -95,8 +119,7 @@ def profiles_job(
     bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    geometry = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre}
-    settled = integrate(profiles.aperture, ground_m, **geometry, antennas=beams, asked=integration)
+    settled = settle(profiles.aperture, centre, grid, ground.level, antennas=beams, asked=integration)
     return Job(
         aperture=profiles.aperture,
         ground_m=ground_m,

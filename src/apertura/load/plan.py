@@ -5,10 +5,12 @@ from dataclasses import replace
 
 from rich.filesize import decimal
 
+from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
+from apertura.echo.compression import centre_frequency
 from apertura.errors import CampaignError
 from apertura.focus.job import Job
-from apertura.imaging.job import imaging_job
+from apertura.imaging.job import imaging_job, settle
 from apertura.load.antennas import lit
 from apertura.load.budget import budget_of
 from apertura.load.pair import OpenPair
@@ -86,6 +88,16 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         path_limit_m=pair.path_limit_m,
         memory_bytes=memory_limit(),
     )
+
+
+def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
+    """Return what weighs the pulses of a pair over the scene, antennas and the sector integrated; None where all count.
+
+    As `job_of` settles it, without a look at the echo: what profiles must cover follows from it.
+    """
+    centre_hz, asked = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
+    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=asked)
+    return Beams.within(settled.sector, pair.beams)
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:

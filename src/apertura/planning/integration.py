@@ -152,8 +152,8 @@ def _described(
             "turns, or passes them more than once"
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(scale * float(total.max())))
-    share = scale * float(seen.mean()) / len(aperture)
-    return Integration(sector, count, value, f"{why}; {counted}", share, report, flags)
+    summed = scale * float(seen.mean()) / len(aperture)
+    return Integration(sector, count, value, f"{why}; {counted}", summed, report, flags)
 
 
 def _seen_under(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:

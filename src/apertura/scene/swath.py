@@ -1,5 +1,6 @@
 """Total paths from each pulse to the scene, bounded by blocks of pixels."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,7 +22,7 @@ def swath(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the shortest and longest total path from each pulse to the scene.
 
-    At most 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
+    About 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
     total path changes by at most twice the radius. Of a long flight some pulses stand for those about them: a path
     changes by at most what both antennas move.
 
@@ -48,7 +49,10 @@ def swath(
     >>> bool(near[0] <= 41.02), bool(far[0] >= 59.0)
     (True, True)
     """
-    middle_m, radius_m = balls(grid, terrain, list(grid.tiles(-(-max(grid.shape) // _BLOCKS))))
+    side = (
+        -(-max(grid.shape) // _BLOCKS) if beams is None else math.isqrt(grid.shape[0] * grid.shape[1] // _BLOCKS**2) + 1
+    )
+    middle_m, radius_m = balls(grid, terrain, list(grid.tiles(side)))
     every = 1 + (len(aperture) - 1) // _MOST_PULSES
     nearest, farthest = np.empty((2, len(aperture)))
     for first in range(0, len(aperture), every * _PULSES_AT_ONCE):

@@ -125,7 +125,11 @@ class _Work:
         integration, formation = self.formation.plan.integration, self.formation
         empty = 1 - len(formation.windows) / len(formation.tiles)
         tiles = {"tiles": {"formed": len(formation.windows), "empty_share": round(empty, 6)}}
-        return tiles if integration is None else {**tiles, "integration": {**integration.report}}
+        return (
+            tiles
+            if integration is None
+            else {**tiles, "integration": {"chosen": integration.value, **integration.report}}
+        )
 
     def compute(self, windows: list[Window], target: Any) -> None:
         """Compute some tiles as planned."""

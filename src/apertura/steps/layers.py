@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.export import export_modules, write_exports
 from apertura.export.layers import OUTSIDE
 from apertura.focus.inputs import Profiles
-from apertura.focus.job import Job
-from apertura.imaging.job import profiles_job
+from apertura.imaging.job import settle
 from apertura.imaging.noise import PLACES, noise_power
 from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
@@ -24,7 +24,6 @@ from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import Provenance, sha256_file
 from apertura.scene.grid import SceneGrid
-from apertura.scene.ground_models import GroundModels
 from apertura.scene.lattice import BLOCK_PX
 from apertura.scene.looks import Looks
 from apertura.scene.terrain import FlatGround, Terrain
@@ -38,18 +37,19 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root, modules)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
-    ground = GroundModels.of(scene.terrain, scene.level, scene.grid)
-    beams, asked = beams_of(campaign, pair, body_axes(echo)), campaign.settings.processing.integrated
-    job = profiles_job(profiles, scene.grid, ground, beams=beams, integration=asked)
-    looks = Looks.of(scene.grid, scene.terrain, job.aperture, job.beams, threads=threads)
-    noise = _noise(profiles, scene, job)
+    antennas, asked = beams_of(campaign, pair, body_axes(echo)), campaign.settings.processing.integrated
+    aperture, centre_hz = profiles.aperture, profiles.centre_frequency_hz
+    settled = settle(aperture, centre_hz, scene.grid, scene.level, antennas=antennas, asked=asked)
+    beams = Beams.within(settled.sector, antennas)
+    looks = Looks.of(scene.grid, scene.terrain, aperture, beams, threads=threads)
+    noise = _noise(profiles, scene, beams)
     origin = Provenance.of(
         modules,
         [echo, profile, *scene.parents],
         settings={**campaign.relevant("layers", pair), **scene.spec},
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()} | scene.inputs,
     )
-    rasters = _rasters(scene, looks, noise / job.count**2, threads=threads)
+    rasters = _rasters(scene, looks, noise / settled.count**2, threads=threads)
     written = write_exports(
         "layers",
         campaign.result(flight, pair),
@@ -63,10 +63,10 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     return written
 
 
-def _noise(profiles: Profiles, scene: OpenScene, job: Job) -> float:
+def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
     """Return the noise of one pulse, measured at random places of the scene."""
     rows, columns = np.random.default_rng(0).integers(0, scene.grid.shape, (PLACES, 2)).T
-    return noise_power(profiles, scene.terrain.positions_at(scene.grid, rows, columns), beams=job.beams)
+    return noise_power(profiles, scene.terrain.positions_at(scene.grid, rows, columns), beams=beams)
 
 
 @dataclass(frozen=True)

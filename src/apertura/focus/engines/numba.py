@@ -116,8 +116,7 @@ class Tables:
 
     def __getitem__(self, pulses: slice) -> "Tables":
         """Return the tables of some pulses, as views."""
-        some = {"samples": self.samples[pulses], "start_m": self.start_m[pulses], "aperture": self.aperture[pulses]}
-        return replace(self, **some)
+        return replace(self, samples=self.samples[pulses], start_m=self.start_m[pulses], aperture=self.aperture[pulses])
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:

@@ -1,0 +1,244 @@
+"""A strip flown past: what a pixel costs as the flight grows, and what a long flight takes of memory.
+
+    python benchmarks/stripmap.py
+    python benchmarks/stripmap.py --pulses 300000 --pixels 4096
+
+The first images a strip of one width from flights of 0.25 to 2 km, a pulse every 2 cm, and a small scene from the
+longest; CPU seconds of planning and of tiles, and the error against the double sum over pulses and subcarriers at
+random pixels, all with the same integration. The second writes echo and profiles of a flight to disk, and images,
+certifies and measures it as the step does, in a process of its own whose peak memory it prints.
+"""
+
+import argparse
+import contextlib
+import io
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.antenna.beam import Beam, Beams
+from apertura.antenna.illumination import illuminate
+from apertura.antenna.pattern import gaussian_cut
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.echo.compression import centre_frequency
+from apertura.focus.inputs import PhaseHistory, Profiles
+from apertura.focus.tiles import compute_tiles
+from apertura.geometry.aperture import Aperture
+from apertura.imaging.certify import certified, measures
+from apertura.imaging.focus_check import focus_report
+from apertura.imaging.formation import Formation
+from apertura.imaging.job import imaging_job
+from apertura.imaging.range_profiles import RangeWindow, range_compress
+from apertura.imaging.stages import Rows
+from apertura.planning.planner import make_plan
+from apertura.scene.grid import SceneGrid
+from apertura.scene.ground_models import GroundModels
+from apertura.scene.terrain import FlatGround
+
+FLAT = FlatGround(0.0)
+SPEED_M, HEIGHT_M = 0.02, 40.0
+NEAR_M, WIDTH_M, SPACING_M = 60.0, 40.0, 0.25
+SUBCARRIERS, BAND_HZ, CARRIER_HZ = 256, 200e6, 1.2e9
+AT_ONCE = 4096
+
+
+class Flight:
+    """Point targets every ten metres along a straight flight, and the echo of each pulse, made as it is asked for."""
+
+    def __init__(self, pulses: int, step_m: float, width_m: float, subcarriers: int, band_hz: float):
+        along = (np.arange(pulses) - pulses / 2) * step_m
+        track = np.stack([along, 0 * along, np.full(pulses, HEIGHT_M)], -1)
+        self.aperture, self.shape, self.ndim = Aperture(track, track), (pulses, subcarriers), 2
+        self.frequency_hz = CARRIER_HZ + band_hz / subcarriers * np.arange(subcarriers)
+        generator, count = np.random.default_rng(0), int(pulses * step_m / 10)
+        east = np.sort(generator.uniform(along[0], along[-1], count))
+        self.targets_m = np.stack([east, NEAR_M + width_m * generator.random(count), 0 * east], -1)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
+        some = self.aperture[pulses]
+        echo = np.zeros((len(some), self.shape[1]), np.complex128)
+        east, reach = some.tx_m[:, 0], 3 * (NEAR_M + 200)
+        for target in self.targets_m[np.abs(self.targets_m[:, 0] - east.mean()) < reach]:
+            delay = some.path(target) / C
+            turn = np.exp(-2j * np.pi * (delay * (self.frequency_hz[1] - self.frequency_hz[0])))
+            echo += np.exp(-2j * np.pi * delay * self.frequency_hz[0])[:, None] * _powers(turn, self.shape[1])
+        return echo.astype(np.complex64)
+
+    @property
+    def history(self) -> PhaseHistory:
+        """All of it, read as it is asked for."""
+        weight = np.hanning(self.shape[1]) / np.hanning(self.shape[1]).sum()
+        return PhaseHistory(self, self.frequency_hz, weight, np.zeros(len(self)), self.aperture)  # type: ignore[arg-type]
+
+
+def _powers(turn: NDArray[np.complex128], count: int) -> NDArray[np.complex128]:
+    """Return turn**n, n = 0…count-1, (pulse, n), by doubling."""
+    powers = np.ones((len(turn), 1), np.complex128)
+    while powers.shape[1] < count:
+        powers = np.hstack([powers, powers * (powers[:, -1] * turn)[:, None]])
+    return powers[:, :count]
+
+
+def profiles_of(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> Profiles:
+    """Return the profiles of a flight, compressed block by block into an array."""
+    for first in range(0, len(history), AT_ONCE):
+        block = slice(first, min(first + AT_ONCE, len(history)))
+        part = RangeWindow(
+            window.start_m[block], window.samples, window.step_m, window.unambiguous, window.farthest_m[block]
+        )
+        into[block] = range_compress(history[block], grid, FLAT, window=part).samples
+    return _profiles(into, window.start_m, window.step_m, window.unambiguous, history)
+
+
+def _profiles(samples: Any, start_m: Any, step_m: float, unambiguous: int, history: PhaseHistory) -> Profiles:
+    frequency = history.frequency_hz
+    over = unambiguous / len(frequency)
+    return Profiles(samples, start_m, step_m, centre_frequency(frequency), over, history.aperture)
+
+
+def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dict[str, Any]:
+    """Return what an image costs, and how exact it is."""
+    history, ground = flight.history, GroundModels.of(FLAT, None, grid)
+    began = time.process_time()
+    job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, integration=integration)
+    plan = make_plan(job, accuracy_db=-60.0)
+    window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
+    planned = time.process_time()
+    profiles = profiles_of(history, window, grid, np.empty((len(flight), window.samples), np.complex64))
+    formation = Formation(history, profiles, grid, plan, 256)
+    image = np.zeros(grid.shape, np.complex64)
+    ready = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        compute_tiles(formation.image, formation.windows, image, threads=1)
+    done = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        said = certified(formation, image, accuracy_db=-60.0, threads=1)
+    summed = job.pixels * len(flight) * job.share
+    return {
+        "length_km": round(float(np.ptp(flight.aperture.tx_m[:, 0])) / 1000, 2),
+        "pulses": len(flight),
+        "pulses_per_pixel": plan.integration.report.get("pulses_per_pixel", {}).get("median", len(flight)),
+        "pixels": job.pixels,
+        "samples": window.samples,
+        "idle_pulses": int((~window.contributing).sum()),
+        "plan_s": round(planned - began, 2),
+        "tiles_s": round(done - ready, 2),
+        "us_per_pixel": round(1e6 * (done - ready) / job.pixels, 3),
+        "ns_per_pixel_pulse": round(1e9 * (done - ready) / summed, 3),
+        "error_db": said["numerical_error_estimate_db"],
+        "redone": len(said["redone"]),
+        "flags": ",".join(plan.flags),
+    }
+
+
+def lengths() -> None:
+    """Print a row per length of a flight past a strip, then one of the longest past a small scene."""
+    warm = Flight(3000, SPEED_M, WIDTH_M, SUBCARRIERS, BAND_HZ)
+    formed(warm, SceneGrid("local", -8.0, NEAR_M + WIDTH_M, SPACING_M, (160, 64)))
+    for flown_m, length in ((250, 250.0), (500, 500.0), (1000, 1000.0), (2000, 2000.0), (2000, 64.0)):
+        flight = Flight(int(flown_m / SPEED_M), SPEED_M, WIDTH_M, SUBCARRIERS, BAND_HZ)
+        columns = int(length / SPACING_M)
+        grid = SceneGrid("local", -length / 2, NEAR_M + WIDTH_M, SPACING_M, (int(WIDTH_M / SPACING_M), columns))
+        print(formed(flight, grid), flush=True)
+
+
+def long_flight(pulses: int, pixels: int, folder: Path) -> None:
+    """Write echo and profiles of a flight along the middle of a square scene, two swaths of antennas wide."""
+    grid, flight, beams = _long(pulses, pixels)
+    history = flight.history
+    known = flight.aperture, flight.frequency_hz, history.weight
+    job = imaging_job(*known, grid, GroundModels.of(FLAT, None, grid), beams=beams)
+    window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
+    import zarr
+
+    group = zarr.open_group(folder / "flight.zarr", mode="w")
+    profile, transfer = (
+        group.create_array(
+            name, shape=(pulses, size), chunks=(1024, size), dtype="complex64", dimension_names=["pulse", name + "_at"]
+        )
+        for name, size in (("profile", window.samples), ("transfer", flight.shape[1]))
+    )
+    for first in range(0, pulses, AT_ONCE):
+        transfer[first : first + AT_ONCE] = flight[first : first + AT_ONCE]
+    profiles_of(history, window, grid, profile)
+    np.savez(folder / "window.npz", start=window.start_m, step=window.step_m, over=window.unambiguous)
+    print(f"{window.samples} samples, {int((~window.contributing).sum())} pulses add to nothing")
+
+
+def _long(pulses: int, pixels: int) -> tuple[SceneGrid, Flight, Beams]:
+    side_m = 0.5 * pixels
+    flight = Flight(pulses, 1.1 * side_m / pulses, 200.0, 512, 100e6)
+    grid = SceneGrid("local", -side_m / 2, side_m / 2, 0.5, (pixels, pixels))
+    down = np.radians(20.0)  # to the north and down, 15° above and below
+    ahead, up = [0.0, np.cos(down), -np.sin(down)], [0.0, np.sin(down), np.cos(down)]
+    axes = np.broadcast_to(np.array([ahead, [1.0, 0.0, 0.0], up]), (pulses, 3, 3))
+    wide, narrow = (gaussian_cut(width, cutoff_db=-10.0, limit_rad=1.5) for width in (60.0, 12.0))
+    beam = Beam(axes, *wide, *narrow)
+    return grid, flight, Beams(beam, beam)
+
+
+def imaged(pulses: int, pixels: int, folder: Path) -> None:
+    """Image, certify and measure the flight that `long_flight` wrote, as the step does."""
+    import zarr
+
+    began, wall = time.process_time(), time.perf_counter()
+    grid, flight, beams = _long(pulses, pixels)
+    stage = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
+    window = np.load(folder / "window.npz")
+    history = replace(flight.history, transfer=Rows(stage.transfer))
+    ground = GroundModels.of(FLAT, None, grid)
+    job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, history=history, beams=beams)
+    lit = illuminate(job.beams, job.aperture, job.points_m) if job.beams else None
+    plan = make_plan(replace(job, illumination=lit, threads=2, memory_bytes=8 << 30), accuracy_db=-60.0)
+    planned = time.process_time()
+    places = window["start"], float(window["step"]), int(window["over"])
+    profiles = _profiles(Rows(stage.profile), *places, history)
+    formation = Formation(history, profiles, grid, plan, 256)
+    target = zarr.open_array(folder / "image.zarr", mode="w", shape=grid.shape, chunks=(256, 256), dtype="complex64")
+    compute_tiles(formation.image, formation.windows, target, threads=2)
+    print(_peak("tiles"), f"{time.process_time() - planned:.1f} CPU s")
+    said = certified(formation, target, accuracy_db=-60.0, threads=2)
+    print(_peak("certificate"), said["numerical_error_db"])
+    measures(formation, target), focus_report(formation, target)
+    tiles = f"{len(formation.windows)} of {len(formation.tiles)} tiles"
+    report = plan.integration.report if plan.integration else {}
+    print(plan.setting.line, plan.setting.pulse_blocks, "blocks;", tiles, report, dict(plan.flags))
+    print(f"planned {plan.memory_bytes / 2**30:.2f} GiB, {plan.predicted_seconds:.0f} s")
+    print(_peak("focus"), f"{time.process_time() - began:.1f} CPU s, {time.perf_counter() - wall:.1f} s")
+
+
+def _peak(what: str) -> str:
+    return f"{what}: peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
+
+
+def main() -> None:
+    """Measure."""
+    asked = argparse.ArgumentParser(description=__doc__)
+    asked.add_argument("--pulses", type=int, default=0)
+    asked.add_argument("--pixels", type=int, default=4096)
+    asked.add_argument("--folder", type=Path)
+    given = asked.parse_args()
+    if not given.pulses:
+        lengths()
+    elif given.folder:
+        imaged(given.pulses, given.pixels, given.folder)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            long_flight(given.pulses, given.pixels, Path(folder))
+            subprocess.run([sys.executable, __file__, *sys.argv[1:], "--folder", folder], check=True)
+
+
+if __name__ == "__main__":
+    main()
