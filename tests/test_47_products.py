@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
+from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
 from apertura.export import exports_in, product_files
@@ -105,3 +106,27 @@ def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
     assert "UTM zone 32N" in cube.spatial_ref.attrs["crs_wkt"]
     slc = rasterio.open(finished_tiny.results / "f01" / "uav1-uav2" / "slc.tif").read(1)
     np.testing.assert_array_equal(cube.image.values[0, cube.attrs["pairs"].index("uav1-uav2")], slc)
+
+
+def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
+    features = json.loads((finished_tiny.results / "coverage.geojson").read_text())["features"]
+    kinds = [(feature["properties"]["kind"], feature["properties"]["pair"]) for feature in features]
+    assert kinds == [("track", PAIRS[0]), ("footprint", PAIRS[0]), *2 * [("track", PAIRS[1])], ("footprint", PAIRS[1])]
+    xmin, ymin, xmax, ymax = finished_tiny.settings.scene.bounds_m
+    ((ring,),) = features[1]["geometry"]["coordinates"]
+    east, north = Transformer.from_crs("OGC:CRS84", "EPSG:32632", always_xy=True).transform(*np.transpose(ring))
+    assert (east.min(), north.min()) == pytest.approx((xmin, ymin), abs=0.01)
+    assert (east.max(), north.max()) == pytest.approx((xmax, ymax), abs=0.01)
+    echo = xr.open_zarr(finished_tiny.results / "f01" / PAIRS[1] / "echo.zarr", consolidated=False)
+    for track, name in ((features[2], "tx_position"), (features[3], "rx_position")):
+        longitude, latitude, height_m = np.transpose(track["geometry"]["coordinates"])
+        ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(latitude, longitude, height_m)
+        assert np.abs(np.stack(ecef, -1)[0] - echo[name].values[0]).max() < 0.01
+
+
+def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
+    folder = finished_tiny.results / "f01" / "uav1-uav1"
+    db, nesz, looks, mask = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("db", "nesz", "looks", "mask"))
+    assert np.nanmax(nesz) < np.nanpercentile(db, 20)
+    assert len(np.unique(looks)) == 1  # every pulse counts for every pixel
+    assert not mask.any()

@@ -133,28 +133,32 @@ class Looks:
         key = (tile[0].start, tile[1].start)
         if key not in self._asked:
             seen = self.lattice.amid_positive(self.total, tile)
-            seen[~seen] = self._any(self.terrain.positions(self.grid[tile])[~seen])
+            self._ask(seen, tile)
             self._asked[key] = bool(seen[0, 0]) if (seen == seen[0, 0]).all() else np.packbits(seen)
         known = self._asked[key]
         if isinstance(known, bool):
             return np.full(shape, known)
         return np.unpackbits(known, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
-    def _any(self, points: Floats) -> NDArray[np.bool_]:
-        """Return at which points (point, 3) any pulse has a weight."""
+    def _ask(self, seen: NDArray[np.bool_], tile: Window) -> None:
+        """Ask every pulse that may reach them of the pixels of a tile that are not known to be seen, cell by cell."""
+        part, pitch = self.grid[tile], self.lattice.pitch_px
+        cells = [cell for cell in part.tiles(pitch) if not seen[cell].all()]
+        if not cells or self.beams is None:
+            return
+        lit = reached(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=_AT_ONCE)
+        positions = self.terrain.positions(part)
+        for cell, blocks in zip(cells, lit.T, strict=True):
+            unseen = ~seen[cell]
+            mine = np.flatnonzero(np.repeat(blocks, _AT_ONCE)[: len(self.aperture)])
+            seen[cell][unseen] = self._any(positions[cell][unseen], mine)
+
+    def _any(self, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return at which points (point, 3) any of some pulses, whole blocks of 64, has a weight."""
         seen = np.zeros(len(points), bool)
-        if self.beams is None or not len(points):
-            return ~seen
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        radius = np.linalg.norm(points - middle, axis=1).max()
-        lit = reached(self.beams, self.aperture, middle[None], np.array([radius]), pulses=_AT_ONCE)[:, 0]
-        if not lit.any():
-            return seen
-        mine = np.flatnonzero(np.repeat(lit, _AT_ONCE)[: len(self.aperture)])
-        for every in _EXACT:
-            for first in range(0, len(mine), _AT_ONCE * every):
-                some = slice(int(mine[first]), int(mine[min(first + _AT_ONCE * every, len(mine)) - 1]) + 1, every)
-                left = np.flatnonzero(~seen)
+        for every in _EXACT if self.beams is not None else ():
+            for first in range(0, len(pulses), _AT_ONCE * every):
+                some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~seen)
                 if not left.size:
                     return seen
                 seen[left] = (self.beams[some].weight(self.aperture[some], points[left]) != 0).any(axis=0)
