@@ -52,14 +52,14 @@ AT_ONCE = 4096
 
 
 class Flight:
-    """Point targets every ten metres along a straight flight, and the echo of each pulse, made as it is asked for."""
+    """Point targets every 25 metres along a straight flight, and the echo of each pulse, made as it is asked for."""
 
     def __init__(self, pulses: int, step_m: float, width_m: float, subcarriers: int, band_hz: float):
         along = (np.arange(pulses) - pulses / 2) * step_m
         track = np.stack([along, 0 * along, np.full(pulses, HEIGHT_M)], -1)
         self.aperture, self.shape, self.ndim = Aperture(track, track), (pulses, subcarriers), 2
         self.frequency_hz = CARRIER_HZ + band_hz / subcarriers * np.arange(subcarriers)
-        generator, count = np.random.default_rng(0), int(pulses * step_m / 10)
+        generator, count = np.random.default_rng(0), int(pulses * step_m / 25)
         east = np.sort(generator.uniform(along[0], along[-1], count))
         self.targets_m = np.stack([east, NEAR_M + width_m * generator.random(count), 0 * east], -1)
 
@@ -69,7 +69,7 @@ class Flight:
     def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
         some = self.aperture[pulses]
         echo = np.zeros((len(some), self.shape[1]), np.complex128)
-        east, reach = some.tx_m[:, 0], 3 * (NEAR_M + 200)
+        east, reach = some.tx_m[:, 0], 200.0
         for target in self.targets_m[np.abs(self.targets_m[:, 0] - east.mean()) < reach]:
             delay = some.path(target) / C
             turn = np.exp(-2j * np.pi * (delay * (self.frequency_hz[1] - self.frequency_hz[0])))
@@ -91,15 +91,14 @@ def _powers(turn: NDArray[np.complex128], count: int) -> NDArray[np.complex128]:
     return powers[:, :count]
 
 
-def profiles_of(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> Profiles:
-    """Return the profiles of a flight, compressed block by block into an array."""
+def compress_into(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> None:
+    """Compress a flight block by block into an array."""
     for first in range(0, len(history), AT_ONCE):
         block = slice(first, min(first + AT_ONCE, len(history)))
         part = RangeWindow(
             window.start_m[block], window.samples, window.step_m, window.unambiguous, window.farthest_m[block]
         )
         into[block] = range_compress(history[block], grid, FLAT, window=part).samples
-    return _profiles(into, window.start_m, window.step_m, window.unambiguous, history)
 
 
 def _profiles(samples: Any, start_m: Any, step_m: float, unambiguous: int, history: PhaseHistory) -> Profiles:
@@ -116,7 +115,9 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
     plan = make_plan(job, accuracy_db=-60.0)
     window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
     planned = time.process_time()
-    profiles = profiles_of(history, window, grid, np.empty((len(flight), window.samples), np.complex64))
+    samples = np.empty((len(flight), window.samples), np.complex64)
+    compress_into(history, window, grid, samples)
+    profiles = _profiles(samples, window.start_m, window.step_m, window.unambiguous, history)
     formation = Formation(history, profiles, grid, plan, 256)
     image = np.zeros(grid.shape, np.complex64)
     ready = time.process_time()
@@ -172,7 +173,8 @@ def long_flight(pulses: int, pixels: int, folder: Path) -> None:
     )
     for first in range(0, pulses, AT_ONCE):
         transfer[first : first + AT_ONCE] = flight[first : first + AT_ONCE]
-    profiles_of(history, window, grid, profile)
+    echo = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
+    compress_into(replace(history, transfer=Rows(echo.transfer)), window, grid, profile)  # type: ignore[arg-type]
     np.savez(folder / "window.npz", start=window.start_m, step=window.step_m, over=window.unambiguous)
     print(f"{window.samples} samples, {int((~window.contributing).sum())} pulses add to nothing")
 
@@ -197,7 +199,7 @@ def imaged(pulses: int, pixels: int, folder: Path) -> None:
     grid, flight, beams = _long(pulses, pixels)
     stage = xr.open_zarr(folder / "flight.zarr", consolidated=False, chunks=None)
     window = np.load(folder / "window.npz")
-    history = replace(flight.history, transfer=Rows(stage.transfer))
+    history = replace(flight.history, transfer=Rows(stage.transfer))  # type: ignore[arg-type]
     ground = GroundModels.of(FLAT, None, grid)
     job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, history=history, beams=beams)
     lit = illuminate(job.beams, job.aperture, job.points_m) if job.beams else None

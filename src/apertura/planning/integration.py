@@ -114,13 +114,7 @@ def _described(
 ) -> Integration:
     """Return the integration by a sector, with what it makes of the scene."""
     points = points_m.reshape(-1, 3)
-    every = slice(None, None, -(-len(aperture) // _COUNTED))
-    few, some = aperture[every], sector[every]
-    total, seen = np.zeros(len(points)), np.zeros(len(points))
-    for first in range(0, len(few), _PULSES):
-        weight = some[first : first + _PULSES].weight(few[first : first + _PULSES], points)
-        total, seen = total + weight.sum(axis=0), seen + (weight > 0).sum(axis=0)
-    scale = len(aperture) / len(few)
+    total, seen = _counted(sector, aperture, points)
     if not seen.any():
         raise CampaignError(
             f"zero pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
@@ -129,7 +123,7 @@ def _described(
             remedy="Set processing.integration to all, or correct scene.bounds_m.",
         )
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
-    least, median, most = (round(scale * float(np.quantile(seen, part))) for part in (0, 0.5, 1))
+    least, median, most = (round(float(np.quantile(seen, part))) for part in (0, 0.5, 1))
     counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"
     width, sidelobe_db = response()
     report = {
@@ -151,9 +145,23 @@ def _described(
             f"places are seen under {under:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the track "
             "turns, or passes them more than once"
         )
-    value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(scale * float(total.max())))
-    summed = scale * float(seen.mean()) / len(aperture)
+    value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
+    summed = float(seen.mean()) / len(aperture)
     return Integration(sector, count, value, f"{why}; {counted}", summed, report, flags)
+
+
+def _counted(
+    sector: Sector, aperture: Aperture, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the sum of the weights at each point, and how many pulses have one; of many, spread ones stand in."""
+    every = slice(None, None, -(-len(aperture) // _COUNTED))
+    few, some = aperture[every], sector[every]
+    total, seen = np.zeros((2, len(points)))
+    for first in range(0, len(few), _PULSES):
+        weight = some[first : first + _PULSES].weight(few[first : first + _PULSES], points)
+        total, seen = total + weight.sum(axis=0), seen + (weight > 0).sum(axis=0)
+    scale = len(aperture) / len(few)
+    return scale * total, scale * seen
 
 
 def _seen_under(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
