@@ -55,5 +55,7 @@ def test_the_picture_is_the_same_to_the_byte_and_shows_what_is_there(tmp_path):
     for name in ("one.png", "two.png"):
         write_coverage(tmp_path / name, several, TRANSFORM, crs_name="UTM", title="campaign · coverage", tags=tags)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    write_coverage(tmp_path / "less.png", several[2:], TRANSFORM, crs_name="UTM", title="campaign · coverage", tags=tags)
+    write_coverage(
+        tmp_path / "less.png", several[2:], TRANSFORM, crs_name="UTM", title="campaign · coverage", tags=tags
+    )
     assert (tmp_path / "less.png").read_bytes() != (tmp_path / "one.png").read_bytes()

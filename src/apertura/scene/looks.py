@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,15 +165,25 @@ class Looks:
                 seen[left] = (self.beams[some].weight(self.aperture[some], points[left]) != 0).any(axis=0)
         return seen
 
+    @cached_property
+    def _lit(self) -> NDArray[np.float32]:
+        return (self.total > 0).astype(np.float32)
+
+    def _sums(self, tile: Window) -> list[Floats]:
+        """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
+        lit = self.lattice.between(self._lit, tile)
+        lit[lit == 0] = np.inf
+        return [self.lattice.between(values, tile) / lit for values in (self.total, self.squares)]
+
     def effective(self, tile: Window) -> NDArray[np.float32]:
         """Return the looks of the pixels of a tile, (row, column) float32; 0 where none makes them."""
-        total, squares = (self.lattice.between(values, tile) for values in (self.total, self.squares))
+        total, squares = self._sums(tile)
         looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
         return np.where(self.seen(tile), looks, 0).astype(np.float32)
 
     def noise_gain(self, tile: Window) -> Floats:
         """Return Σw² at the pixels of a tile, (row, column) float64; NaN where no pulse makes them."""
-        squares = self.lattice.between(self.squares, tile)
+        squares = self._sums(tile)[1]
         return np.where(self.seen(tile) & (squares > 0), squares, np.nan)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
