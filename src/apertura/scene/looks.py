@@ -152,18 +152,7 @@ class Looks:
         for cell, blocks in zip(cells, lit.T, strict=True):
             unseen = ~seen[cell]
             mine = np.flatnonzero(np.repeat(blocks, _AT_ONCE)[: len(self.aperture)])
-            seen[cell][unseen] = self._any(positions[cell][unseen], mine)
-
-    def _any(self, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return at which points (point, 3) any of some pulses, whole blocks of 64, has a weight."""
-        seen = np.zeros(len(points), bool)
-        for every in _EXACT if self.beams is not None else ():
-            for first in range(0, len(pulses), _AT_ONCE * every):
-                some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~seen)
-                if not left.size:
-                    return seen
-                seen[left] = (self.beams[some].weight(self.aperture[some], points[left]) != 0).any(axis=0)
-        return seen
+            seen[cell][unseen] = _any(self.beams, self.aperture, positions[cell][unseen], mine)
 
     @cached_property
     def _lit(self) -> NDArray[np.float32]:
@@ -199,6 +188,18 @@ def _reaching(lit: NDArray[np.bool_], pulses: int) -> slice:
     if not blocks.size:
         return slice(0, pulses)
     return slice(int(blocks[0]) * _AT_ONCE, min(int(blocks[-1] + 1) * _AT_ONCE, pulses))
+
+
+def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return at which points (point, 3) any of some pulses has a weight."""
+    seen = np.zeros(len(points), bool)
+    for every in _EXACT:
+        for first in range(0, len(pulses), _AT_ONCE * every):
+            some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~seen)
+            if not left.size:
+                return seen
+            seen[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)
+    return seen
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
