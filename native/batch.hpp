@@ -39,7 +39,7 @@ struct Batch {
   float weight_h[kBatch];
   // Depth inside the sector, in widths of its edge: integration.md, (4).
   alignas(64) float depth[kBatch][kBlocks], depth_x[kBatch][kBlocks], depth_y[kBatch][kBlocks];
-  float depth_h[kBatch];
+  float depth_h[kBatch], depth_xx[kBatch], depth_xy[kBatch], depth_yy[kBatch];  // second order at the origin
   const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
   int64_t order[kVariants][kBatch];  // the pulses of each variant
   int64_t count[kVariants];
@@ -198,8 +198,9 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
         if constexpr (kVariant == kAtEdge || kVariant == kWeightedAtEdge) {
           // integration.md, (3): the sector's weight at the pixel.
           const int64_t b = group + v / kParts, part = v % kParts * kLanes;
-          Lanes depth =
-              load(kLaneX + part) * batch.depth_x[q][b] + load(kLaneY + part) * batch.depth_y[q][b] + batch.depth[q][b];
+          const Lanes x = load(kLaneX + part), y = load(kLaneY + part);
+          Lanes depth = x * (batch.depth_x[q][b] + x * batch.depth_xx[q] + y * batch.depth_xy[q]) +
+                        y * (batch.depth_y[q][b] + y * batch.depth_yy[q]) + batch.depth[q][b];
           if constexpr (kTerrain) depth += load(patch.rise + b * 16 + part) * batch.depth_h[q];
           depth = within_unit(depth);
           depth *= depth * (3.0f - 2.0f * depth);

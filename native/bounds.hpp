@@ -29,8 +29,8 @@ constexpr float kCurvatureSpan = 4.5f;
 // curve (second difference) by no more than this.
 constexpr float kWeightChange = 0.12f, kWeightCurvature = 0.025f;
 
-// At the edge of a sector the place of a pixel is linear in its block where second-order terms stay below this part of
-// the edge's width.
+// At the edge of a sector the place of a pixel is of second order in its block where what is left stays below this
+// part of the edge's width.
 constexpr float kSectorBend = 2e-3f;
 
 }  // namespace apertura

@@ -35,10 +35,9 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
       const double along = (wx * ax + wy * ay + wz * az) * scale;
       const float inverse = float(1 / distance), length = __builtin_sqrtf(float(ax * ax + ay * ay + az * az));
       out.along[leg][q] = float(along), out.inverse[leg][q] = inverse, out.place[q] += float(along / distance);
-      // A direction turns by asin(reach / R) at most; second-order terms inside a block are below 1.5 / 2 of (delta /
-      // R)^2.
+      // A direction turns by asin(reach / R) at most; beyond the origin's second order a block bends by 3 D d^2 / R^3.
       slack[q] += length * (reach * inverse < 1 ? 1.5708f * reach * inverse : 2);
-      bend[q] += length * 0.75f * inside_block * inverse * inverse;
+      bend[q] += length * 3 * reach * inside_block * inverse * inverse * inverse;
     }
   }
   const float most = apertura::kSectorBend * (outer - inner);
@@ -59,7 +58,7 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
   const float side = places.place[q] < 0 ? 1 : -1, per_width = float(1 / (sector.outer - sector.inner));
   alignas(64) float s[kBlocks], s_x[kBlocks], s_y[kBlocks];
   for (int64_t b = 0; b < kBlocks; b++) s[b] = float(-sector.centre), s_x[b] = s_y[b] = 0;
-  float s_h = 0;
+  float s_h = 0, s_xx = 0, s_xy = 0, s_yy = 0;
   for (int64_t leg = 0; leg < 2; leg++) {
     const double* axis = sector.axis[leg] + pulse + q;
     const auto along_axis = [&](const double* v) {
@@ -80,6 +79,10 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
       s_y[b] += (a_y - cosine * (w.y[q] * range + patch.dot_y[b]) * per_range) * per_range;
     }
     s_h += (a_h - along * inverse * up) * inverse;
+    const float squared = inverse * inverse, cosine = along * inverse, x = w.x[q], y = w.y[q];
+    s_xx += squared * (cosine * (3 * x * x - patch.xx) - 2 * a_x * x) * 0.5f;
+    s_xy += squared * (cosine * (3 * x * y - patch.xy) - a_x * y - a_y * x);
+    s_yy += squared * (cosine * (3 * y * y - patch.yy) - 2 * a_y * y) * 0.5f;
   }
   for (int64_t b = 0; b < kBlocks; b++) {
     batch.depth[q][b] = (float(sector.outer) + side * s[b]) * per_width;
@@ -87,6 +90,8 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
     batch.depth_y[q][b] = side * s_y[b] * per_width;
   }
   batch.depth_h[q] = side * s_h * per_width;
+  batch.depth_xx[q] = side * s_xx * per_width, batch.depth_xy[q] = side * s_xy * per_width;
+  batch.depth_yy[q] = side * s_yy * per_width;
 }
 
 // (3): the weight of one pulse at each pixel of a patch, times what `weight` holds.
