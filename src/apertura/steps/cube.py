@@ -18,6 +18,8 @@ from apertura.scene.grid import SceneGrid
 from apertura.steps.stamping import stamped
 from apertura.store import create, finish, open_array, open_stage, writing
 
+_SUMS = ("coherent", "noncoherent", "magnitude")
+
 
 def cube(campaign: Campaign) -> Path:
     """Write results/cube.zarr: image (flight, pair, y, x) and the coherent and non-coherent sums of each flight.
@@ -41,9 +43,7 @@ def cube(campaign: Campaign) -> Path:
             _empty(images, fusion, pairs), "cube", modules=[__name__], parents=images, settings={"fusion": fusion}
         )
         empty.attrs |= _between_flights(references, settled_scene(campaign).grid)
-        chunks = {"image": (1, 1, side, side)} | dict.fromkeys(
-            ("coherent", "noncoherent", "magnitude"), (1, side, side)
-        )
+        chunks = {"image": (1, 1, side, side), **dict.fromkeys(_SUMS, (1, side, side))}
         create(wip, empty, chunks)
         arrays = {name: open_array(wip, name) for name in chunks}
         for place, flight in enumerate(flights):
