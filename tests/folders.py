@@ -30,7 +30,7 @@ from apertura.simulation import (
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.steps import assess, cube, echo, export, image, ingest, layers, profile, scene, terrain
+from apertura.steps import assess, coverage, cube, echo, export, image, ingest, layers, profile, scene, terrain
 from apertura.store import open_stage
 
 ROOT = Path(__file__).parents[1]
@@ -81,11 +81,12 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
         assess.assess(campaign, flight.name)
     cube.cube(campaign)
     if exports:
-        layers.layers(campaign, threads=2)
         for flight in campaign.image_flights:
             for pair in flight.pairs:
+                layers.layers(campaign, flight.name, pair, threads=2)
                 export.export(campaign, flight.name, pair)
             export.export_fused(campaign, flight.name)
+        coverage.coverage(campaign)
     return campaign
 
 

@@ -18,7 +18,7 @@ from apertura.errors import CampaignError, ContractError
 from apertura.export import exports_in
 from apertura.export.cog import write_power, write_slc
 from apertura.export.db import write_db
-from apertura.export.layers import LAYOVER, SHADOW, UNKNOWN, write_mask
+from apertura.export.layers import LAYOVER, OUTSIDE, SHADOW, write_mask
 from apertura.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.export.quicklook import below_peak, shrink, write_quicklook
 from apertura.export.writing import READ
@@ -257,14 +257,14 @@ def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
     angle = np.full((600, 600), 30, np.float32)
     angle[:10] = np.nan
     bits = np.full((600, 600), SHADOW, np.uint8)
-    bits[300:, :300], bits[300:, 300:], bits[:10] = LAYOVER, SHADOW | LAYOVER, UNKNOWN
+    bits[300:, :300], bits[300:, 300:], bits[:10] = LAYOVER, SHADOW | LAYOVER, OUTSIDE
     for name, write in LAYERS.items():
         layer = bits if name == "mask.tif" else angle
         write(tmp_path / name, layer, **UTM, tags=TAGS)
         with rasterio.open(tmp_path / name) as raster:
             assert np.array_equal(raster.read(1), layer, equal_nan=name != "mask.tif")
             assert np.array_equal(raster.dataset_mask() == 0, np.arange(600)[:, None] + np.zeros(600) < 10)
-            assert raster.units == (("bits",) if name == "mask.tif" else ("deg",))
+            assert raster.units == ({"mask.tif": "bits", "looks.tif": "pulses", "nesz.tif": "dB"}.get(name, "deg"),)
         assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
 
 

@@ -68,7 +68,7 @@ def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
     assert len(list(check_links(Inspected(campaign)))) == 1
 
 
-@pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "layers/mask.tif"])
+@pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "f01/uav1-uav1/mask.tif"])
 def test_a_link_anywhere_below_the_results_is_named(tiny, tmp_path, name):
     path = tiny / "results" / name
     path.parent.mkdir(parents=True)

@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 17 + 2
+    assert len(results) == 19 + 2
     for name, result in results:
         if name in {"speed_accuracy", "whole"}:  # made when they are asked for
             continue
@@ -149,7 +149,7 @@ def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
     monkeypatch.setattr(stale, "code_of", lambda result: "0" if result == "profile" else known(result))
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
-    assert not {"raw", "track", "echo", "scene", "layers"} & names(found)
+    assert not {"raw", "track", "echo", "scene"} & names(found)
 
 
 def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finished):
@@ -167,7 +167,8 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
         ("f01/uav1-uav1/db.tif", "f01/uav1-uav1/export"),
         ("f01/fused/quicklook.png", "f01/fused/export"),
         ("f01/fused/image.json", "f01/fused/export"),
-        ("layers/mask.tif", "layers/layers"),
+        ("f01/uav1-uav1/mask.tif", "f01/uav1-uav1/layers"),
+        ("coverage.geojson", "coverage"),
         ("scene.json", "scene"),
         ("f01/assessment.json", "f01/assessment"),
         ("cube.zarr/zarr.json", "cube"),
@@ -181,7 +182,9 @@ def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
     assert list(damaged_results(Campaign.load(finished))) == [f"results/{manifest}.manifest.json"]
 
 
-@pytest.mark.parametrize("file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "layers/mask.tif", "scene.json"])
+@pytest.mark.parametrize(
+    "file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "f01/uav1-uav1/mask.tif", "coverage.png", "scene.json"]
+)
 @pytest.mark.parametrize("how", ["edited", "gone"])
 def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, file, how):
     path = finished / "results" / file
@@ -204,7 +207,7 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
     for path in finished.rglob("*.manifest.json"):
         path.unlink()
     campaign = Campaign.load(finished)
-    assert names(stale_results(campaign)) == {"export", "layers"}
+    assert names(stale_results(campaign)) == {"export", "layers", "coverage"}
     with pytest.raises(CampaignError, match=r"export\.manifest\.json: no such file"):
         print_summary(campaign)
 

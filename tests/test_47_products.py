@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
+from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
-from apertura.export import product_files
+from apertura.export import exports_in, product_files
 from apertura.provenance import sha256_file
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": PAIRS}))
-RASTERS = [name for name in PRODUCTS if name.startswith("f01") and name.endswith(".tif")]
+LAYERS = [f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers")]
+RASTERS = [name for name in PRODUCTS if name.endswith(".tif") and name not in LAYERS]
 RECORDED = [
     *(f"raw/f01/uav1.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.csv")),
     *(f"raw/f01/uav2.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.pos")),
@@ -28,13 +30,14 @@ def tags_of(campaign, name):
 
 def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
-    files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in {".tif", ".png"}}
+    opened = {".tif", ".png", ".geojson"}
+    files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in opened}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
-    assert len(RASTERS) == 12
+    assert (len(RASTERS), len(LAYERS)) == (12, 10)
     assert files | reports == set(PRODUCTS)
 
 
-@pytest.mark.parametrize("name", RASTERS)
+@pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
 def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
     path = finished_tiny.results / name
     valid, errors, warnings = cog_validate(str(path), strict=True, quiet=True)
@@ -43,10 +46,11 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
         np.testing.assert_allclose(tuple(raster.bounds), finished_tiny.settings.scene.bounds_m, atol=1e-3)
         assert raster.crs.to_epsg() == 32632
         assert raster.transform.a == -raster.transform.e == 0.1
-        assert raster.dtypes[0] == ("complex64" if name.endswith("slc.tif") else "float32")
+        kinds = {"slc.tif": "complex64", "coherent_slc.tif": "complex64", "mask.tif": "uint8"}
+        assert raster.dtypes[0] == kinds.get(path.name, "float32")
 
 
-@pytest.mark.parametrize("name", RASTERS)
+@pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
 def test_a_raster_says_where_it_comes_from(finished_tiny, name):
     tags, pair = tags_of(finished_tiny, name), name.split("/")[1]
     spec = json.loads(tags["APERTURA_RUNSPEC"])
@@ -102,3 +106,27 @@ def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
     assert "UTM zone 32N" in cube.spatial_ref.attrs["crs_wkt"]
     slc = rasterio.open(finished_tiny.results / "f01" / "uav1-uav2" / "slc.tif").read(1)
     np.testing.assert_array_equal(cube.image.values[0, cube.attrs["pairs"].index("uav1-uav2")], slc)
+
+
+def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
+    features = json.loads((finished_tiny.results / "coverage.geojson").read_text())["features"]
+    kinds = [(feature["properties"]["kind"], feature["properties"]["pair"]) for feature in features]
+    assert kinds == [("track", PAIRS[0]), ("footprint", PAIRS[0]), *2 * [("track", PAIRS[1])], ("footprint", PAIRS[1])]
+    xmin, ymin, xmax, ymax = finished_tiny.settings.scene.bounds_m
+    ((ring,),) = features[1]["geometry"]["coordinates"]
+    east, north = Transformer.from_crs("OGC:CRS84", "EPSG:32632", always_xy=True).transform(*np.transpose(ring))
+    assert (east.min(), north.min()) == pytest.approx((xmin, ymin), abs=0.01)
+    assert (east.max(), north.max()) == pytest.approx((xmax, ymax), abs=0.01)
+    echo = xr.open_zarr(finished_tiny.results / "f01" / PAIRS[1] / "echo.zarr", consolidated=False)
+    for track, name in ((features[2], "tx_position"), (features[3], "rx_position")):
+        longitude, latitude, height_m = np.transpose(track["geometry"]["coordinates"])
+        ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(latitude, longitude, height_m)
+        assert np.abs(np.stack(ecef, -1)[0] - echo[name].values[0]).max() < 0.01
+
+
+def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
+    folder = finished_tiny.results / "f01" / "uav1-uav1"
+    db, nesz, looks, mask = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("db", "nesz", "looks", "mask"))
+    assert np.nanmax(nesz) < np.nanpercentile(db, 20)
+    assert len(np.unique(looks)) == 1  # every pulse counts for every pixel
+    assert not mask.any()

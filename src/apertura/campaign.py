@@ -136,9 +136,9 @@ class Campaign:
             if node
         }
         beams = self.antennas(pair) if pair else {}
+        stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
+        antennas = {"antennas": stated} if stated else {}
         segments = [list(segment) for segment in self.segments_of(flight, pair)]
-        antennas = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
-        weighing = {"antennas": antennas} if beams else {}
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
                 "waveform": settings["waveform"],
@@ -151,14 +151,15 @@ class Campaign:
             "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
             "scene": {"scene": settings["scene"]},
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
-            "profile": {name: processing[name] for name in ("window", "integration")} | weighing,
+            "profile": {name: processing[name] for name in ("window", "integration")} | antennas,
             "assess": {"fusion": processing["fusion"]},
             "image": {
                 name: value
                 for name, value in processing.items()
                 if name not in {"window", "sidelink", "false_alarms_per_s", "fusion"}
             }
-            | weighing,
+            | antennas,
+            "layers": {"integration": processing["integration"], **antennas},
         }
         return chosen.get(stage, {})
 

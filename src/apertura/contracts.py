@@ -133,13 +133,20 @@ STAGES: Mapping[str, Stage] = {
         {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest ground"},
     ),
     "image": Stage(
-        {"image": Variable(("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude")},
+        {
+            "image": Variable(
+                ("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude; NaN: not formed"
+            )
+        },
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
     ),
     "cube": Stage(
         {
             "image": Variable(
-                ("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN where a pair did not fly"
+                ("flight", "pair", "y", "x"),
+                "complex64",
+                "1",
+                "every image; NaN where a pair did not fly or a tile is not formed",
             ),
             "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
             "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),

@@ -76,8 +76,8 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     result
         A key of `RESULTS`.
     *where
-        Flight and node (raw, track), flight and pair (echo, profile, image, export), flight (calibration, assessment,
-        fused), nothing (scene, terrain, layers, cube, speed_accuracy, whole).
+        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export), flight (calibration,
+        assessment, fused), nothing (scene, terrain, cube, coverage, speed_accuracy, whole).
     """
     return RESULTS[result](campaign, *where)
 
@@ -99,13 +99,12 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     yield ("scene",)
     if campaign.settings.scene.dem:
         yield ("terrain",)
-    yield ("layers",)
     for flight in campaign.image_flights:
-        for stage in ("profile", "image"):
+        for stage in ("profile", "image", "layers"):
             yield from ((stage, flight.name, pair) for pair in flight.pairs)
         yield "assessment", flight.name
         yield from (("export", flight.name, pair) for pair in flight.pairs)
-    yield ("cube",)
+    yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield from (("speed_accuracy",), ("whole",))
 
@@ -157,11 +156,18 @@ def _terrain(campaign: Campaign) -> Result:
     return Result(campaign.manifest("terrain"), sources, campaign.relevant("terrain"))
 
 
-def _layers(campaign: Campaign) -> Result:
-    first = campaign.image_flights[0]
-    echoes = [campaign.manifest("echo", first.name, pair) for pair in first.pairs]
+def _layers(campaign: Campaign, flight: str, pair: str) -> Result:
+    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
+    patterns = [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
+    settings = {"campaign": campaign.settings.campaign, **campaign.relevant("layers", pair)}
+    return Result(campaign.manifest("layers", flight, pair), (*stages, *_ground(campaign), *patterns), settings)
+
+
+def _coverage(campaign: Campaign) -> Result:
+    pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
+    made = [campaign.manifest(stage, *pair) for pair in pairs for stage in ("echo", "layers")]
     settings = {"campaign": campaign.settings.campaign}
-    return Result(campaign.manifest("layers", "layers"), (*echoes, *_ground(campaign)), settings)
+    return Result(campaign.manifest("coverage"), (*made, campaign.manifest("scene")), settings)
 
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
@@ -243,6 +249,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "scene": _scene,
     "terrain": _terrain,
     "layers": _layers,
+    "coverage": _coverage,
     "profile": _profile,
     "image": _image,
     "assessment": _assessment,

@@ -98,13 +98,14 @@ _IMAGE = Demand(
 )
 
 DEMANDS: Mapping[str, Demand] = {
-    "ingest": Demand(500, pulse_bytes=500, recorded_s=60),
-    "echo": Demand(800, pulse_bytes=1000, recorded_s=120),
+    "ingest": Demand(250, pulse_bytes=100, recorded_s=60),
+    "echo": Demand(400, pulse_bytes=400, recorded_s=120),
     "calibrate": Demand(500, pulse_bytes=1000, recorded_s=60),
     "scene": Demand(400, pulse_bytes=500),
     "terrain": Demand(500, pixel_bytes=50, pixel_s=10),
-    "layers": Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
-    "profile": Demand(800, pulse_bytes=500, recorded_s=120),
+    "layers": Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
+    "coverage": Demand(600, pulse_bytes=500, pixel_s=1),
+    "profile": Demand(500, pulse_bytes=500, recorded_s=120),
     "tiles": _IMAGE,
     "image": _IMAGE,
     "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),

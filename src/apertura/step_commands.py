@@ -59,9 +59,15 @@ def terrain(campaign: Directory = HERE) -> None:
 
 
 @app.command()
-def layers(campaign: Directory = HERE, threads: Threads = 1) -> None:
-    """Write incidence, bistatic angle and the mask of shadow and layover as GeoTIFFs."""
-    _run("apertura.steps.layers:layers", campaign, threads=threads)
+def layers(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+    """Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs."""
+    _run("apertura.steps.layers:layers", campaign, flight, pair, threads=threads)
+
+
+@app.command()
+def coverage(campaign: Directory = HERE) -> None:
+    """Draw what every flight and pair covers, coverage.png and coverage.geojson."""
+    _run("apertura.steps.coverage:coverage", campaign)
 
 
 @app.command()

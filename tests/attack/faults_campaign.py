@@ -31,10 +31,12 @@ STEPS = (
     "image f01 uav1-uav2",
     "assess f01",
     "cube",
-    "layers",
+    "layers f01 uav1-uav1",
+    "layers f01 uav1-uav2",
     "export f01 uav1-uav1",
     "export f01 uav1-uav2",
     "export f01 fused",
+    "coverage",
 )
 """Every command of a run in its order."""
 
@@ -49,9 +51,10 @@ TARGETS = (
     "image f01 uav1-uav2",
     "assess f01",
     "cube",
-    "layers",
+    "layers f01 uav1-uav2",
     "export f01 uav1-uav2",
     "export f01 fused",
+    "coverage",
 )
 """One command of every kind."""
 

@@ -69,3 +69,29 @@ rule export_fused:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:
         "apertura step export {wildcards.flight} fused > {log} 2>&1"
+
+
+rule coverage:
+    input:
+        lambda wildcards: result_of(campaign, "coverage").sources,
+    output:
+        report("results/coverage.png", caption="../report/coverage.rst", category="campaign"),
+        "results/coverage.geojson",
+        "results/coverage.manifest.json",
+    log:
+        "results/logs/coverage.log",
+    benchmark:
+        "results/benchmarks/coverage.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["coverage"].threads
+    resources:
+        mem_mb=asked["coverage"].mem_mb,
+        runtime=asked["coverage"].runtime,
+    params:
+        settings=campaign.settings.campaign,
+        code=code_of("coverage"),
+    message:
+        "drawing what the flights cover"
+    shell:
+        "apertura step coverage > {log} 2>&1"

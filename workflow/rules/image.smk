@@ -54,14 +54,14 @@ rule terrain:
 
 rule layers:
     input:
-        lambda wildcards: result_of(campaign, "layers").sources,
+        lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).sources,
     output:
-        [f"results/layers/{export.file}" for export in exports_in("layers")],
-        "results/layers/layers.manifest.json",
+        [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("layers")],
+        "results/{flight}/{pair}/layers.manifest.json",
     log:
-        "results/logs/layers.log",
+        "results/logs/{flight}/{pair}.layers.log",
     benchmark:
-        "results/benchmarks/layers.tsv"
+        "results/benchmarks/{flight}/{pair}.layers.tsv"
     conda:
         "../../environment.yml"
     threads: asked["layers"].threads
@@ -69,11 +69,12 @@ rule layers:
         mem_mb=asked["layers"].mem_mb,
         runtime=asked["layers"].runtime,
     params:
+        settings=lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).settings,
         code=code_of("layers"),
     message:
-        "drawing how the scene is seen"
+        "{wildcards.flight}: how {wildcards.pair} sees the scene"
     shell:
-        "apertura step layers --threads {threads} > {log} 2>&1"
+        "apertura step layers {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
 
 rule tiles:

@@ -62,7 +62,7 @@ class Beam:
             if not (step > 0 and np.allclose(np.diff(angle), step, rtol=1e-6, atol=1e-9) and np.isfinite(gain).all()):
                 raise ValueError(f"{name}: angles must grow in equal steps, gains be finite")
 
-    def __getitem__(self, pulses: slice) -> "Beam":
+    def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
         """Return the beam over some pulses."""
         return replace(self, axes=self.axes[pulses])
 
@@ -135,7 +135,7 @@ class Beams:
     receive: Beam | None = None
     sector: Sector | None = None
 
-    def __getitem__(self, pulses: slice) -> "Beams":
+    def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beams":
         """Return the beams over some pulses."""
         transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
         return Beams(transmit, receive, self.sector and self.sector[pulses])

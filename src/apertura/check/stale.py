@@ -12,6 +12,7 @@ from apertura.atomic import date
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
+from apertura.export import COVERAGE, exports_in
 from apertura.lineage import Result, results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
@@ -41,7 +42,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     for name, result in results_of(campaign):
         path = campaign.root / result.manifest
         if not path.is_file():
-            if name in _PRODUCTS and any(path.parent.glob("*.tif")):
+            if any((path.parent / file).is_file() for file in _PRODUCTS.get(name, ())):
                 stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
             continue
         try:
@@ -134,7 +135,14 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
     return damaged
 
 
-_PRODUCTS = frozenset({"export", "fused", "layers"})
+_PRODUCTS = {
+    "coverage": COVERAGE,
+    **{
+        name: tuple(row.file for row in exports_in(kind))
+        for name, kind in {"export": "pair", "fused": "fused", "layers": "layers"}.items()
+    },
+}
+"""Result → the files that people open."""
 
 
 def _reasons(root: Path, code: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:

@@ -21,12 +21,14 @@ SOURCES: Mapping[str, str] = {
     "incidence": "layers",
     "bistatic_angle": "layers",
     "mask": "layers",
+    "looks": "layers",
+    "nesz": "layers",
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers of the scene's
-geometry, real.
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers that explain a
+pair's image, real; they lie beside it.
 """
 
 
@@ -37,7 +39,7 @@ class Export:
     Attributes
     ----------
     file
-        Its name in the folder of the pair, of the fused images, or of the layers.
+        Its name in the folder of the pair or of the fused images.
     source
         A key of `SOURCES`.
     function
@@ -79,18 +81,23 @@ EXPORTS: tuple[Export, ...] = (
     Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
     Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
     Export("mask.tif", "mask", "apertura.export.layers:write_mask"),
+    Export("looks.tif", "looks", "apertura.export.layers:write_looks"),
+    Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
-"""Every product, in the order in which they are written."""
+"""Every product of a pair or of a flight's sums, in the order in which they are written."""
+
+COVERAGE = ("coverage.png", "coverage.geojson")
+"""What shows the whole campaign."""
 
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows whose files lie in a kind of folder: ``pair``, ``fused`` or ``layers``.
+    """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
 
     Examples
     --------
     >>> [export.file for export in exports_in("layers")]
-    ['incidence.tif', 'bistatic_angle.tif', 'mask.tif']
+    ['incidence.tif', 'bistatic_angle.tif', 'mask.tif', 'looks.tif', 'nesz.tif']
     """
     return (export for export in EXPORTS if SOURCES[export.source] == folder)
 
@@ -116,13 +123,14 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
     Examples
     --------
-    >>> list(product_files({"f01": ["a-b"]}))[2:5]
-    ['layers/mask.tif', 'f01/a-b/slc.tif', 'f01/a-b/power.tif']
+    >>> list(product_files({"f01": ["a-b"]}))[1:4]
+    ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/db.tif']
     """
-    yield from (f"layers/{export.file}" for export in exports_in("layers"))
+    yield from COVERAGE
     for flight, names in pairs.items():
-        for folder, kind in (*((name, "pair") for name in names), ("fused", "fused")):
-            yield from (f"{flight}/{folder}/{file}" for file in (*(row.file for row in exports_in(kind)), "image.json"))
+        for folder, kinds in (*((name, ("pair", "layers")) for name in names), ("fused", ("fused",))):
+            files = [row.file for kind in kinds for row in exports_in(kind)]
+            yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
 
 
 def write_exports(

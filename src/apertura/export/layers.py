@@ -1,4 +1,4 @@
-"""Layers of the scene's geometry that explain an image: angles of view, and where it saw nothing or too much."""
+"""Layers that explain an image: angles of view, where it saw nothing or too much, and how many pulses made it."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,18 +9,20 @@ from rasterio import Affine
 from apertura.errors import ContractError
 from apertura.export.cog import Band, Pixels, Raster, write_cog
 
-SHADOW, LAYOVER, UNKNOWN = 1, 2, 255
-"""Bits of the mask, and its value where there is no terrain to decide from; 0 is seen once and plainly."""
+SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
+"""Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
 
-INCIDENCE = Band("float32", np.nan, "deg", "incidence angle from the normal of the terrain", "AVERAGE")
-BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle at the pixel between transmitter and receiver", "AVERAGE")
-MASK = Band("uint8", UNKNOWN, "bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 unknown", "MODE")
+INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
+BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")
+MASK = Band("uint8", OUTSIDE, "bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside", "MODE")
+LOOKS = Band("float32", np.nan, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
+NESZ = Band("float32", np.nan, "dB", "noise in the pixel, in units of db.tif: relative, no sigma0", "AVERAGE")
 
 
 def write_incidence(
     path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the incidence angle, (y, x) float32 degrees, NaN where unknown. Else as `apertura.export.cog.write_slc`."""
+    """Write the incidence angle, (y, x) float32 degrees, NaN outside. Else as `apertura.export.cog.write_slc`."""
     check = _only("float32")
     write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
@@ -28,7 +30,7 @@ def write_incidence(
 def write_bistatic_angle(
     path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the bistatic angle, (y, x) float32 degrees, NaN where unknown. Else as `apertura.export.cog.write_slc`."""
+    """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Else as `apertura.export.cog.write_slc`."""
     check = _only("float32")
     write_cog(path, angle_deg, BISTATIC_ANGLE, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
@@ -36,7 +38,7 @@ def write_bistatic_angle(
 def write_mask(
     path: Path, bits: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write where the image is in shadow or layover, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `UNKNOWN`.
+    """Write where the image is in shadow or layover, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
 
     Overviews take the commonest value, so that bits never mix. Else as `apertura.export.cog.write_slc`.
 
@@ -49,10 +51,24 @@ def write_mask(
     ...     write_mask(path, np.ones((2, 3), "u1"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
     ...     with rasterio.open(path) as raster:
     ...         raster.descriptions[0], raster.read(1)[0, 0].item()
-    ('0 seen, 1 shadow, 2 layover, 3 both, 255 unknown', 1)
+    ('0 seen, 1 shadow, 2 layover, 3 both, 255 outside', 1)
     """
     check = _only("uint8")
     write_cog(path, bits, MASK, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_looks(
+    path: Path, looks: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write how many pulses make a pixel, (y, x) float32, 0 outside. Else as `apertura.export.cog.write_slc`."""
+    write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
+
+
+def write_nesz(
+    path: Path, noise_db: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the noise in a pixel, (y, x) float32 dB in units of db.tif, NaN outside. Else as `write_looks`."""
+    write_cog(path, noise_db, NESZ, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 
 def _only(dtype: str) -> Callable[[Pixels], Pixels]:

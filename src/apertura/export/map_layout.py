@@ -1,7 +1,7 @@
 """The layout of a quicklook: metric axes, scale bar, north arrow, colour bar and words around a picture."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import ceil, floor, log10
 from textwrap import wrap
@@ -9,6 +9,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Polygon, Rectangle
@@ -37,26 +38,38 @@ class MapLayout:
         West, south, east, north of the scene, metres.
     inch_per_m
         Scale of the picture.
+    left
+        Margin left of it.
     """
 
     figure: Figure
     axes: Axes
     bounds: tuple[float, float, float, float]
     inch_per_m: float
+    left: float = LEFT
 
     @classmethod
-    def for_bounds(cls, bounds: tuple[float, float, float, float]) -> "MapLayout":
-        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`."""
+    def for_bounds(cls, bounds: tuple[float, float, float, float], *, maps: int = 1) -> "MapLayout":
+        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`, with room for `maps`."""
         west, south, east, north = bounds
         scale = LONGER_SIDE / max(east - west, north - south)
         wide, high = (east - west) * scale, (north - south) * scale
-        width = LEFT + max(wide, LEAST_WIDTH) + RIGHT
+        width = maps * (LEFT + max(wide, LEAST_WIDTH) + RIGHT)
         height = BOTTOM + max(high, LEAST_HEIGHT) + TOP
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         bottom = height - TOP - high
         axes = figure.add_axes((LEFT / width, bottom / height, wide / width, high / height))
         return cls(figure, axes, bounds, scale)
+
+    def beside(self) -> "MapLayout":
+        """Return the layout of the next map of the same place, right of this one."""
+        place = self.axes.get_position()
+        wide = (self.bounds[2] - self.bounds[0]) * self.inch_per_m
+        left = self.left + max(wide, LEAST_WIDTH) + RIGHT + LEFT
+        width = self.figure.get_size_inches()[0]
+        axes = self.figure.add_axes((left / width, place.y0, place.width, place.height))
+        return replace(self, axes=axes, left=left)
 
     def draw_frame(self, crs_name: str) -> None:
         """Label the axes in metres from a round number, so that UTM coordinates stay readable."""
@@ -74,15 +87,15 @@ class MapLayout:
             axis.set_label_text(f"{name}{separator}− {_number(origin)}, m" if origin else f"{name}, m")
         self._write(LEFT, 0.58, crs_name, size=8)
 
-    def draw_colour_bar(self, picture: AxesImage, label: str) -> None:
-        """Draw the colour bar at the right of the picture."""
+    def draw_colour_bar(self, picture: AxesImage, label: str, *, beyond: str = "both") -> Colorbar:
+        """Draw the colour bar at the right of the picture; values lie `beyond` 'both' ends, 'min' or 'neither'."""
         width, height = self.figure.get_size_inches()
         wide, high = ((self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1))
         high = max(high, LEAST_HEIGHT)
-        place = ((LEFT + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
-        beyond = "both" if picture.norm.vmax else "min"  # 0 dB is the peak: nothing lies above it
+        place = ((self.left + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
         bar = self.figure.colorbar(picture, cax=self.figure.add_axes(place), extend=beyond)
         bar.set_label(label)
+        return bar
 
     def draw_scale_and_north(self) -> None:
         """Draw a bar of a round length and an arrow to grid north below the picture, where they hide nothing."""

@@ -86,7 +86,8 @@ def write_quicklook(
         )
         layout.draw_frame(_crs_name(crs))
         averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
-        layout.draw_colour_bar(picture, f"power re peak, dB{averaged}")
+        beyond = "both" if top_db else "min"  # 0 dB is the peak: nothing lies above it
+        layout.draw_colour_bar(picture, f"power re peak, dB{averaged}", beyond=beyond)
         layout.draw_scale_and_north()
         layout.draw_markers(markers)
         if not np.isfinite(decibel).any():

@@ -1,6 +1,7 @@
 """Rule `cube`: every image of the campaign on one grid, and each flight's pairs added up."""
 
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,14 @@ from apertura.scene.grid import SceneGrid
 from apertura.steps.stamping import stamped
 from apertura.store import create, finish, open_array, open_stage, writing
 
+_SUMS = ("coherent", "noncoherent", "magnitude")
+
 
 def cube(campaign: Campaign) -> Path:
-    """Write results/cube.zarr: image (flight, pair, y, x) and the coherent and non-coherent sums of each flight."""
+    """Write results/cube.zarr: image (flight, pair, y, x) and the coherent and non-coherent sums of each flight.
+
+    Tile by tile; a tile that no pulse of a pair sees is not stored and reads as NaN, as in its image.
+    """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root, [__name__])
     pairs = sorted({pair for flight in flights for pair in flight.pairs})
     images = {
@@ -37,9 +43,7 @@ def cube(campaign: Campaign) -> Path:
             _empty(images, fusion, pairs), "cube", modules=[__name__], parents=images, settings={"fusion": fusion}
         )
         empty.attrs |= _between_flights(references, settled_scene(campaign).grid)
-        chunks = {"image": (1, 1, side, side)} | dict.fromkeys(
-            ("coherent", "noncoherent", "magnitude"), (1, side, side)
-        )
+        chunks = {"image": (1, 1, side, side), **dict.fromkeys(_SUMS, (1, side, side))}
         create(wip, empty, chunks)
         arrays = {name: open_array(wip, name) for name in chunks}
         for place, flight in enumerate(flights):
@@ -50,11 +54,15 @@ def cube(campaign: Campaign) -> Path:
             turned = np.array([phases_rad[pair] for pair in flight.pairs if pair in phases_rad])
             for window in windows:
                 stack = np.stack([image.image[window].values for image in present])
-                for pair, block in zip(flight.pairs, stack, strict=True):
+                there = ~np.isnan(stack).all(axis=(1, 2))
+                for pair, block in zip(compress(flight.pairs, there), stack[there], strict=True):
                     arrays["image"][place, pairs.index(pair), *window] = block
-                arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
-                arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
-                arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
+                stack[~there] = 0  # what a pair does not see it adds nothing to
+                if there[added].any():
+                    arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
+                if there.any():
+                    arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
+                    arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
         finish(wip, folder, lineage=lineage)
     return folder
 
@@ -80,13 +88,13 @@ def _empty(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any], pairs: S
     first = next(iter(images.values()))
     shape = first.image.shape
     flights = list(fusion)
-    missing = np.complex64(np.nan + 1j * np.nan)
+    missing, nothing = np.complex64(np.nan + 1j * np.nan), np.float32(np.nan)
     return xr.Dataset(
         {
             "image": (("flight", "pair", "y", "x"), np.broadcast_to(missing, (len(flights), len(pairs), *shape))),
-            "coherent": (("flight", "y", "x"), np.broadcast_to(np.complex64(0), (len(flights), *shape))),
-            "noncoherent": (("flight", "y", "x"), np.broadcast_to(np.float32(0), (len(flights), *shape))),
-            "magnitude": (("flight", "y", "x"), np.broadcast_to(np.float32(0), (len(flights), *shape))),
+            "coherent": (("flight", "y", "x"), np.broadcast_to(missing, (len(flights), *shape))),
+            "noncoherent": (("flight", "y", "x"), np.broadcast_to(nothing, (len(flights), *shape))),
+            "magnitude": (("flight", "y", "x"), np.broadcast_to(nothing, (len(flights), *shape))),
         },
         coords={"y": first.y, "x": first.x, "spatial_ref": first.spatial_ref},
         attrs={"flights": flights, "pairs": pairs, "fusion": fusion},

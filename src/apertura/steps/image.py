@@ -30,6 +30,9 @@ from apertura.steps.stamping import stamped
 from apertura.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
 
 _MODULES = [__name__, *ENGINES.values()]
+_MISSING = np.complex64(complex(np.nan, np.nan))
+"""What a tile that no pulse sees reads as; it is not stored."""
+
 _QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
 
 
@@ -154,7 +157,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(
         xr.Dataset(
-            {"image": (("y", "x"), np.broadcast_to(np.complex64(0), scene.grid.shape))},
+            {"image": (("y", "x"), np.broadcast_to(_MISSING, scene.grid.shape))},
             coords=scene.grid.coordinates,
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),

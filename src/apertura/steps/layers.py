@@ -1,57 +1,61 @@
-"""Rule `layers`: incidence, bistatic angle, and the mask of shadow and layover, as GeoTIFFs on the campaign's grid.
+"""Rule `layers`: how a pair sees the scene, as GeoTIFFs on the campaign's grid: angles, mask, looks and noise."""
 
-One layer stands for the campaign: that of the first image flight. Its pairs share the transmitter, whose incidence it
-is; the bistatic angle is the largest of the pairs'; the mask marks what any pair sees in shadow or layover, because
-their sum lacks it too.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.contracts import Window
 from apertura.export import export_modules, write_exports
+from apertura.export.layers import OUTSIDE
+from apertura.focus.inputs import Profiles
+from apertura.imaging.job import settle
+from apertura.imaging.noise import PLACES, noise_power
+from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
+from apertura.load.antennas import beams_of, body_axes
 from apertura.load.scene import OpenScene, open_scene
-from apertura.provenance import Provenance
+from apertura.provenance import Provenance, sha256_file
 from apertura.scene.grid import SceneGrid
+from apertura.scene.lattice import BLOCK_PX
+from apertura.scene.looks import Looks
 from apertura.scene.terrain import FlatGround, Terrain
 from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.store import open_stage, record_files
 
-MASK_PULSES = 17
-"""Pulses, evenly spread over the aperture, from which shadow is decided."""
 
-_TILE_PX = 256
-
-
-def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
-    """Write the products of results/layers: incidence, bistatic angle and mask; return their paths."""
+def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
+    """Write incidence, bistatic angle, mask, looks and noise of one pair; return their paths."""
     modules = [__name__, *export_modules("layers")]
-    lineage = result_of(campaign, "layers").begin(campaign.root, modules)
-    scene, flight = open_scene(campaign), campaign.image_flights[0]
-    echoes = {pair: open_stage(campaign.stage("echo", flight.name, pair), "echo") for pair in flight.pairs}
-    rasters = _rasters(scene, [_track(echo) for echo in echoes.values()], threads=threads)
+    lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root, modules)
+    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
+    antennas, asked = beams_of(campaign, pair, body_axes(echo)), campaign.settings.processing.integrated
+    aperture, centre_hz = profiles.aperture, profiles.centre_frequency_hz
+    settled = settle(aperture, centre_hz, scene.grid, scene.level, antennas=antennas, asked=asked)
+    beams = Beams.within(settled.sector, antennas)
+    looks = Looks.of(scene.grid, scene.terrain, aperture, beams, threads=threads)
+    noise = _noise(profiles, scene, beams)
     origin = Provenance.of(
         modules,
-        {**echoes, **dict(zip(["terrain"], scene.parents, strict=False))},
-        settings=scene.spec,
-        inputs=scene.inputs,
+        [echo, profile, *scene.parents],
+        settings={**campaign.relevant("layers", pair), **scene.spec},
+        inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()} | scene.inputs,
     )
+    rasters = _rasters(scene, looks, noise / settled.count**2, threads=threads)
     written = write_exports(
         "layers",
-        campaign.result("layers"),
+        campaign.result(flight, pair),
         rasters,
-        titles={name: f"{campaign.settings.campaign} · flight {flight.name} · {name}" for name in rasters},
-        tags=origin.tags(),
+        titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
+        tags=origin.tags() | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )
@@ -59,19 +63,10 @@ def layers(campaign: Campaign, *, threads: int = 1) -> list[Path]:
     return written
 
 
-@dataclass(frozen=True)
-class Track:
-    """Phase centres of a pair: at mid-aperture (3,), and at the pulses of the mask, 2 × (pulse, 3), metres."""
-
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    spread: tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def _track(echo: xr.Dataset) -> Track:
-    tx, rx = echo.tx_position.values, echo.rx_position.values
-    some = np.unique(np.linspace(0, len(tx) - 1, MASK_PULSES).round().astype(int))
-    return Track(tx[len(tx) // 2], rx[len(rx) // 2], (tx[some], rx[some]))
+def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
+    """Return the noise of one pulse, measured at random places of the scene."""
+    rows, columns = np.random.default_rng(0).integers(0, scene.grid.shape, (PLACES, 2)).T
+    return noise_power(profiles, scene.terrain.positions_at(scene.grid, rows, columns), beams=beams)
 
 
 @dataclass(frozen=True)
@@ -110,36 +105,56 @@ class Layer:
             values[tile] = self.of((rows, columns))
 
         with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, part.tiles(_TILE_PX)))
+            list(pool.map(work, part.tiles(BLOCK_PX)))
         return values
 
 
-def _rasters(scene: OpenScene, tracks: Sequence[Track], *, threads: int) -> dict[str, Layer]:
+def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, Layer]:
+    """Return the layers; `noise` is what a pixel holds of it per Σw²."""
     grid, terrain = scene.grid, scene.terrain
-    mask = _flat_mask(grid) if isinstance(terrain, FlatGround) else _mask(scene, tracks)
 
     def incidence(window: Window) -> NDArray[np.float64]:
-        return incidence_deg(*_surface(grid, terrain, window), tracks[0].tx)
+        return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
 
     def bistatic_angle(window: Window) -> NDArray[np.float64]:
-        position = terrain.positions(grid[window])
-        return np.asarray(np.max([bistatic_angle_deg(position, track.tx, track.rx) for track in tracks], axis=0))
+        angle_deg = bistatic_angle_deg(terrain.positions(grid[window]), *looks.centre(window))
+        return _inside(looks, window, angle_deg)
+
+    def nesz(window: Window) -> NDArray[np.float64]:
+        gain = looks.noise_gain(window)
+        return 10 * np.log10(np.where(gain > 0, gain, np.nan) * (noise or np.nan))
 
     return {
         "incidence": Layer(grid, np.float32, incidence, threads),
         "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
-        "mask": Layer(grid, np.uint8, mask, threads),
+        "mask": Layer(grid, np.uint8, _mask(scene, looks), threads),
+        "looks": Layer(grid, np.float32, looks.effective, threads),
+        "nesz": Layer(grid, np.float32, nesz, threads),
     }
 
 
-def _flat_mask(grid: SceneGrid) -> Callable[[Window], NDArray[np.uint8]]:
-    return lambda window: np.zeros(grid[window].shape, np.uint8)
+def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(looks.seen(window), values, np.nan)
 
 
-def _mask(scene: OpenScene, tracks: Sequence[Track]) -> Callable[[Window], NDArray[np.uint8]]:
-    relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
-    pairs = [tuple(relief.above(leg) for leg in track.spread) for track in tracks]
-    return lambda window: np.asarray(np.bitwise_or.reduce([visibility(relief, tx, rx, window) for tx, rx in pairs]))
+def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
+    """Return what marks the pixels of a window, each by the pulses that make the lattice's node nearest to it."""
+    level = isinstance(scene.terrain, FlatGround)
+    relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+
+    def mask(window: Window) -> NDArray[np.uint8]:
+        seen = looks.seen(window)
+        marked = np.where(seen, 0, OUTSIDE).astype(np.uint8)
+        if relief is None or not seen.any():
+            return marked
+        for node, part in looks.lattice.nearest(window):
+            here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
+            if seen[here].any():
+                tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
+                marked[here] = np.where(seen[here], visibility(relief, tx, rx, part), OUTSIDE)
+        return marked
+
+    return mask
 
 
 def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,116 @@
+"""Peak memory and seconds of the steps that write products, on a synthetic campaign of any size.
+
+    python -m benchmarks.products export --side 16384          one pair's files
+    python -m benchmarks.products cube --side 8192 --pairs 3   the cube, then the files of the sums
+
+A tiny simulated campaign is run to its images; then its grid is enlarged and its images are replaced by speckle, a
+fifth of whose tiles no pulse sees. Each step runs in a process of its own.
+"""
+
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from apertura.campaign import Campaign
+from apertura.load.scene import settled_scene
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.steps import assess, echo, image, ingest, profile, scene
+from apertura.store import create, finish, open_array, open_stage, save_document, writing
+
+TILE = 256
+LIT = 0.8
+
+
+def prepare(root: Path, side: int, receivers: int) -> Campaign:
+    """Write the campaign: speckle of side × side pixels for each pair."""
+    plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    start = plan.flights[0].tracks["uav2"].start_m
+    third = replace(plan.flights[0].tracks["uav2"], start_m=(start[0] - 3.0, start[1] - 3.6, start[2]))
+    over = replace(plan.flights[0], tracks={**plan.flights[0].tracks, "uav3": third})
+    nodes = {**plan.nodes, "uav3": plan.nodes["uav2"]}
+    campaign = Campaign.load(simulate(root, replace(plan, nodes=nodes, flights=(over,)), seed=7))
+    (flight,) = campaign.image_flights
+    for node in flight.nodes:
+        ingest.ingest(campaign, flight.name, node)
+    for pair in flight.pairs:
+        echo.echo(campaign, flight.name, pair)
+    scene.scene(campaign)
+    for pair in flight.pairs:
+        profile.profile(campaign, flight.name, pair)
+        image.image(campaign, flight.name, pair)
+    assess.assess(campaign, flight.name)
+    settled = json.loads(campaign.result("scene.json").read_text())
+    settled["grid"]["shape"] = [side, side]
+    save_document(campaign.result("scene.json"), settled)
+    for number, pair in enumerate(flight.pairs[:receivers]):
+        enlarge(campaign, flight.name, pair, number)
+    return campaign
+
+
+def enlarge(campaign: Campaign, flight: str, pair: str, seed: int) -> None:
+    """Replace an image by speckle on the enlarged grid."""
+    folder, grid = campaign.stage("image", flight, pair), settled_scene(campaign).grid
+    small = open_stage(folder, "image")
+    missing = np.broadcast_to(np.complex64(complex(np.nan, np.nan)), grid.shape)
+    large = xr.Dataset({"image": (("y", "x"), missing, small.image.attrs)}, coords=grid.coordinates, attrs=small.attrs)
+    rng = np.random.default_rng(seed)
+    peak = small.attrs["quality"]["brightest"]["amplitude"]
+    shutil.rmtree(folder)
+    with writing(folder) as wip:
+        create(wip, large, {"image": (TILE, TILE)})
+        array = open_array(wip, "image")
+        for window in grid.tiles(TILE):
+            if rng.random() < LIT:
+                array[window] = peak * 0.1 * rng.standard_normal((TILE, 2 * TILE), np.float32).view(np.complex64)
+        finish(wip, folder)
+
+
+def measured(root: Path, *step: str) -> None:
+    """Run a step in a process of its own and print what it took."""
+    started = time.perf_counter()
+    subprocess.run([sys.executable, "-m", __spec__.name, "--measure", str(root), *step], check=True)
+    print(f"{' '.join(step)}: {time.perf_counter() - started:.1f} s of wall clock", flush=True)
+
+
+def run_step(root: str, *step: str) -> None:
+    """Run a step here; print its peak memory and seconds of the processor."""
+    from apertura.step_commands import app
+
+    app([*step, "--campaign", root], standalone_mode=False)
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    seconds = used.ru_utime + used.ru_stime
+    print(f"{' '.join(step)}: peak {used.ru_maxrss / 2**20:.2f} GiB, {seconds:.1f} s of the processor", flush=True)
+
+
+def main() -> None:
+    """Prepare a campaign and measure the steps asked for."""
+    if sys.argv[1:2] == ["--measure"]:
+        run_step(*sys.argv[2:])
+        return
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["export", "cube"])
+    parser.add_argument("--side", type=int, default=16384)
+    parser.add_argument("--pairs", type=int, default=2)
+    parser.add_argument("--folder", type=Path, default=Path("/tmp/apertura-products"))
+    asked = parser.parse_args()
+    shutil.rmtree(asked.folder, ignore_errors=True)
+    campaign = prepare(asked.folder, asked.side, 1 if asked.what == "export" else asked.pairs)
+    (flight,) = campaign.image_flights
+    if asked.what == "export":
+        measured(asked.folder, "export", flight.name, flight.pairs[0])
+        return
+    measured(asked.folder, "cube")
+    measured(asked.folder, "export", flight.name, "fused")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Rule `coverage`: what all flights and pairs of a campaign cover, as a picture and for a GIS."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio import Affine
+from rasterio.enums import Resampling
+
+from apertura.atomic import replacement
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.export import COVERAGE
+from apertura.export.coverage import Covered, feature_collection, write_coverage
+from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
+from apertura.imaging.stages import aperture_of
+from apertura.lineage import result_of
+from apertura.load.scene import OpenScene, settled_scene
+from apertura.provenance import Provenance, canonical_json, sha256_file
+from apertura.scene.grid import SceneGrid
+from apertura.scene.raster import opened_raster
+from apertura.store import open_stage, read_manifest, record_files
+
+_DOTS = 480  # of the longer side of the scene
+_VERTICES = 400  # of a track
+
+
+def coverage(campaign: Campaign) -> list[Path]:
+    """Write results/coverage.png and results/coverage.geojson; return their paths."""
+    lineage = result_of(campaign, "coverage").begin(campaign.root, [__name__])
+    scene = settled_scene(campaign)
+    covered = [
+        _covered(campaign, flight.name, pair, scene.grid) for flight in campaign.image_flights for pair in flight.pairs
+    ]
+    step, _, west, _, _, north = scene.grid.transform
+    rows, columns = covered[0].looks.shape
+    down, right = (size * step / dots for size, dots in zip(scene.grid.shape, (rows, columns), strict=True))
+    transform = Affine(right, 0, west, 0, -down, north)
+    picture, features = written = [campaign.result(name) for name in COVERAGE]
+    tags = Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs).tags()
+    title = f"{campaign.settings.campaign} · coverage"
+    write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
+    found = feature_collection(covered, transform, _place(scene), height_m=scene.level.height_m)
+    with replacement(features) as temporary:
+        temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Covered:
+    aperture = aperture_of(open_stage(campaign.stage("echo", flight, pair), "echo"))
+    some = np.unique(np.linspace(0, len(aperture) - 1, _VERTICES).round().astype(int))
+    legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
+    if len(set(pair.split("-"))) == 1:
+        del legs["receiver"]  # the same node: one track
+    tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
+    return Covered(flight, pair, tracks_m, _looks(campaign, flight, pair))
+
+
+def _looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
+    """Return the looks of a pair, averaged to few places; from the overviews of its file."""
+    path = campaign.result(flight, pair, "looks.tif")
+    manifest = campaign.root / campaign.manifest("layers", flight, pair)
+    remedy = f"Delete {manifest} and run the workflow again."
+    if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
+        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
+    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+        fewer = max(1.0, max(raster.shape) / _DOTS)
+        shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
+        looks: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
+    return looks
+
+
+def _place(scene: OpenScene) -> Any:
+    """Return what turns map coordinates into longitude, latitude and height; None in a local frame."""
+    if scene.grid.crs == LOCAL:
+        return None
+
+    def place(at_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        latitude, longitude, height_m = geodetic_from_ecef(frame_from_map(scene.grid.crs, *at_m.T)).T
+        return np.stack([longitude, latitude, height_m], axis=-1)
+
+    return place
+
+
+def _crs_name(grid: SceneGrid) -> str:
+    from pyproj import CRS
+
+    known = CRS.from_user_input(grid.crs_wkt)
+    return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")

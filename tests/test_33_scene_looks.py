@@ -1,0 +1,119 @@
+"""Which pulses make a pixel: looks, the centre of its aperture, and what lies outside."""
+
+import numpy as np
+import pytest
+from scenes import monostatic, straight_track
+
+from apertura.antenna.beam import Beam, Beams
+from apertura.antenna.pattern import gaussian_cut
+from apertura.geometry.aperture import Aperture
+from apertura.geometry.sector import Sector
+from apertura.scene.grid import SceneGrid
+from apertura.scene.lattice import BLOCK_PX
+from apertura.scene.looks import Looks
+from apertura.scene.terrain import FlatGround
+
+GROUND = FlatGround(0.0)
+GRID = SceneGrid("local", -60.0, 70.0, 0.25, (200, 480))
+FLOWN = monostatic(straight_track(6000, length_m=150.0))
+
+
+def sideways(pulses, *, beamwidth_deg=(30.0, 8.0)):
+    """A beam that looks north and 30° down; it ends at -20 dB."""
+    down = np.radians(30)
+    axes = np.array([[0, np.cos(down), -np.sin(down)], [1, 0, 0], [0, np.sin(down), np.cos(down)]])
+    cuts = [gaussian_cut(width, cutoff_db=-20.0, limit_rad=np.pi / 2) for width in beamwidth_deg]
+    return Beam(np.broadcast_to(axes, (pulses, 3, 3)), *cuts[0], *cuts[1])
+
+
+SECTOR = Sector.of(FLOWN, chord_m=2.0, centre=0.0, half=0.2)
+WEIGHED = {
+    "sector": Beams(sector=SECTOR),
+    "beam": Beams(sideways(len(FLOWN)), sideways(len(FLOWN))),
+    "both": Beams(sideways(len(FLOWN)), None, SECTOR),
+    "wide": Beams(sideways(len(FLOWN), beamwidth_deg=(30.0, 60.0)), None, SECTOR),
+}
+
+
+def tiles(looks):
+    return list(looks.grid.tiles(BLOCK_PX))
+
+
+def assembled(looks, of):
+    values = np.empty(looks.grid.shape)
+    for tile in tiles(looks):
+        values[tile] = of(tile)
+    return values
+
+
+def some_pixels(count=400):
+    rows, columns = np.random.default_rng(1).integers(0, GRID.shape, (count, 2)).T
+    return rows, columns, GROUND.positions_at(GRID, rows, columns)
+
+
+def every_weight(beams, points):
+    parts = [slice(first, first + 250) for first in range(0, len(FLOWN), 250)]
+    return np.concatenate([beams[part].weight(FLOWN[part], points) for part in parts])
+
+
+@pytest.mark.parametrize("kind", ["sector", "wide"])
+def test_looks_between_nodes_are_those_of_every_pulse_at_every_pixel(kind):
+    looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)
+    rows, columns, points = some_pixels()
+    weight = every_weight(WEIGHED[kind], points)
+    exact = weight.sum(axis=0) ** 2 / np.maximum((weight**2).sum(axis=0), 1e-30)
+    found = assembled(looks, looks.effective)[rows, columns]
+    inside = exact > 0.5 * exact.max()
+    assert inside.mean() > 0.3
+    assert np.abs(found / np.maximum(exact, 1) - 1)[inside].max() < 0.01
+    gain = assembled(looks, looks.noise_gain)[rows, columns]
+    assert np.abs(10 * np.log10(gain / (weight**2).sum(axis=0)))[inside].max() < 0.05
+
+
+def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
+    looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED["sector"])
+    middle = looks.effective((slice(0, 200), slice(0, 256)))[100, 240]
+    weight = every_weight(WEIGHED["sector"], GROUND.positions_at(GRID, [100], [240]))
+    assert (weight == 1).sum() < middle < (weight > 0).sum()
+    assert (Looks.of(GRID, GROUND, FLOWN, None).effective((slice(0, 8), slice(0, 8))) == len(FLOWN)).all()
+
+
+@pytest.mark.parametrize("kind", WEIGHED)
+def test_outside_is_exact_at_every_pixel(kind):
+    looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)
+    seen = assembled(looks, looks.seen).astype(bool)
+    rows, columns, points = some_pixels(1500)
+    assert np.array_equal(seen[rows, columns], (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
+    if kind in {"sector", "wide"}:
+        assert seen.all()
+        return
+    edge = np.argwhere(seen[:, 1:] != seen[:, :-1])[::7]  # where a row passes from dark to lit
+    points = GROUND.positions_at(GRID, *np.concatenate([edge, edge + [0, 1]]).T)
+    told = np.concatenate([seen[tuple(edge.T)], seen[tuple((edge + [0, 1]).T)]])
+    assert np.array_equal(told, (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
+    assert not seen.all()
+    assert (assembled(looks, looks.effective)[~seen] == 0).all()
+    assert np.isnan(assembled(looks, looks.noise_gain)[~seen]).all()
+
+
+@pytest.mark.parametrize("beams", [None, Beams(sector=Sector.of(FLOWN, chord_m=2.0, centre=0.2, half=0.1))])
+def test_the_centre_of_an_aperture_is_the_closest_approach(beams):
+    """Beside a straight track at the pixel's east, or behind it where the sector looks ahead by s = 2 sin(squint)."""
+    looks, (rows, columns, points) = Looks.of(GRID, GROUND, FLOWN, beams), some_pixels()
+    east = assembled(looks, lambda tile: looks.centre(tile)[0][..., 0])[rows, columns]
+    squint = 0.0 if beams is None else np.arcsin(0.2)
+    expected = points[:, 0] - np.hypot(points[:, 1], 10.0) * np.tan(squint)
+    within = np.abs(expected) < 74
+    assert within.mean() > 0.8
+    assert np.abs(east - expected)[within].max() < 0.02
+
+
+def test_a_centre_that_goes_over_to_another_pass_is_not_taken_between_them():
+    east = np.linspace(-60, 60, 800)
+    south, north = (np.stack([east, np.full(800, y), np.full(800, 10.0)], -1) for y in (0.0, 90.0))
+    track = np.concatenate([south, north])
+    looks = Looks.of(GRID, GROUND, Aperture(track, track), None)
+    passed = assembled(looks, lambda tile: looks.centre(tile)[1][..., 1])
+    assert set(np.unique(passed.round(6))) == {0.0, 90.0}
+    assert (passed[:80] == 90).all()  # north of 50 m; the middle lies at 45 m
+    assert (passed[120:] == 0).all()

@@ -1,0 +1,55 @@
+"""The noise of a pulse, measured on profiles that hold echoes as well."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import monostatic, straight_track
+
+from apertura.antenna.beam import Beams
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.focus.band_limited import band_limited_image
+from apertura.focus.inputs import Profiles
+from apertura.geometry.sector import Sector
+from apertura.imaging.noise import noise_power
+
+CENTRE_HZ, STEP_M = 1.2e9, 0.375 / 2
+FLOWN = monostatic(straight_track(2048, length_m=40.0))
+PLACES = np.c_[np.random.default_rng(2).uniform([-15, 20], [15, 60], (64, 2)), np.zeros(64)]
+
+
+def profiles(noise, *, echo=1.0):
+    """Two targets, and white noise of that power at every sample."""
+    start = np.full(len(FLOWN), 30.0)
+    at = start[0] + STEP_M * np.arange(800)
+    rng = np.random.default_rng(3)
+    path = FLOWN.path(np.array([[2.0, 35.0, 0.0], [-6.0, 48.0, 0.0]]))
+    held = sum(
+        echo * np.sinc((at - each[:, None]) / 0.375) * np.exp(-2j * np.pi * CENTRE_HZ / C * each[:, None])
+        for each in path.T
+    )
+    band = np.fft.fft(rng.standard_normal((len(FLOWN), 800)) + 1j * rng.standard_normal((len(FLOWN), 800)), axis=1)
+    band[:, 200:600] = 0  # twice oversampled
+    samples = held + np.sqrt(noise) * np.fft.ifft(band, axis=1)  # 2 of power, half of the band
+    return Profiles(samples.astype(np.complex64), start, STEP_M, CENTRE_HZ, 2.0, FLOWN)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-2, 4.0])
+def test_noise_of_a_recording_is_found_below_its_echoes(noise):
+    """Its echoes are focused at other places, 40 dB above the noise of a pulse, and leave no mark on it."""
+    assert 10 * np.log10(noise_power(profiles(noise), PLACES) / noise) == pytest.approx(0, abs=0.35)
+
+
+def test_the_noise_of_a_pixel_follows_from_that_of_a_pulse():
+    """Eq. 2: |I|² where there is no echo is σ² Σw² over the pulses counted, squared."""
+    only, sector = profiles(0.01, echo=0.0), Beams(sector=Sector.of(FLOWN, chord_m=1.0, centre=0.0, half=0.15))
+    image = band_limited_image(only, PLACES, beams=sector)
+    squares = (sector.weight(FLOWN, PLACES) ** 2).sum(axis=0)
+    told = noise_power(only, PLACES, beams=sector)
+    assert 10 * np.log10(np.mean(np.abs(image) ** 2 / squares) / told) == pytest.approx(0, abs=1.2)
+
+
+def test_too_few_pulses_tell_nothing():
+    few = profiles(1.0)[:12]
+    assert np.isnan(noise_power(few, PLACES))
+    assert np.isfinite(noise_power(replace(profiles(1.0)[:40]), PLACES))
