@@ -14,7 +14,7 @@ from apertura.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
-_MOST_PULSES = 16384  # whose paths are taken each
+_MOST_PULSES = 4096  # whose paths are taken each
 
 
 def swath(
