@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apertura import progress as told
-from apertura.progress import Counted, progress, telling, told_at
+from apertura.progress import progress, telling, told_at
 
 
 @pytest.fixture
@@ -58,14 +58,23 @@ def test_a_failing_step_leaves_no_progress_behind(tmp_path):
     assert not path.exists()
 
 
-def test_tiles_that_dask_stores_are_counted(tmp_path):
+def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeypatch):
+    """A tile of a long flight is done with the last block of pulses: parts are counted, not tiles."""
     from dask.array import ones
 
     from apertura.focus.tiles import compute_tiles
 
-    finished = []
-    target = np.zeros((4, 6))
+    monkeypatch.setattr("apertura.progress._BETWEEN_S", 0.0)
+    seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6))
+
+    class Watched:
+        def __setitem__(self, window, block):
+            seen.append(json.loads(path.read_text()))
+            target[window] = block
+
     windows = [(slice(0, 2), slice(0, 2)), (slice(2, 4), slice(2, 4)), (slice(0, 2), slice(4, 6))]
-    compute_tiles(ones((4, 6), chunks=2), windows, Counted(target, finished.append), threads=2)
-    assert finished == [1, 1, 1]
+    with telling(path):
+        compute_tiles(ones((4, 6), chunks=2), windows, Watched(), threads=1)
+    assert {one["total"] for one in seen} == {6}  # each is formed and written
+    assert 0 < seen[-1]["done"] < 6
     assert target.sum() == 12

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 RUN = ".run"
 """Folder of the results: what a run keeps of itself, its journal and a file for each step under way."""
@@ -82,32 +81,6 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     _tell(what, 0, total, since_s)
     yield done
     _tell(what, finished, total, since_s)
-
-
-class Counted:
-    """An array that is written in blocks, each of which counts as done.
-
-    Parameters
-    ----------
-    target
-        Takes blocks: numpy or zarr.
-    done
-        From `progress`.
-
-    Examples
-    --------
-    >>> target, written = [0, 0], []
-    >>> Counted(target, written.append)[1] = 5
-    >>> target, written
-    ([0, 5], [1])
-    """
-
-    def __init__(self, target: Any, done: Callable[[int], None]) -> None:
-        self._target, self._done = target, done
-
-    def __setitem__(self, window: Any, block: Any) -> None:
-        self._target[window] = block
-        self._done(1)
 
 
 def _tell(what: str, done: int, total: int, since_s: float) -> None:

@@ -17,6 +17,7 @@ from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.presum import Presum, presummed
 from apertura.focus.reach import Reach, pulse_blocks_of
+from apertura.progress import progress
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
@@ -216,6 +217,7 @@ def compute_tiles(
     >>> target.sum()
     np.float64(4.0)
     """
+    from dask.callbacks import Callback
     from dask.threaded import get
 
     places = [
@@ -229,13 +231,17 @@ def compute_tiles(
     if scheduler != "threads":
         from apertura.focus.cluster import formed_elsewhere
 
-        for number, tile in formed_elsewhere(graph, keys, scheduler):
-            target[windows[number]] = tile
+        with progress("tiles", len(keys)) as done:
+            for number, tile in formed_elsewhere(graph, keys, scheduler):
+                target[windows[number]] = tile
+                done(1)
         return
     written = {
         ("written", *key): (partial(_write, target, window), key) for key, window in zip(keys, windows, strict=True)
     }
-    get({**graph, **written}, list(written), num_workers=threads)
+    tasks = {**graph, **written}
+    with progress("parts of tiles", len(tasks)) as done, Callback(posttask=lambda *_: done(1)):
+        get(tasks, list(written), num_workers=threads)
 
 
 def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:

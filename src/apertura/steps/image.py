@@ -23,7 +23,6 @@ from apertura.load.budget import arithmetic_line, budget_of
 from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
-from apertura.progress import Counted, progress
 from apertura.provenance import sha256_file
 from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
@@ -138,11 +137,9 @@ class _Work:
         """Compute some tiles as planned."""
         line = self.formation.plan.setting.line
         print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
-        image = self.formation.image
-        with progress("tiles", len(windows)) as done:
-            if windows:
-                counted = Counted(target, done)
-                compute_tiles(image, windows, counted, threads=self.threads, scheduler=self.scheduler)
+        if windows:
+            image = self.formation.image
+            compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
