@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from apertura.echo import transfer
+from apertura.echo.baseline import baseline_residual, detect_wrong_association
 from apertura.echo.captures import Saturation, blocks_of, spread
 from apertura.echo.clock import clock_of, estimate_clock
 from apertura.echo.demodulate import Numerology, remove_path
@@ -118,6 +119,16 @@ def test_a_clock_is_measured_as_well_on_stretches_of_a_long_flight():
     assert part.cfo_hz == pytest.approx(whole.cfo_hz, abs=4 * part.cfo_std_hz)
     assert part.cfo_hz == pytest.approx(9600, abs=20)
     assert part.cfo_std_hz < 5
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 9.0])
+def test_jitter_of_a_long_flight_is_not_taken_for_wrong_pulses(moved_m):
+    """The highest of 300 000 medians is further out than that of a thousand; what moves further still is seen."""
+    rng = np.random.default_rng(3)
+    delay_m = 12 + rng.uniform(-12, 12, 300_000)
+    delay_m[100_000:100_300] += moved_m
+    found = detect_wrong_association(baseline_residual(delay_m, np.full(300_000, 12.0)))
+    assert (found is not None) == (moved_m > 0)
 
 
 def test_saturation_is_that_of_all_blocks_together():

@@ -66,8 +66,6 @@ def test_looks_between_nodes_are_those_of_every_pulse_at_every_pixel(kind):
     inside = exact > 0.5 * exact.max()
     assert inside.mean() > 0.3
     assert np.abs(found / np.maximum(exact, 1) - 1)[inside].max() < 0.01
-    gain = assembled(looks, looks.noise_gain)[rows, columns]
-    assert np.abs(10 * np.log10(gain / (weight**2).sum(axis=0)))[inside].max() < 0.05
 
 
 def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
@@ -93,7 +91,6 @@ def test_outside_is_exact_at_every_pixel(kind):
     assert np.array_equal(told, (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
     assert not seen.all()
     assert (assembled(looks, looks.effective)[~seen] == 0).all()
-    assert np.isnan(assembled(looks, looks.noise_gain)[~seen]).all()
 
 
 @pytest.mark.parametrize("beams", [None, Beams(sector=Sector.of(FLOWN, chord_m=2.0, centre=0.2, half=0.1))])

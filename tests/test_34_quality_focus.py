@@ -64,6 +64,12 @@ def test_the_snr_of_a_point_is_told_by_its_even_and_odd_pulses():
     assert focus.snr_db == pytest.approx(20 + 10 * np.log10(4096), abs=0.5)
 
 
+@pytest.mark.parametrize(("cycles", "evidence"), [(0.4, True), (1.5, False), (6.5, False)])
+def test_a_sidelobe_of_an_echo_elsewhere_is_no_evidence_of_focus(cycles, evidence):
+    """Its contributions keep their amplitude and turn: they add up at another place, and not at this one."""
+    assert (point_focus(np.exp(2j * np.pi * cycles * np.arange(400) / 400)) is not None) == evidence
+
+
 def test_one_point_among_sidelobes_does_not_decide():
     generator = np.random.default_rng(4)
     sharp = point_focus(np.ones(200, complex))

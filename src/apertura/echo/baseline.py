@@ -12,11 +12,13 @@ EXPLAINED_M = 0.05
 """Movement of a sidelink that errors of the logged positions alone may explain."""
 
 SIGMAS = 5.0
+"""Of the noise of a median, what one of a thousand windows reaches by chance once in 3000 flights."""
 
 _MEDIAN_PULSES = 15, 61, 241
 """Of the running medians that tell movement from jitter, odd numbers: the longer, the less noise and the slower."""
 
 _WINDOWS_AT_ONCE = 4096
+_ENOUGH = 64  # windows apart from each other that tell their own noise
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,9 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
     middle = pulse[width // 2 : -(width // 2)]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
     noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
+    steps = np.diff(smooth[::width])
+    if steps.size >= _ENOUGH:  # jitter need not be normal: the median of a uniform one is noisier
+        noise_m = max(noise_m, 1.4826 * float(np.median(np.abs(steps))) / 2**0.5)
     worst = int(np.argmax(np.abs(smooth)))
     largest_m = float(abs(smooth[worst]))
     return BaselineResidual(
@@ -87,15 +92,27 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
         jitter_m,
         largest_m,
         int(middle[worst]),
-        largest_m / max(EXPLAINED_M, SIGMAS * float(noise_m)),
+        largest_m / max(EXPLAINED_M, sigmas(smooth.size) * float(noise_m)),
     )
+
+
+def sigmas(windows: int) -> float:
+    """Return how many standard deviations the highest of so many windows must reach, at the same chance for any flight.
+
+    Examples
+    --------
+    >>> sigmas(500), round(sigmas(300_000), 2)
+    (5.0, 6.03)
+    """
+    return float(np.sqrt(SIGMAS**2 + 2 * np.log(max(1.0, windows / 1000))))
 
 
 def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
     """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
 
     A constant and a linear drift belong to the clocks. What still moves by more than `EXPLAINED_M` and by more than
-    five times its own noise cannot come from trigger jitter: the pulses carry positions of other pulses, or wrong ones.
+    five times its own noise, six of a long flight, cannot come from trigger jitter: the pulses carry positions of other
+    pulses, or wrong ones.
 
     Notes
     -----

@@ -16,7 +16,7 @@ INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from 
 BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")
 MASK = Band("uint8", OUTSIDE, "bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside", "MODE")
 LOOKS = Band("float32", np.nan, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
-NESZ = Band("float32", np.nan, "dB", "noise in the pixel, in units of db.tif: relative, no sigma0", "AVERAGE")
+NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
 
 
 def write_incidence(
@@ -67,7 +67,7 @@ def write_looks(
 def write_nesz(
     path: Path, noise_db: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the noise in a pixel, (y, x) float32 dB in units of db.tif, NaN outside. Else as `write_looks`."""
+    """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`."""
     write_cog(path, noise_db, NESZ, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 

@@ -16,6 +16,9 @@ LEAST_BLOCKS = 32
 MOST_INTERFERENCE = 0.08
 """Variance of the logarithm of a point's amplitude over the aperture, above which it does not dominate its cell."""
 
+LEAST_HERE = 0.35
+"""Amplitude at the point itself of the most that a place near it has: less is a sidelobe of an echo elsewhere."""
+
 DEFOCUSED_DB = -1.0
 """A point that lost more is called defocused."""
 
@@ -83,6 +86,8 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
             unrest = _unrest(np.log(amplitude))
             if unrest <= MOST_INTERFERENCE:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
+                if abs(complex(blocks.sum())) < LEAST_HERE * best:
+                    return None
                 loss = (best / amplitude.sum()) ** 2 * (1 + unrest * (1 - 2.5 * unrest) / 2) ** 2
                 snr_db = _snr_db(contributions)
                 allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))

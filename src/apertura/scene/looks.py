@@ -170,11 +170,6 @@ class Looks:
         looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
         return np.where(self.seen(tile), looks, 0).astype(np.float32)
 
-    def noise_gain(self, tile: Window) -> Floats:
-        """Return Σw² at the pixels of a tile, (row, column) float64; NaN where no pulse makes them."""
-        squares = self._sums(tile)[1]
-        return np.where(self.seen(tile) & (squares > 0), squares, np.nan)
-
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
         limit_m = _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m

@@ -13,7 +13,7 @@ from apertura.simulation.experiments import (
     paper_static,
     paper_uav,
 )
-from apertura.simulation.impairments import Impairments, Leakage, TimeTag, Timing, UniformPhase
+from apertura.simulation.impairments import Adc, Impairments, Leakage, TimeTag, Timing, UniformPhase
 from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import Geometry, straight_pair
 from apertura.simulation.scene import PointTarget, Scatterers
@@ -115,10 +115,12 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
     A receiver records two channels of 2256 samples per pulse, 5.4 GB; the image has 4096 × 4096 pixels.
     """
     waveform = WaveformSpecification(1024, 1.2e9, 100e3, 10.3125e-6, 4.375e-6, 153.6e6, 500.0)
-    nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0))}
+    nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0, adc=Adc(backoff_db=24.0)))}
     tracks, half_m = {"uav1": Straight((0.0, -270.0, 80.0), (5.0, 0.0, 0.0))}, 5.0 * (pulses - 1) / 500.0 / 2
     for name, ahead_m in (("uav2", 12.0), ("uav3", -15.0)):
         nodes[name] = _secondary(0.4, 0.2, tag_s=0.2e-3, missed=0.0)
+        wide = replace(nodes[name].impairments, adc=Adc(backoff_db=24.0))  # echoes are strongest as targets are passed
+        nodes[name] = replace(nodes[name], impairments=wide)
         tracks[name] = Straight((ahead_m, -270.0, 82.0), (5.0, 0.0, 0.0))
     tracks = {
         name: replace(track, start_m=(track.start_m[0] - half_m, *track.start_m[1:])) for name, track in tracks.items()

@@ -49,7 +49,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         settings={**campaign.relevant("layers", pair), **scene.spec},
         inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()} | scene.inputs,
     )
-    rasters = _rasters(scene, looks, noise / settled.count**2, threads=threads)
+    rasters = _rasters(scene, looks, noise, threads=threads)
     written = write_exports(
         "layers",
         campaign.result(flight, pair),
@@ -110,7 +110,7 @@ class Layer:
 
 
 def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, Layer]:
-    """Return the layers; `noise` is what a pixel holds of it per Σw²."""
+    """Return the layers; `noise` is that of one pulse."""
     grid, terrain = scene.grid, scene.terrain
 
     def incidence(window: Window) -> NDArray[np.float64]:
@@ -121,8 +121,8 @@ def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> d
         return _inside(looks, window, angle_deg)
 
     def nesz(window: Window) -> NDArray[np.float64]:
-        gain = looks.noise_gain(window)
-        return 10 * np.log10(np.where(gain > 0, gain, np.nan) * (noise or np.nan))
+        effective = looks.effective(window).astype(np.float64)
+        return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
 
     return {
         "incidence": Layer(grid, np.float32, incidence, threads),
