@@ -365,7 +365,11 @@ def test_list_tells_what_is_finished_stale_and_missing(finished, capsys):
     (finished.results / "f01/uav1-uav1/image.manifest.json").unlink()
     found = states(finished)
     assert found["f01", "uav1"] == {"finished": ["raw", "track"], "stale": [], "missing": []}
-    assert found["f01", "uav1-uav1"] == {"finished": ["echo", "profile"], "stale": ["export"], "missing": ["image"]}
+    assert found["f01", "uav1-uav1"] == {
+        "finished": ["echo", "profile", "layers"],
+        "stale": ["export"],
+        "missing": ["image"],
+    }
     print_list(finished)
     said = capsys.readouterr().out
     assert "uav1-uav2" in said

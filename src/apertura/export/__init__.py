@@ -123,7 +123,7 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
     Examples
     --------
-    >>> list(product_files({"f01": ["a-b"]}))[1:4]
+    >>> list(product_files({"f01": ["a-b"]}))[2:5]
     ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/db.tif']
     """
     yield from COVERAGE
