@@ -114,11 +114,6 @@ def _raw(campaign: Campaign, flight: str, node: str) -> Result:
     return Result(campaign.manifest("raw", flight, node), files, campaign.relevant("raw"))
 
 
-def _samples(campaign: Campaign, flight: str, node: str) -> str:
-    """Return the recorder's file of samples, which the raw stage refers to."""
-    return campaign.relative(campaign.recording_files(flight, node)[-1])
-
-
 def _track(campaign: Campaign, flight: str, node: str) -> Result:
     log = campaign.relative(campaign.track_file(flight, node))
     return Result(campaign.manifest("track", flight, node), (log,), {})
@@ -129,7 +124,11 @@ def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
     nodes = dict.fromkeys(pair.split("-"))
     if isinstance(waveform, OfdmWaveform):
         sources = [campaign.manifest(stage, flight, node) for node in nodes for stage in ("raw", "track")]
-        sources = [waveform.codes, *(_samples(campaign, flight, node) for node in nodes), *sources]
+        sources = [
+            waveform.codes,
+            *(campaign.relative(campaign.recording_files(flight, node)[-1]) for node in nodes),
+            *sources,
+        ]
         if calibration is not None and campaign.flight(flight).kind == "image":
             sources.append(campaign.manifest("calibration", calibration.flight))
     else:

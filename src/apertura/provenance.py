@@ -136,11 +136,6 @@ def sha256_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def sha512_file(path: Path) -> str:
-    """Return the sha512 of a file's bytes, hex, as SigMF states it."""
-    return hashes_of_file(path, ["sha512"])["sha512"]
-
-
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
     """Return algorithm → hash of a file's bytes, hex; it is read once."""
     digests = {name: hashlib.new(name) for name in algorithms}

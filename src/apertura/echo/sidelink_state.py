@@ -96,18 +96,8 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
 def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "sidelink") -> SidelinkState:
     """Measure the sidelink of a flight, block by block.
 
-    Parameters
-    ----------
-    blocks
-        Gives the sidelink from its beginning, (pulse, subcarrier) complex64 each, the code removed; asked once, and
-        once more where no pulse locks.
-    where
-        What to call the recording in errors.
-
-    Raises
-    ------
-    CampaignError
-        If no pulse locks.
+    `blocks` gives it from its beginning, (pulse, subcarrier) complex64 each, the code removed; it is asked once more
+    where no pulse locks. Errors call the recording `where`; CampaignError if it carries nothing.
 
     Notes
     -----

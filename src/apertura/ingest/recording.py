@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.ingest.sample_file import SampleFile
-from apertura.provenance import sha512_file
+from apertura.provenance import hashes_of_file
 
 _AT_ONCE = 4096
 _ALIVE = 16  # samples of which one that is not zero spares the others a look
+
+
+def _sha512(path: Path) -> str:
+    return hashes_of_file(path, ["sha512"])["sha512"]
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Recording:
         elapsed = np.round(start / self.sample_rate_hz * 1e9).astype(np.int64).astype("timedelta64[ns]")
         return Captures(start, length, self.captures.time[0] + elapsed, frame)
 
-    def check_hash(self, sha512_of: Callable[[Path], str] = sha512_file) -> None:
+    def check_hash(self, sha512_of: Callable[[Path], str] = _sha512) -> None:
         """Raise CampaignError unless the samples are those that the recorder hashed."""
         if self.sha512 is None:
             return
