@@ -157,9 +157,9 @@ def _terrain(campaign: Campaign) -> Result:
 
 def _layers(campaign: Campaign, flight: str, pair: str) -> Result:
     stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
-    patterns = [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
+    sources = (*stages, *_ground(campaign), *_patterns(campaign, pair))
     settings = {"campaign": campaign.settings.campaign, **campaign.relevant("layers", pair)}
-    return Result(campaign.manifest("layers", flight, pair), (*stages, *_ground(campaign), *patterns), settings)
+    return Result(campaign.manifest("layers", flight, pair), sources, settings)
 
 
 def _coverage(campaign: Campaign) -> Result:

@@ -11,6 +11,7 @@ from scipy import fft
 from scipy.special import gammainccinv, gammaincinv
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.captures import AT_ONCE
 from apertura.errors import CampaignError
 
 Complexes = NDArray[np.complex64]
@@ -27,7 +28,6 @@ RIVAL_DB = -6.0
 
 _GROUPS = 16
 _OVERSAMPLING = 8
-_PULSES_AT_ONCE = 64
 
 
 class Pulses(Protocol):
@@ -142,7 +142,7 @@ def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats)
     >>> reflector_history(echo, frequency, path_m=path).round(4) + 0.0
     array([2.+0.j, 2.+0.j])
     """
-    parts = (slice(first, first + _PULSES_AT_ONCE) for first in range(0, len(transfer), _PULSES_AT_ONCE))
+    parts = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
     return np.concatenate([_aligned(transfer[part], frequency_hz, path_m[part]).mean(axis=1) for part in parts])
 
 
@@ -161,8 +161,8 @@ def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> N
 def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
     """Return (subcarrier,) the mean of pulses first to last, turned to the predicted path, a block at a time."""
     total = np.zeros(len(frequency_hz), np.complex128)
-    for start in range(first, last, _PULSES_AT_ONCE):
-        part = slice(start, min(start + _PULSES_AT_ONCE, last))
+    for start in range(first, last, AT_ONCE):
+        part = slice(start, min(start + AT_ONCE, last))
         total += _aligned(transfer[part], frequency_hz, path_m[part]).sum(axis=0)
     return total / (last - first)
 

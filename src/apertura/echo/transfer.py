@@ -143,7 +143,7 @@ def transfer_by_sidelink(
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
     flight, the state of the sidelink on all.
     """
-    receiver = _Receiver.measured(read, codes, numerology, symbol_samples, len(sidelink_m), accuracy_db)
+    receiver = _Receiver.measured(read, 1 / codes, numerology, symbol_samples, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
         state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
@@ -181,7 +181,7 @@ class _Receiver:
     """How captures of a node with its own clock become symbols: as they are, or with its clock corrected."""
 
     read: Read
-    codes: Complexes
+    inverse: Complexes  # of the code
     numerology: Numerology
     symbol_samples: int
     clock: ClockOffset | None  # to be corrected
@@ -191,12 +191,12 @@ class _Receiver:
 
     @classmethod
     def measured(
-        cls, read: Read, codes: Complexes, numerology: Numerology, symbol_samples: int, count: int, accuracy_db: float
+        cls, read: Read, inverse: Complexes, numerology: Numerology, symbol_samples: int, count: int, accuracy_db: float
     ) -> "_Receiver":
         """Measure the clock, and decide whether it is corrected in the samples."""
         groups = spread(count, groups=GROUPS, each=_CLOCK_STRETCH)
         sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :symbol_samples]) for some in groups)
-        kept = read, codes, numerology, symbol_samples
+        kept = read, inverse, numerology, symbol_samples
         try:
             clock = clock_of(sidelink, numerology, pulses=count)
         except ValueError as error:
@@ -226,7 +226,7 @@ class _Receiver:
         if self.clock is not None:
             cfo_hz = self.cfo_hz[captures]
             samples = correct_clock(samples, self.numerology, cfo_hz=cfo_hz, sfo_ppm=self.clock.sfo_ppm)
-        return demodulate(samples, self.numerology) * (1 / self.codes)
+        return demodulate(samples, self.numerology) * self.inverse
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:

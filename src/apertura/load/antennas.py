@@ -16,6 +16,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.load.scene import OpenScene
+from apertura.provenance import sha256_file
 from apertura.settings import Antenna
 
 _STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
@@ -44,6 +45,11 @@ def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float6
     files = {point: patterns.get(f"nodes.{node}.antennas.{point}.pattern") for point, (node, _) in stated.items()}
     found = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
     return Beams(found.get("radar_tx"), found.get("radar_rx"))
+
+
+def pattern_digests(campaign: Campaign, pair: str) -> dict[str, str]:
+    """Return key of the config → sha256 of each sampled pattern of a pair's antennas, for provenance."""
+    return {key: sha256_file(path) for key, path in campaign.pattern_files(pair).items()}
 
 
 def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> Beam:

@@ -18,12 +18,11 @@ from apertura.imaging.focus_check import focus_flags, focus_report
 from apertura.imaging.formation import Formation
 from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
-from apertura.load.antennas import antennas_report
+from apertura.load.antennas import antennas_report, pattern_digests
 from apertura.load.budget import arithmetic_line, budget_of
 from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
 from apertura.load.scene import OpenScene, open_scene
-from apertura.provenance import sha256_file
 from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
 from apertura.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
@@ -161,7 +160,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         "image",
         modules=_MODULES,
         parents=[echo, profile, *scene.parents],
-        inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()},
+        inputs=pattern_digests(campaign, pair),
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
     )
     scheduler = campaign.settings.processing.scheduler

@@ -16,13 +16,14 @@ from apertura.contracts import Window
 from apertura.export import export_modules, write_exports
 from apertura.export.layers import OUTSIDE
 from apertura.focus.inputs import Profiles
-from apertura.imaging.job import settle
 from apertura.imaging.noise import PLACES, noise_power
 from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
-from apertura.load.antennas import beams_of, body_axes
+from apertura.load.antennas import pattern_digests
+from apertura.load.pair import open_pair
+from apertura.load.plan import weighing
 from apertura.load.scene import OpenScene, open_scene
-from apertura.provenance import Provenance, sha256_file
+from apertura.provenance import Provenance
 from apertura.scene.grid import SceneGrid
 from apertura.scene.lattice import BLOCK_PX
 from apertura.scene.looks import Looks
@@ -37,17 +38,14 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root, modules)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
-    antennas, asked = beams_of(campaign, pair, body_axes(echo)), campaign.settings.processing.integrated
-    aperture, centre_hz = profiles.aperture, profiles.centre_frequency_hz
-    settled = settle(aperture, centre_hz, scene.grid, scene.level, antennas=antennas, asked=asked)
-    beams = Beams.within(settled.sector, antennas)
-    looks = Looks.of(scene.grid, scene.terrain, aperture, beams, threads=threads)
+    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
+    looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
     noise = _noise(profiles, scene, beams)
     origin = Provenance.of(
         modules,
         [echo, profile, *scene.parents],
         settings={**campaign.relevant("layers", pair), **scene.spec},
-        inputs={name: sha256_file(path) for name, path in campaign.pattern_files(pair).items()} | scene.inputs,
+        inputs=pattern_digests(campaign, pair) | scene.inputs,
     )
     rasters = _rasters(scene, looks, noise, threads=threads)
     written = write_exports(

@@ -10,12 +10,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.digests import digest_of
 from apertura.echo.compression import centre_frequency
 from apertura.errors import CampaignError
 from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
 from apertura.imaging.stages import aperture_of, phase_history_of
 from apertura.lineage import result_of
+from apertura.load.antennas import pattern_digests
 from apertura.load.pair import open_pair
 from apertura.load.plan import weighing
 from apertura.load.scene import OpenScene, open_scene
@@ -48,10 +48,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "window": asked,
     }
     settings, parents = {**campaign.relevant("profile", pair), **scene.spec}, [source, *scene.parents]
-    patterns = {
-        key: digest_of(campaign.root, campaign.relative(path)) for key, path in campaign.pattern_files(pair).items()
-    }
-    inputs = merged(scene.inputs, patterns)
+    inputs = merged(scene.inputs, pattern_digests(campaign, pair))
     how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
     with writing(folder) as wip:
