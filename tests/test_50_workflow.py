@@ -63,7 +63,7 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
     code, output = finished(snakemake(tiny, "-n"))
     assert code == 0
     planned = {line.split()[0] for line in output.split("Job stats:")[1].split("total")[0].splitlines()[3:] if line}
-    assert planned == {"all", "assess", "cube", "export", "export_fused", "image", "profile"}
+    assert planned == {"all", "assess", "coverage", "cube", "export", "export_fused", "image", "layers", "profile"}
 
 
 def tiles(root):
