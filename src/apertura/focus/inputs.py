@@ -1,11 +1,40 @@
 """What an engine is given: the recorded history as plain arrays, without settings or files."""
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
+
+
+class Turned:
+    """Samples of pulses, each times a factor of its own, as they are asked for.
+
+    Examples
+    --------
+    >>> np.asarray(Turned(np.ones((3, 2), np.complex64), np.array([1, 1j, -1]))[1:])
+    array([[ 0.+1.j,  0.+1.j],
+           [-1.+0.j, -1.+0.j]], dtype=complex64)
+    """
+
+    def __init__(self, samples: Any, factor: NDArray[np.complex128]):
+        self._samples, self._factor = samples, factor.astype(np.complex64)
+        self.shape, self.ndim, self.dtype = samples.shape, samples.ndim, samples.dtype
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self._samples)
+
+    def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
+        """Return the samples of some pulses."""
+        return np.asarray(self._samples[pulses]) * self._factor[pulses, None]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return all of them."""
+        return np.asarray(self[:], dtype)
 
 
 @dataclass(frozen=True)
@@ -62,6 +91,14 @@ class PhaseHistory:
             reference_delay_s=self.reference_delay_s[pulses],
             aperture=self.aperture[pulses],
         )
+
+    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "PhaseHistory":
+        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+
+        As `Profiles.moved`.
+        """
+        delay_s = self.reference_delay_s + further_m / SPEED_OF_LIGHT_M_S
+        return replace(self, reference_delay_s=delay_s, aperture=aperture)
 
 
 @dataclass(frozen=True)
@@ -122,3 +159,22 @@ class Profiles:
             start_m=self.start_m[pulses],
             aperture=self.aperture[pulses],
         )
+
+    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "Profiles":
+        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+
+        Parameters
+        ----------
+        aperture
+            Of as many pulses.
+        further_m
+            (pulse,) float64, metres by which the measured path of every echo of a pulse grows.
+
+        Notes
+        -----
+        Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
+        """
+        wavenumber = 2 * np.pi * self.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        turned = Turned(self.samples, np.exp(-1j * wavenumber * further_m)) if np.any(further_m) else self.samples
+        samples = cast("NDArray[np.complex64]", turned)
+        return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)
