@@ -13,7 +13,8 @@ using apertura::Patch;
 
 #define APERTURA_DECLARE(isa)                                                                     \
   extern "C" void apertura_add_##isa(const ApertureJob*, const Patch*, int64_t, int64_t, float*); \
-  extern "C" void apertura_expand_##isa(const TableJob*, float*);
+  extern "C" void apertura_expand_##isa(const TableJob*, float*);                                 \
+  extern "C" void apertura_contribute_##isa(const EchoJob*);
 
 APERTURA_DECLARE(portable)
 #ifdef APERTURA_X86
@@ -29,6 +30,7 @@ struct Isa {
   bool runs;
   void (*add)(const ApertureJob*, const Patch*, int64_t, int64_t, float*);
   void (*expand)(const TableJob*, float*);
+  void (*contribute)(const EchoJob*);
 };
 
 // Fastest first.
@@ -40,10 +42,10 @@ const Isa* find(const char* name) {
 #endif
   static const Isa isas[] = {
 #ifdef APERTURA_X86
-      {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512},
-      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2},
+      {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512},
+      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2},
 #endif
-      {"portable", true, apertura_add_portable, apertura_expand_portable},
+      {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
@@ -134,6 +136,10 @@ __attribute__((visibility("default"))) int apertura_expand(const char* name, con
 __attribute__((visibility("default"))) int apertura_image(const char* name, const ApertureJob* job) {
   return run(name,
              [job](const Isa& isa) { job->wide_sum ? form_tile<double>(*job, isa) : form_tile<float>(*job, isa); });
+}
+
+__attribute__((visibility("default"))) int apertura_contribute(const char* name, const EchoJob* job) {
+  return run(name, [job](const Isa& isa) { isa.contribute(job); });
 }
 
 }  // extern "C"

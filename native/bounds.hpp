@@ -10,6 +10,8 @@ constexpr int64_t kBlockSide = 4;   // pixels along a block, whose paths are one
 constexpr int64_t kBatch = 8;       // pulses whose paths are computed together
 constexpr int64_t kTaps = 16;       // of a table's filters
 constexpr int64_t kWindow = 16;     // table cells that one look-up can reach
+constexpr int64_t kEchoTaps = 8;    // samples that make an echo at a single place
+constexpr int64_t kEchoDegree = 4;  // of the polynomials that weigh them
 // A path may lie half a cell beyond the cell it is rounded to; the rest is what float32 may err.
 constexpr float kWindowMargin = 0.51f;
 

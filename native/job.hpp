@@ -53,6 +53,23 @@ struct TableJob {
   int32_t degree;
 };
 
+// What single pulses add at single places, blocks of pulses apart.
+struct EchoJob {
+  const float* samples;       // (pulse, 2, length): re, im, with kEchoTaps zeros at both ends
+  const float* taps;          // (kEchoDegree + 1, kEchoTaps): of each sample's weight, constant term first
+  const double* transmitter;  // (3, pulses)
+  const double* receiver;     // (3, pulses)
+  const double* start;        // (pulses): total path of sample 0, a zero
+  const float* weight;        // (pulses), or (count, pulses)
+  const double* pixels;       // (count, 3)
+  const int64_t* edges;       // (blocks + 1): pulses edges[b] .. edges[b + 1] are added to columns[b]
+  const int64_t* columns;     // (blocks)
+  float* sums;                // (count, width, 2): re, im, to be added to
+  int64_t pulses, length, count, blocks, width;
+  int64_t weight_step;  // from one pixel's weights to the next: 0 or pulses
+  double samples_per_metre, turns_per_metre;
+};
+
 // Static: compiled for several instruction sets, whose copies the linker must never merge.
 namespace apertura {
 

@@ -1,5 +1,6 @@
 // Compiled once per instruction set; APERTURA_ISA names the copy.
 #include "beam.hpp"
+#include "echoes.hpp"
 #include "expand.hpp"
 
 #define APERTURA_JOIN2(a, b) a##b
@@ -92,3 +93,5 @@ extern "C" void APERTURA_JOIN(apertura_add_, APERTURA_ISA)(const ApertureJob* jo
 extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_ISA)(const TableJob* job, float* scratch) {
   expand(*job, scratch);
 }
+
+extern "C" void APERTURA_JOIN(apertura_contribute_, APERTURA_ISA)(const EchoJob* job) { contribute(*job); }

@@ -86,7 +86,9 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
     subprocess.run([cmake, "-S", root, "-B", tmp_path, "-DAPERTURA_SANITIZE=ON"], check=True, capture_output=True)
     subprocess.run([cmake, "--build", tmp_path, "--parallel", "2"], check=True, capture_output=True)
     runtimes = [  # with the C++ one, or the sanitizer knows no throw of the libraries that Python loads later
-        subprocess.run([compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True).stdout.strip()
+        subprocess.run(
+            [compiler, f"-print-file-name={name}"], check=True, capture_output=True, text=True
+        ).stdout.strip()
         for name in ("libasan.so", "libstdc++.so")
     ]
     environment = {
@@ -104,7 +106,7 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
         "no:cacheprovider",
         "-m",
         "not slow",
-        *(f"tests/test_34_focus_{name}.py" for name in ("native", "beams", "envelope")),
+        *(f"tests/test_34_focus_{name}.py" for name in ("native", "beams", "envelope", "contributions")),
     ]
     done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -64,6 +64,17 @@ class TableJob(ctypes.Structure):
     ]
 
 
+class EchoJob(ctypes.Structure):
+    """native/job.hpp, EchoJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "taps", "transmitter", "receiver", "start", "weight", "pixels")),
+        *((name, _pointer) for name in ("edges", "columns", "sums")),
+        *((name, _int64) for name in ("pulses", "length", "count", "blocks", "width", "weight_step")),
+        *((name, _double) for name in ("samples_per_metre", "turns_per_metre")),
+    ]
+
+
 def layout() -> dict[str, str]:
     """Return the layout of the structs as this module lays them out: field → where it lies, struct → its size.
 
@@ -73,7 +84,7 @@ def layout() -> dict[str, str]:
     'byte 8, 8 bytes'
     """
     lines: dict[str, str] = {}
-    for struct in (BeamJob, SectorJob, ApertureJob, TableJob):
+    for struct in (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob):
         for name, *_ in struct._fields_:
             field = getattr(struct, name)
             lines[f"{struct.__name__}.{name}"] = _place(field.offset, field.size)

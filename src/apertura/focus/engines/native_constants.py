@@ -23,6 +23,9 @@ class KernelConstants:
         Of a table's filters.
     window
         Table cells that one look-up can reach; tables have as many empty cells at both ends.
+    echo_taps, echo_degree
+        Samples that make an echo at a single place, and the degree of the polynomials that weigh them
+        (docs/theory/autofocus.md, "What pulses add").
     window_margin
         Cells: a path lies up to ½ beyond the cell it is rounded to, the rest is what float32 may err.
     fifth_order
@@ -52,6 +55,8 @@ class KernelConstants:
     batch: int = 8
     taps: int = 16
     window: int = 16
+    echo_taps: int = 8
+    echo_degree: int = 4
     window_margin: float = 0.51
     fifth_order: float = 0.14
     third_order: float = 0.19
