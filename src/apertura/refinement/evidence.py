@@ -1,0 +1,223 @@
+"""Whether refined tracks are to be believed, told without truth."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.contributions import block_contributions
+from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.inputs import Sighting
+from apertura.refinement.objective import Seen
+from apertura.refinement.patches import bandwidth_hz
+
+Floats = NDArray[np.float64]
+
+LEAST_GAIN_DB, LEAST_BETTER = 0.3, 0.75
+"""Contrast that patches gain which were not fitted, and the share of them that gains: less is not believed."""
+
+PARTS = 8
+"""Of the aperture, whose images of a point are compared in range."""
+
+_LEAST_SETTLED = 8
+_LOG_POWER = float(np.log(2.5))
+_REACH_CELLS, _STEPS = 1.5, 25
+_SLIP_SURE = 4.0
+_DOMINATES = 30.0  # peak power of a part's image of a point against its speckle
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was measured of refined tracks.
+
+    Attributes
+    ----------
+    fitted_db, held_out_db
+        (pair, patch) float64, contrast gained by the patches that were fitted and by those that were not.
+    settled
+        (mode,) float64, unknowns that the image settles whatever the log says: of unit variance if the log states its
+        errors rightly.
+    before, after
+        Where parts of the aperture see points in range.
+    wavelength_m
+        Of the band's middle.
+    start, values
+        Which start led lowest, and the value that each led to.
+    """
+
+    fitted_db: Floats
+    held_out_db: Floats
+    settled: Floats
+    before: "RangeShifts"
+    after: "RangeShifts"
+    wavelength_m: float
+    start: str
+    values: tuple[float, ...]
+
+    @property
+    def gain_db(self) -> float:
+        """Contrast gained by the patches that were not fitted, mean, dB."""
+        return float(self.held_out_db.mean())
+
+    @property
+    def better(self) -> float:
+        """Share of their images that gained."""
+        return float((self.held_out_db > 0).mean())
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the tracks are believed."""
+        return self.gain_db >= LEAST_GAIN_DB and self.better >= LEAST_BETTER
+
+    @property
+    def why(self) -> str:
+        """In one line."""
+        line = (
+            f"{self.held_out_db.size} images of patches that were not fitted gained {self.gain_db:.2f} dB of contrast, "
+            f"{self.better:.0%} of them gained"
+        )
+        return line if self.accepted else f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are asked for"
+
+    @cached_property
+    def inconsistent(self) -> str:
+        """What is wrong with the errors that the logs state; nothing where they fit what was found."""
+        count = len(self.settled)
+        if count < _LEAST_SETTLED:
+            return ""
+        power = float((self.settled**2).mean())
+        spread = np.sqrt(2 / count)
+        if np.exp(-_LOG_POWER - 3 * spread) < power < np.exp(_LOG_POWER + 3 * spread):
+            return ""
+        return (
+            f"the {count} motions that the image settles are {np.sqrt(power):.2f} times as large as the logs' errors "
+            "allow"
+        )
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Edges crossed."""
+        flags = {} if self.accepted else {"refinement_rejected": self.why}
+        if self.inconsistent:
+            flags["prior_inconsistent"] = self.inconsistent
+        slipped = int(self.after.slipped(self.wavelength_m).sum())
+        if slipped:
+            off = float(np.nanmax(np.abs(np.where(self.after.slipped(self.wavelength_m), self.after.shift_m, np.nan))))
+            flags["cycle_slip_suspected"] = (
+                f"{slipped} of {self.after.shift_m.size} parts of the apertures see the points up to {off:.2f} m of "
+                f"path from where the whole has them; the wavelength is {self.wavelength_m:.2f} m"
+            )
+        return flags
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "gain_fitted_db": round(float(self.fitted_db.mean()), 3),
+            "gain_held_out_db": round(self.gain_db, 3),
+            "held_out_better": round(self.better, 3),
+            "settled": {"modes": len(self.settled), "power": round(float((self.settled**2).mean()), 3)}
+            if len(self.settled)
+            else None,
+            "range_shift_m": {"before": self.before.rms_m, "after": self.after.rms_m},
+            "start": self.start,
+            "objective": [round(value, 2) for value in self.values],
+        }
+
+
+def gains_db(before: Sequence[Sequence[Seen]], after: Sequence[Sequence[Seen]]) -> Floats:
+    """Return (pair, patch) float64, dB by which the contrast Σ|I|⁴/(Σ|I|²)² has grown.
+
+    Examples
+    --------
+    >>> gains_db([[Seen(1.0, 0.1, 9.0)]], [[Seen(1.0, 0.2, 9.0)]]).round(2)
+    array([[3.01]])
+    """
+    ratio = [[b.contrast / a.contrast for a, b in zip(*both, strict=True)] for both in zip(before, after, strict=True)]
+    return 10 * np.log10(np.array(ratio))
+
+
+@dataclass(frozen=True, eq=False)
+class RangeShifts:
+    """Where parts of the aperture see points in range, against the whole.
+
+    Attributes
+    ----------
+    shift_m, std_m
+        (pair, part) float64, metres of total path: median over points and its standard deviation; NaN where no
+        point was seen.
+    """
+
+    shift_m: Floats
+    std_m: Floats
+
+    @property
+    def rms_m(self) -> float | None:
+        """RMS of the shifts, metres; None where no point was seen."""
+        known = self.shift_m[np.isfinite(self.shift_m)]
+        return round(float(np.sqrt((known**2).mean())), 5) if known.size else None
+
+    def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
+        """Return (pair, part) bool: parts that are nearer to a whole turn off than to none, for sure."""
+        off = np.abs(self.shift_m)
+        return np.asarray((off > 0.6 * wavelength_m) & (off > _SLIP_SURE * self.std_m))
+
+
+def range_shifts(
+    sightings: Sequence[Sighting], places_m: Floats, correction: TrackCorrection, axes: Floats
+) -> RangeShifts:
+    """Return where parts of the aperture see some points in range.
+
+    Parameters
+    ----------
+    sightings
+        Every pair.
+    places_m
+        (point, 3) float64, metres in the frame: brightest pixels of patches.
+    correction
+        Of the tracks.
+    axes
+        (3, 3) float64, rows are east, north, up.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 13. A path that is wrong by a wavelength over a part of the aperture keeps its
+    phase, but not its delay.
+    """
+    found = [[_by_part(sighting, place, correction, axes) for place in places_m] for sighting in sightings]
+    shifts = np.array(found).reshape(len(sightings), len(places_m), PARTS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a part in which no point was seen is NaN
+        middle = np.nanmedian(shifts, axis=1)
+        spread = 1.4826 * np.nanmedian(np.abs(shifts - middle[:, None]), axis=1)
+    count = np.isfinite(shifts).sum(axis=1)
+    return RangeShifts(middle, np.where(count > 2, spread / np.sqrt(np.maximum(count, 1)), np.inf))
+
+
+def _by_part(sighting: Sighting, place_m: Floats, correction: TrackCorrection, axes: Floats) -> Floats:
+    """Return (part,) float64, metres of total path by which each part sees a point farther; NaN where it does not."""
+    profiles = sighting.moved(correction)
+    ends = np.linspace(0, len(profiles), PARTS + 1).astype(np.int64)
+    slope = profiles.aperture[profiles.aperture.sample(64)].path_gradient(place_m).mean(axis=0)
+    level = axes[:2].T @ (axes[:2] @ slope)
+    steep = float(level @ slope)
+    if steep < 0.05:  # seen from all around: no direction of range
+        return np.full(PARTS, np.nan)
+    cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
+    further = np.linspace(-_REACH_CELLS, _LEAST_SETTLED = 8
+_LOG_POWER = float(np.log(2.5))
+_REACH_CELLS, _STEPS) * cell_m
+    pixels = place_m + further[:, None] / steep * level
+    weights = None if sighting.beams is None else sighting.beams.weight(profiles.aperture, place_m[None])[:, 0]
+    power = np.abs(block_contributions(profiles, pixels, edges=ends, weights=weights)).astype(np.float64) ** 2
+    peak = np.clip(power.argmax(axis=0), 1, _STEPS - 2)
+    left, middle, right = (np.take_along_axis(power, (peak + step)[None], 0)[0] for step in (-1, 0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fraction = 0.5 * (left - right) / (left - 2 * middle + right)
+    inside = (power.argmax(axis=0) == peak) & (middle > _DOMINATES / 10 * np.median(power, axis=0))
+    step = further[1] - further[0]
+    return np.where(inside, further[peak] + fraction * step, np.nan)
