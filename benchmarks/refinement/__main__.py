@@ -1,8 +1,8 @@
 """Cases run one after another into a table that is taken up where it ended.
 
 `python -m benchmarks.refinement --cases five,forty/straight/joint/1,2,3/10/0-9 --out table.csv`: scenes, geometries,
-pairs, sigma in cm, SNR in dB and seeds; every combination is a row. Run with OPENBLAS_NUM_THREADS=1: seconds are those of
-one core.
+pairs, sigma in cm, SNR in dB and seeds; every combination is a row. Run with OPENBLAS_NUM_THREADS=1: seconds are then
+those of one core.
 """
 
 import argparse
