@@ -1,0 +1,63 @@
+"""Cases by which a refinement of tracks is judged: what they hold is what was asked."""
+
+import numpy as np
+import pytest
+from scenes import compiled
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.geometry.aperture import Aperture
+from apertura.refinement.inputs import TrackErrors
+from benchmarks.refinement import PROBES_M, case, judge
+from benchmarks.refinement.echoes import transfer
+from benchmarks.refinement.flights import drawn_errors
+from benchmarks.refinement.measures import peaks
+from benchmarks.refinement.scenes import Scatterers
+
+FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
+
+
+def test_echoes_are_those_of_the_plain_sum():
+    generator = np.random.default_rng(1)
+    places = generator.uniform((-9, 5, 0), (9, 25, 1), (30, 3))
+    amplitude = generator.standard_normal(30) + 1j * generator.standard_normal(30)
+    flown = Aperture(*(generator.uniform((-15, -1, 9), (15, 1, 11), (2, 40, 3))))
+    further = generator.uniform(-5, 5, 40)
+    exact = np.zeros((40, 128), complex)
+    for place, one in zip(places, amplitude, strict=True):
+        there, back = (np.linalg.norm(place - leg, axis=1) for leg in flown.legs)
+        path = (there + back + further)[:, None]
+        exact += (one / (there * back))[:, None] * np.exp(-2j * np.pi * FREQUENCY_HZ * path / SPEED_OF_LIGHT_M_S)
+    echo = transfer(Scatterers(places, amplitude, np.zeros(0, int)), flown, FREQUENCY_HZ, further_m=further)
+    assert np.linalg.norm(echo - exact) < 3e-6 * np.linalg.norm(exact)
+
+
+def test_errors_have_the_deviation_and_the_correlation_of_the_prior():
+    time_s, generator = np.arange(3000) / 100, np.random.default_rng(2)
+    errors = TrackErrors((0.01, 0.02, 0.03), correlation_s=1.0)
+    drawn = np.stack([drawn_errors(time_s, errors, generator) for _ in range(200)])
+    assert np.allclose(drawn.std((0, 1)), errors.std_m, rtol=0.05)
+    half = np.mean(drawn[:, 50:] * drawn[:, :-50], axis=(0, 1)) / np.square(errors.std_m)
+    assert np.allclose(half, 0.5, atol=0.05)
+
+
+@compiled
+@pytest.mark.parametrize("pairs", ["mono", "bi"])
+def test_the_true_tracks_lose_nothing_and_the_logs_what_the_theory_says(pairs):
+    one = case("five", "straight", pairs, 0.01, None, 3)
+    assert judge(one, one.truth).probe_loss_db == 0
+    found = peaks(one.probes, one.truth, PROBES_M, one.reach_m)
+    assert np.abs(found.place_m - PROBES_M).max() < 0.02
+    losses = [judge(case("five", "straight", pairs, 0.01, None, seed)).probe_loss_db for seed in range(3, 6)]
+    # 1 cm in each axis turns the echo by k·|g|·σ, |g| about 2: exp(-(2kσ)²), of which a search for the peak saves some
+    assert -2.2 < np.mean(losses) < -0.8
+
+
+@compiled
+def test_a_seed_keeps_its_tracks_and_noise_when_pairs_or_scene_change():
+    joint, mono = (case("five", "straight", pairs, 0.01, 10, 1) for pairs in ("joint", "mono"))
+    other = case("forty", "straight", "mono", 0.02, 10, 1)
+    assert np.array_equal(joint.sightings[0].profiles.samples, mono.sightings[0].profiles.samples)
+    assert np.allclose(other.truth.moved_m["uav1"], 2 * joint.truth.moved_m["uav1"])
+    assert not np.array_equal(
+        case("five", "straight", "mono", 0.01, 10, 2).truth.moved_m["uav1"], mono.truth.moved_m["uav1"]
+    )
