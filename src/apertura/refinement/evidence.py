@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.contributions import block_contributions
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.inputs import Sighting
+from apertura.refinement.blocks import Blocks, PatchEcho, Tracks
 from apertura.refinement.objective import Seen
-from apertura.refinement.patches import bandwidth_hz
+from apertura.refinement.patches import Patch, bandwidth_hz
+from apertura.refinement.solve import Problem, State
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +27,8 @@ _LEAST_SETTLED = 8
 _LOG_POWER = float(np.log(2.5))
 _REACH_CELLS, _STEPS = 1.5, 25
 _SLIP_SURE = 4.0
-_DOMINATES = 30.0  # peak power of a part's image of a point against its speckle
+_DOMINATES = 3.0  # peak power of a part's image of a point against the median of a line through it
+_LEAST_SLOPE = 0.05  # of the path over ground: a point seen from all around has no direction of range
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,19 +167,13 @@ class RangeShifts:
         return np.asarray((off > 0.6 * wavelength_m) & (off > _SLIP_SURE * self.std_m))
 
 
-def range_shifts(
-    sightings: Sequence[Sighting], places_m: Floats, correction: TrackCorrection, axes: Floats
-) -> RangeShifts:
-    """Return where parts of the aperture see some points in range.
+def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
+    """Return where parts of the aperture see the brightest point of every patch in range.
 
     Parameters
     ----------
-    sightings
-        Every pair.
-    places_m
-        (point, 3) float64, metres in the frame: brightest pixels of patches.
-    correction
-        Of the tracks.
+    problem, state
+        As solved.
     axes
         (3, 3) float64, rows are east, north, up.
 
@@ -188,8 +182,12 @@ def range_shifts(
     Source: docs/theory/autofocus.md, eq. 13. A path that is wrong by a wavelength over a part of the aperture keeps its
     phase, but not its delay.
     """
-    found = [[_by_part(sighting, place, correction, axes) for place in places_m] for sighting in sightings]
-    shifts = np.array(found).reshape(len(sightings), len(places_m), PARTS)
+    pairs = zip(problem.pairs, problem.echoes, state.images, strict=True)
+    found = [
+        [_by_part(blocks, echo, image, state.tracks, axes) for echo, image in zip(echoes, images, strict=True)]
+        for blocks, echoes, images in pairs
+    ]
+    shifts = np.array(found).reshape(len(problem.pairs), -1, PARTS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a part in which no point was seen is NaN
         middle = np.nanmedian(shifts, axis=1)
@@ -198,26 +196,25 @@ def range_shifts(
     return RangeShifts(middle, np.where(count > 2, spread / np.sqrt(np.maximum(count, 1)), np.inf))
 
 
-def _by_part(sighting: Sighting, place_m: Floats, correction: TrackCorrection, axes: Floats) -> Floats:
+def _by_part(
+    blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats
+) -> Floats:
     """Return (part,) float64, metres of total path by which each part sees a point farther; NaN where it does not."""
-    profiles = sighting.moved(correction)
-    ends = np.linspace(0, len(profiles), PARTS + 1).astype(np.int64)
-    slope = profiles.aperture[profiles.aperture.sample(64)].path_gradient(place_m).mean(axis=0)
+    nothing = np.full(PARTS, np.nan)
+    place = echo.patch.pixels_m[int(np.abs(image).argmax())]
+    slope = blocks.aperture.path_gradient(place).mean(axis=0)
     level = axes[:2].T @ (axes[:2] @ slope)
     steep = float(level @ slope)
-    if steep < 0.05:  # seen from all around: no direction of range
-        return np.full(PARTS, np.nan)
-    cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
-    further = np.linspace(-_REACH_CELLS, _LEAST_SETTLED = 8
-_LOG_POWER = float(np.log(2.5))
-_REACH_CELLS, _STEPS) * cell_m
-    pixels = place_m + further[:, None] / steep * level
-    weights = None if sighting.beams is None else sighting.beams.weight(profiles.aperture, place_m[None])[:, 0]
-    power = np.abs(block_contributions(profiles, pixels, edges=ends, weights=weights)).astype(np.float64) ** 2
+    if steep < _LEAST_SLOPE or len(echo.profiles) < PARTS:
+        return nothing
+    further = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles)
+    line = Patch(echo.patch.place_m, place + further[:, None] / steep * level)
+    values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values
+    ends = np.linspace(0, values.shape[1], PARTS + 1).astype(np.int64)[:-1]
+    power = np.abs(np.add.reduceat(values, ends, axis=1)).astype(np.float64) ** 2
     peak = np.clip(power.argmax(axis=0), 1, _STEPS - 2)
     left, middle, right = (np.take_along_axis(power, (peak + step)[None], 0)[0] for step in (-1, 0, 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = 0.5 * (left - right) / (left - 2 * middle + right)
-    inside = (power.argmax(axis=0) == peak) & (middle > _DOMINATES / 10 * np.median(power, axis=0))
-    step = further[1] - further[0]
-    return np.where(inside, further[peak] + fraction * step, np.nan)
+    curve = np.minimum(left - 2 * middle + right, -1e-300)
+    found = further[peak] + 0.5 * (left - right) / curve * (further[1] - further[0])
+    inside = (power.argmax(axis=0) == peak) & (middle > _DOMINATES * np.median(power, axis=0))
+    return np.where(inside, found, nothing)

@@ -17,7 +17,7 @@ SEEN_RAD = 0.03
 LEAST_SHIFT_M = 1e-3
 """Modes that move patches by less are left to the solver."""
 
-SURE_RAD = 0.3
+SURE_RAD = 0.1
 """A mode that turns phases by more is settled by the image, whatever the log says."""
 
 _PIECES = 5  # of the time for which a patch is seen, to a cubic piece of a smooth mode

@@ -13,6 +13,8 @@ Tracks = Mapping[str, Floats]
 
 MOST_WEIGHT = 1e4
 _WEIGHT_OF_RATIO = 3.0
+_SIDELOBES = 1e-3
+"""Power of a point's sidelobes beyond its own patch, of an aperture without weights, whatever its tracks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,7 @@ class Seen:
     contrast
         Σ|I|⁴/(Σ|I|²)².
     ratio
-        Peak power against that of the speckle about it: median/ln 2.
+        Peak power against that of what lies about it: speckle, median/ln 2, or sidelobes of brighter points.
     """
 
     energy: float
@@ -34,11 +36,11 @@ class Seen:
     ratio: float
 
     @classmethod
-    def of(cls, image: NDArray[np.complex64]) -> "Seen":
-        """Return what the image of a patch, (pixel,), shows."""
+    def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "Seen":
+        """Return what the image of a patch, (pixel,), shows beside others whose brightest pixel has so much power."""
         power = np.abs(image).astype(np.float64) ** 2
         energy = max(float(power.sum()), 1e-300)
-        about = max(float(np.median(power)) / np.log(2), 1e-300)
+        about = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
         return cls(energy, float((power**2).sum()) / energy**2, float(power.max()) / about)
 
     @property
@@ -80,10 +82,7 @@ class Sharpness:
         total = 0.0
         gradient = {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, patches, seen in zip(self.pairs, self.cached, self.seen, strict=True):
-            moved = {
-                node: blocks.average @ (tracks[node] - self.reference[node])
-                for node in dict.fromkeys(blocks.sighting.nodes)
-            }
+            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
             slopes = {node: np.zeros_like(move) for node, move in moved.items()}
             for patch, now, counts in zip(patches, seen, self.used, strict=True):
                 if counts:

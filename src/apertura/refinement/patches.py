@@ -34,13 +34,10 @@ class Patch:
         (3,) float64, metres in the frame.
     pixels_m
         (pixel, 3) float64, metres, level about the place.
-    cells
-        Resolution cells that a pixel stands for.
     """
 
     place_m: Floats
     pixels_m: Floats
-    cells: float
 
 
 def spread_out(places_m: Floats, axes: Floats, *, apart_m: float, count: int = MOST_PATCHES) -> Floats:
@@ -110,7 +107,7 @@ def patch_at(place_m: Floats, sightings: Sequence[Sighting], axes: Floats, *, co
              for reach, size in zip(half, cell, strict=True)]
     along, aside = np.meshgrid(*sides, indexing="ij")
     level = along[..., None] * across[0] + aside[..., None] * across[1]
-    return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2], _SAMPLING**2)
+    return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2])
 
 
 def bandwidth_hz(profiles: Profiles) -> float:

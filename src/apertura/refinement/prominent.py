@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.refinement.blocks import Blocks, Contribution
 from apertura.refinement.objective import Tracks
-from apertura.refinement.solve import Problem, minimal
+from apertura.refinement.solve import Problem, State, minimal
 
 Floats = NDArray[np.float64]
 
@@ -16,20 +16,19 @@ SMOOTHED = (2.0, 1.5, 1.0)
 """Standard deviation, in blocks, of what smooths phases before they are unwrapped: one per round."""
 
 
-def prominent(problem: Problem, start: Floats, used: NDArray[np.bool_], axes: Floats) -> Floats:
-    """Return the unknowns that explain the phase histories of the patches' brightest pixels, least squares with the prior.
+def prominent(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
+    """Return the tracks that explain the phase histories of the patches' brightest pixels, least squares with the prior.
 
     Notes
     -----
     Source: docs/theory/autofocus.md, eq. 11.
     """
-    unknowns = start
+    state = start
     for smoothed in SMOOTHED:
-        cached = problem.cached(unknowns)
-        histories = [[_History.of(patch, smoothed, axes) for patch in patches] for patches in cached]
-        fit = _Fit(problem.pairs, histories, problem.prior.tracks(unknowns), used)
-        unknowns = minimal(fit, problem.prior, problem.gauge, unknowns, iterations=40)
-    return unknowns
+        histories = [[_History.of(patch, smoothed, axes) for patch in patches] for patches in state.cached]
+        fit = _Fit(problem.pairs, histories, state.tracks, used)
+        state = problem.state(minimal(fit, problem.prior, problem.gauge, state.unknowns, iterations=40))
+    return state
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +65,7 @@ class _Fit:
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
         total, gradient = 0.0, {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, histories in zip(self.pairs, self.histories, strict=True):
-            moved = {
-                node: blocks.average @ (tracks[node] - self.reference[node])
-                for node in dict.fromkeys(blocks.sighting.nodes)
-            }
+            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
             for one, counts in zip(histories, self.used, strict=True):
                 if not counts:
                     continue

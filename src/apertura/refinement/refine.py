@@ -9,38 +9,41 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.blocks import Blocks, Contribution
+from apertura.refinement.blocks import Blocks
+from apertura.refinement.candidates import bright_places, east_north_up
 from apertura.refinement.evidence import Evidence, gains_db, range_shifts
 from apertura.refinement.gauge import Gauge, find_gauge
 from apertura.refinement.inputs import ReferencePoint, Sighting, TrackErrors
-from apertura.refinement.objective import Seen
 from apertura.refinement.outcome import Refinement
 from apertura.refinement.patches import Patch, patch_at, spread_out
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
-from apertura.refinement.solve import Problem
+from apertura.refinement.solve import Problem, State
 from apertura.refinement.ties import tied
 from apertura.refinement.uncertainty import remaining
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import Terrain
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LEAST_PATCHES = 4
-LEAST_RATIO = 12.0
-"""Peak power of a patch against its speckle: less is no point."""
+LEAST_RATIO = 5.0
+"""Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
 
 _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
 _HELD_OUT = 4  # every so many-th patch is not fitted
+_STAGES = 3  # of caching and sharpening
 _STARTS = ("log", "prominent points")
 
 
 def refine(
     sightings: Sequence[Sighting],
-    places_m: Floats,
+    grid: SceneGrid,
+    terrain: Terrain,
     errors: Mapping[str, TrackErrors],
     *,
-    axes: Floats,
     reference_points: Sequence[ReferencePoint] = (),
 ) -> Refinement:
     """Return the corrections of a flight's tracks that make its images sharpest, and whether they are to be believed.
@@ -49,12 +52,10 @@ def refine(
     ----------
     sightings
         What every pair saw.
-    places_m
-        (place, 3) float64, metres in the frame of the phase centres: bright places of the images, brightest first.
+    grid, terrain
+        The scene.
     errors
         Node → what is known of its log's errors.
-    axes
-        (3, 3) float64, rows are the unit vectors east, north, up at the scene, in the frame.
     reference_points
         Points whose places are known, to which the image is tied.
 
@@ -62,17 +63,17 @@ def refine(
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps what it found; images are formed without it.
     """
-    search = _Search.begin(sightings, places_m, errors, axes)
+    search = _Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
         return search.refused(errors, found=len(search.problem.patches))
     held_out = np.arange(len(search.problem.patches)) % _HELD_OUT == 2
-    fitted, evidence = search.judged(held_out)
+    state, evidence = search.judged(held_out)
     if evidence.accepted:
-        fitted = search.problem.solved(fitted, np.ones_like(held_out), stages=1)
-    left = remaining(search.problem, fitted)
-    fitted, ties = tied(search.problem, fitted, reference_points, axes)
+        state = search.problem.sharper(state, np.ones_like(held_out))
+    left = remaining(search.problem, state)
+    unknowns, ties = tied(search.problem, state.unknowns, reference_points, axes)
     report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
-    correction = search.problem.correction(fitted)
+    correction = search.problem.correction(unknowns)
     return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
 
 
@@ -82,50 +83,48 @@ class _Search:
 
     problem: Problem
     axes: Floats
-    before: list[list[Seen]]
+    begun: State
     wavelength_m: float
 
     @classmethod
     def begin(
-        cls, sightings: Sequence[Sighting], places_m: Floats, errors: Mapping[str, TrackErrors], axes: Floats
+        cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "_Search":
+        lasting_s = min(one.correlation_s for one in errors.values())
+        places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
+        axes = east_north_up(grid, places_m)
         knots_s = _knots(sightings, errors)
         prior = Prior({node: NodePrior.of(one, knots_s, axes) for node, one in sorted(errors.items())})
         pairs = [Blocks.of(sighting, knots_s) for sighting in sightings]
-        problem = Problem(pairs, _patches(sightings, places_m, errors, axes), knots_s, prior, Gauge.none(prior.size))
-        cached = problem.cached(np.zeros(prior.size))
-        seen = _seen(cached)
-        points = [number for number in range(len(problem.patches)) if max(p[number].ratio for p in seen) > LEAST_RATIO]
-        cached, seen = ([[one[number] for number in points] for one in many] for many in (cached, seen))
-        problem = replace(problem, patches=[problem.patches[number] for number in points])
-        if len(points) >= LEAST_PATCHES:
-            problem = replace(problem, gauge=find_gauge(pairs, cached, prior, knots_s, axes))
+        patches = _patches(sightings, places_m[ratio > LEAST_RATIO], lasting_s, axes)
+        echoes = [blocks.echoes(patches) for blocks in pairs]
+        problem = Problem(pairs, echoes, knots_s, prior, Gauge.none(prior.size))
+        begun = problem.state(np.zeros(prior.size))
+        if len(patches) >= LEAST_PATCHES:
+            problem = replace(problem, gauge=find_gauge(pairs, begun.cached, prior, knots_s, axes))
         wavelength_m = SPEED_OF_LIGHT_M_S / sightings[0].profiles.centre_frequency_hz
-        return cls(problem, axes, seen, wavelength_m)
+        return cls(problem, axes, begun, wavelength_m)
 
-    def judged(self, held_out: Bools) -> tuple[Floats, Evidence]:
+    def judged(self, held_out: Bools) -> tuple[State, Evidence]:
         """Return what the patches that are not held out ask for, and what the others say of it."""
-        problem, nothing = self.problem, np.zeros(self.problem.prior.size)
-        starts = [nothing, prominent(problem, nothing, ~held_out, self.axes)]
-        best, found, values = problem.lowest(starts, ~held_out)
-        cached = problem.cached(found)
-        gains = gains_db(self.before, _seen(cached))
-        sightings = [blocks.sighting for blocks in problem.pairs]
-        shifts = [
-            range_shifts(sightings, _brightest(problem.patches, one), self.problem.correction(tracks), self.axes)
-            for one, tracks in ((problem.cached(nothing), nothing), (cached, found))
-        ]
-        sure = problem.gauge.sure @ found
-        return found, Evidence(
-            fitted_db=gains[:, ~held_out],
+        problem, begun, fitted = self.problem, self.begun, ~held_out
+        points = prominent(problem, begun, fitted, self.axes)
+        states = [problem.sharper(start, fitted) for start in (begun, points)]
+        values = [problem.value(state, fitted, begun.seen) for state in states]
+        best = int(np.argmin(values))
+        state = problem.sharper(states[best], fitted, stages=_STAGES - 1)
+        gains = gains_db(begun.seen, state.seen)
+        evidence = Evidence(
+            fitted_db=gains[:, fitted],
             held_out_db=gains[:, held_out],
-            settled=sure,
-            before=shifts[0],
-            after=shifts[1],
+            settled=problem.gauge.sure @ state.unknowns,
+            before=range_shifts(problem, begun, self.axes),
+            after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
             start=_STARTS[best],
-            values=tuple(values),
+            values=tuple(map(float, values)),
         )
+        return state, evidence
 
     def refused(self, errors: Mapping[str, TrackErrors], *, found: int) -> Refinement:
         """Return that too few points stand out."""
@@ -141,18 +140,6 @@ class _Search:
         return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)
 
 
-def _seen(cached: Sequence[Sequence[Contribution]]) -> list[list[Seen]]:
-    return [[Seen.of(patch.values.sum(axis=1)) for patch in patches] for patches in cached]
-
-
-def _brightest(patches: Sequence[Patch], cached: Sequence[Sequence[Contribution]]) -> Floats:
-    """Return (patch, 3) float64, the brightest pixel of each patch over all pairs."""
-    power = [
-        sum(np.abs(one[number].values.sum(axis=1)) ** 2 for one in cached) for number in range(len(patches))
-    ]
-    return np.stack([patch.pixels_m[int(np.argmax(one))] for patch, one in zip(patches, power, strict=True)])
-
-
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:
     """Return equally spaced times: several to an error's correlation time, none closer than pulses."""
     first = min(float(one.time_s[0]) for one in sightings)
@@ -164,10 +151,7 @@ def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> 
     return first + (np.arange(count) + 0.5) * (last - first) / count
 
 
-def _patches(
-    sightings: Sequence[Sighting], places_m: Floats, errors: Mapping[str, TrackErrors], axes: Floats
-) -> list[Patch]:
-    lasting_s = min(one.correlation_s for one in errors.values())
+def _patches(sightings: Sequence[Sighting], places_m: Floats, lasting_s: float, axes: Floats) -> list[Patch]:
     if not len(places_m):
         return []
     typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.blocks import Blocks, Contribution
+from apertura.refinement.blocks import Blocks, Contribution, PatchEcho
 from apertura.refinement.gauge import Gauge
 from apertura.refinement.objective import Seen, Sharpness, Tracks
 from apertura.refinement.patches import Patch
@@ -16,8 +17,8 @@ from apertura.refinement.prior import Prior
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-STAGES, ITERATIONS = 3, 20
-"""Contributions are cached anew so often, and the sharpest tracks looked for in so many steps."""
+ITERATIONS = 20
+"""Steps towards the sharpest tracks before contributions are cached anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,8 @@ class Problem:
     ----------
     pairs
         Blocks of each pair.
-    patches
-        Of the scene.
+    echoes
+        Pair → patch → what it recorded of it.
     knots_s
         (knot,) float64, times of the corrections.
     prior
@@ -39,7 +40,7 @@ class Problem:
     """
 
     pairs: Sequence[Blocks]
-    patches: Sequence[Patch]
+    echoes: Sequence[Sequence[PatchEcho]]
     knots_s: Floats
     prior: Prior
     gauge: Gauge
@@ -48,36 +49,72 @@ class Problem:
         """Return the corrections of some unknowns."""
         return TrackCorrection(self.knots_s, self.prior.tracks(unknowns))
 
-    def cached(self, unknowns: Floats) -> list[list[Contribution]]:
-        """Return pair → patch → what blocks add there from tracks as corrected."""
-        correction = self.correction(unknowns)
-        return [blocks.contributions(self.patches, correction) for blocks in self.pairs]
-
-    def solved(self, start: Floats, used: Bools, *, stages: int = STAGES) -> Floats:
-        """Return the unknowns at which the patches used are sharpest, from `start` on."""
-        unknowns = start
-        for _ in range(stages):
-            unknowns = self._stage(unknowns, used)
-        return unknowns
-
-    def lowest(self, starts: Sequence[Floats], used: Bools) -> tuple[int, Floats, list[float]]:
-        """Return which start leads lowest, where to, and the value of each, all with the weights of the first."""
-        found = [self.solved(start, used) for start in starts]
-        first = [[Seen.of(patch.values.sum(axis=1)) for patch in patches] for patches in self.cached(starts[0])]
-        values = [self._value(unknowns, used, first) for unknowns in found]
-        best = int(np.argmin(values))
-        return best, found[best], values
-
-    def _value(self, unknowns: Floats, used: Bools, weights: Sequence[Sequence[Seen]]) -> float:
+    def state(self, unknowns: Floats) -> "State":
+        """Return what blocks add to the patches from tracks as corrected."""
         tracks = self.prior.tracks(unknowns)
-        value, _ = Sharpness(self.pairs, self.cached(unknowns), tracks, weights, used)(tracks)
-        return value + 0.5 * float(unknowns @ unknowns)
+        cached = []
+        for blocks, echoes in zip(self.pairs, self.echoes, strict=True):
+            moved = blocks.moves(tracks)
+            cached.append([blocks.contribution(echo, moved) for echo in echoes])
+        return State(unknowns, tracks, cached)
 
-    def _stage(self, unknowns: Floats, used: Bools) -> Floats:
-        cached = self.cached(unknowns)
-        seen = [[Seen.of(patch.values.sum(axis=1)) for patch in patches] for patches in cached]
-        sharpness = Sharpness(self.pairs, cached, self.prior.tracks(unknowns), seen, used)
-        return minimal(sharpness, self.prior, self.gauge, unknowns)
+    @property
+    def patches(self) -> list[Patch]:
+        """Of the scene."""
+        return [echo.patch for echo in self.echoes[0]]
+
+    def of(self, patches: Sequence[int]) -> "Problem":
+        """Return the problem of some of its patches."""
+        return replace(self, echoes=[[echoes[number] for number in patches] for echoes in self.echoes])
+
+    def sharper(self, state: "State", used: Bools, *, stages: int = 1) -> "State":
+        """Return the tracks at which the patches used are sharpest, from a state on."""
+        for _ in range(stages):
+            sharpness = Sharpness(self.pairs, state.cached, state.tracks, state.seen, used)
+            state = self.state(minimal(sharpness, self.prior, self.gauge, state.unknowns))
+        return state
+
+    def value(self, state: "State", used: Bools, weights: Sequence[Sequence[Seen]]) -> float:
+        """Return what is to be small, with the weights and energies of another state."""
+        value, _ = Sharpness(self.pairs, state.cached, state.tracks, weights, used)(state.tracks)
+        return value + 0.5 * float(state.unknowns @ state.unknowns)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Tracks, and the patches as seen from them.
+
+    Attributes
+    ----------
+    unknowns
+        (unknown,) float64, of the prior.
+    tracks
+        Node → (knot, 3) float64, metres: the corrections.
+    cached
+        Pair → patch → what its blocks add.
+    """
+
+    unknowns: Floats
+    tracks: Tracks
+    cached: Sequence[Sequence[Contribution]]
+
+    @cached_property
+    def images(self) -> list[list[NDArray[np.complex64]]]:
+        """Pair → patch → (pixel,) complex64."""
+        return [[patch.values.sum(axis=1) for patch in patches] for patches in self.cached]
+
+    @cached_property
+    def seen(self) -> list[list[Seen]]:
+        """Pair → patch → what it shows."""
+        seen = []
+        for images in self.images:
+            brightest = max((float(np.abs(image).max()) ** 2 for image in images), default=0.0)
+            seen.append([Seen.of(image, brightest) for image in images])
+        return seen
+
+    def of(self, patches: Sequence[int]) -> "State":
+        """Return the state of some patches."""
+        return replace(self, cached=[[cached[number] for number in patches] for cached in self.cached])
 
 
 def minimal(

@@ -42,13 +42,14 @@ def tied(
         return unknowns, {}
     correction = problem.correction(unknowns)
     rows, apart, report = [], [], []
-    tracks = problem.prior.tracks(problem.gauge.modes)
+    found_tracks, tracks = problem.prior.tracks(unknowns), problem.prior.tracks(problem.gauge.modes)
     lasting_s = problem.knots_s[1] - problem.knots_s[0]
     for point in points:
         place = np.array(point.place_m)
         patch = patch_at(place, [blocks.sighting for blocks in problem.pairs], axes, correlation_s=10 * lasting_s)
         for blocks in problem.pairs:
-            [seen] = blocks.contributions([patch], correction)
+            [echo] = blocks.echoes([patch])
+            seen = blocks.contribution(echo, blocks.moves(found_tracks))
             power = np.abs(seen.values.sum(axis=1)) ** 2
             if power.max() < _LEAST_RATIO * np.median(power) / np.log(2):
                 continue

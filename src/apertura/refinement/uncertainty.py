@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.refinement.objective import Seen
-from apertura.refinement.solve import Problem
+from apertura.refinement.solve import Problem, State
 
 Floats = NDArray[np.float64]
 
@@ -43,7 +42,7 @@ class Remaining:
         }
 
 
-def remaining(problem: Problem, unknowns: Floats) -> Remaining:
+def remaining(problem: Problem, state: State) -> Remaining:
     """Return what is left unknown: per knot the log's errors and all phases seen while they last, together.
 
     Notes
@@ -56,11 +55,10 @@ def remaining(problem: Problem, unknowns: Floats) -> Remaining:
     for node, prior in nodes.items():
         known[:, column[node], column[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
     rows: list[tuple[slice, Floats]] = []
-    cached = problem.cached(unknowns)
     smooth = max(prior.smooth for prior in nodes.values())
-    for patches in cached:
-        for patch in patches:
-            ratio = min(Seen.of(patch.values.sum(axis=1)).ratio, _MOST_RATIO)
+    for patches, seen in zip(state.cached, state.seen, strict=True):
+        for patch, now in zip(patches, seen, strict=True):
+            ratio = min(now.ratio, _MOST_RATIO)
             row = np.zeros((patch.blocks.stop - patch.blocks.start, 3 * len(nodes)))
             for node, slope in patch.slopes.items():
                 row[:, column[node]] = patch.wavenumber * slope

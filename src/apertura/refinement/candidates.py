@@ -1,0 +1,101 @@
+"""Where points may stand: bright places of images of short parts of the aperture, which errors of tracks blur least."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.engines import load_engine
+from apertura.geometry.geodesy import ned_axes
+from apertura.refinement.inputs import Sighting
+from apertura.refinement.patches import bandwidth_hz
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import Terrain
+
+Floats = NDArray[np.float64]
+
+MOST_LOOKS = 24
+"""Parts of the aperture: each as long as an error lasts, or longer."""
+
+_SIDE_PX = 512
+_ABOUT_CELLS = 12  # of range: how far a place is compared with what lies about it
+_SIDELOBES = 1e-3  # of the brightest: what stands out of nothing may be its sidelobe
+_MOST_PLACES = 500
+
+
+def bright_places(
+    sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, lasting_s: float
+) -> tuple[Floats, Floats]:
+    """Return places that stand out of what lies about them in the images of all pairs, and by how much.
+
+    Parameters
+    ----------
+    sightings
+        What every pair saw.
+    grid, terrain
+        The scene.
+    lasting_s
+        How long an error of the tracks lasts.
+
+    Returns
+    -------
+    places_m : ndarray
+        (place, 3) float64, metres in the frame, those that stand out most first.
+    ratio : ndarray
+        (place,) float64, power there against what lies about it, summed over parts of the aperture.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, "Patches". Power is summed over images of parts of the aperture, on every so many-th
+    pixel of the grid; each part as long as an error lasts is focused whatever the error.
+    """
+    from scipy.ndimage import maximum_filter, median_filter  # slow to import
+
+    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in sightings) / 2
+    step = max(1, int(cell_m / 2 / grid.spacing_m))
+    rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
+    power = np.zeros((len(rows), len(columns)))
+    for one in sightings:
+        image = np.zeros_like(power)
+        for part in _parts(len(rows), len(columns)):
+            row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
+            places = terrain.positions_at(grid, row, column)
+            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, lasting_s))
+        power += image / max(float(np.nanmean(image)), 1e-300)
+    power = np.nan_to_num(power)
+    reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
+    about = median_filter(power[:: reach // 3 or 1, :: reach // 3 or 1], size=7, mode="nearest")
+    about = np.repeat(np.repeat(about, reach // 3 or 1, 0), reach // 3 or 1, 1)[: power.shape[0], : power.shape[1]]
+    ratio = power / np.maximum(about, _SIDELOBES * power.max())
+    top = (maximum_filter(power, 2 * max(1, reach // 6) + 1) == power) & (power > 0)
+    row, column = np.nonzero(top)
+    order = np.argsort(-ratio[row, column], kind="stable")[:_MOST_PLACES]
+    row, column = row[order], column[order]
+    return terrain.positions_at(grid, rows[row], columns[column]), ratio[row, column]
+
+
+def east_north_up(grid: SceneGrid, places_m: Floats) -> Floats:
+    """Return (3, 3) float64, rows are the unit vectors east, north, up at the scene, in the frame."""
+    if grid.frame == "local" or not len(places_m):
+        return np.eye(3)
+    north, east, down = ned_axes(places_m.mean(axis=0)[None])[0].T
+    return np.stack([east, north, -down])
+
+
+def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
+    for row in range(0, rows, _SIDE_PX):
+        for column in range(0, columns, _SIDE_PX):
+            yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
+
+
+def _looks(one: Sighting, places: Floats, lasting_s: float) -> Iterator[NDArray[np.complex64]]:
+    """Yield the image of each part of the aperture."""
+    engine = load_engine("native")
+    if not engine.available():
+        engine = load_engine("numba")
+    spans_s = float(one.time_s[-1] - one.time_s[0])
+    count = int(np.clip(spans_s / max(lasting_s, 1e-9), 1, MOST_LOOKS))
+    for pulses in one.profiles.aperture.blocks(count):
+        beams = None if one.beams is None else one.beams[pulses]
+        yield engine.form(engine.prepare(one.profiles[pulses]), places, beams=beams)
