@@ -106,7 +106,7 @@ def test_neither_value_nor_slope_jumps_where_another_sample_becomes_the_nearest(
     for of_end in (0.5**power, power * 0.5 ** (power - 1.0)):
         sign = (-1.0) ** (power if of_end[0] else power + 1)
         ahead, behind = of_end @ tap_polynomials(), (sign * of_end) @ tap_polynomials()
-        assert np.abs(np.append(ahead, 0) - np.append(0, behind)).max() < 1e-6
+        assert np.abs(np.append(ahead, 0) - np.append(0, behind)).max() < 1e-12
 
 
 @pytest.mark.usefixtures("way")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import apertura as ap
 from apertura.antenna.beam import Beams
@@ -178,6 +179,25 @@ def test_gradients_of_patches_add_up():
 def test_what_does_not_fit_is_refused(slope, places, said):
     with pytest.raises(ValueError, match=said):
         path_gradient(PROFILES, places, slope)
+
+
+def test_a_stage_of_profiles_does_as_well_as_arrays_and_other_stages_are_refused():
+    profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
+    patch, slope = TARGET_GRID[60:70, 60:70], np.full((10, 10), 1 + 1j)
+    stage = xr.Dataset(
+        {
+            "profile": (("pulse", "range"), profiles.samples),
+            "start": ("pulse", profiles.start_m),
+            "tx_position": (("pulse", "axis"), profiles.aperture.tx_m),
+            "rx_position": (("pulse", "axis"), profiles.aperture.rx_m),
+        },
+        attrs={name: getattr(profiles, name) for name in ("step_m", "centre_frequency_hz", "oversampling")},
+    )
+    one, other = (ap.gradient(given, patch, slope) for given in (profiles, stage))
+    assert np.array_equal(one.rx_m, other.rx_m)
+    for given in (point_history(), stage.drop_vars("profile")):
+        with pytest.raises(TypeError, match="must be profiles or a stage profile"):
+            ap.gradient(given, patch, slope)
 
 
 def test_the_front_door_wants_a_slope_for_each_pixel():

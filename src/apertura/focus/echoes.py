@@ -19,13 +19,13 @@ _VALUES_AT_ONCE = 2**17  # pulses × places: of beams, and without the compiled 
 
 
 @lru_cache
-def tap_polynomials() -> NDArray[np.float32]:
+def tap_polynomials() -> NDArray[np.float64]:
     """Return the weight of each sample about a place as a polynomial of where between its neighbours the place is.
 
     Returns
     -------
     ndarray
-        (degree + 1, tap) float32, constant term first; of -½…½ from the middle between taps 3 and 4.
+        (degree + 1, tap) float64, constant term first; of -½…½ from the middle between taps 3 and 4.
 
     Notes
     -----
@@ -51,7 +51,12 @@ def tap_polynomials() -> NDArray[np.float32]:
     left, right = (np.concatenate([part.real, part.imag]) for part in (given, wanted))
     free = _joined()
     found = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
-    return np.asarray(found.reshape(TAPS, DEGREE + 1).T, np.float32, order="C")
+    return np.ascontiguousarray(found.reshape(TAPS, DEGREE + 1).T)
+
+
+@lru_cache
+def _rounded_taps() -> NDArray[np.float32]:
+    return tap_polynomials().astype(np.float32)
 
 
 def _joined() -> NDArray[np.float64]:
@@ -138,7 +143,7 @@ class Echoes:
         near = np.clip(first, 0, None)[..., None] + np.arange(TAPS)
         pulse = np.arange(len(self))[:, None, None]
         samples = self.samples[pulse, 0, near] + 1j * self.samples[pulse, 1, near]
-        u, taps = at - 0.5 - whole, tap_polynomials().astype(np.float64)
+        u, taps = at - 0.5 - whole, tap_polynomials()
         powers = u[..., None] ** np.arange(DEGREE + 1)
         level = np.einsum("pxn,nt,pxt->px", powers, taps, samples)
         rate = np.einsum("pxn,nt,pxt->px", powers[..., :-1], taps[1:] * np.arange(1, DEGREE + 1)[:, None], samples)
@@ -158,7 +163,7 @@ def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.flo
     weight
         (place or 1, pulse) float32, contiguous: of each pulse at each place, or at all.
     """
-    arrays = (echoes.samples, tap_polynomials(), echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m)
+    arrays = (echoes.samples, _rounded_taps(), echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m)
     return EchoJob(
         *(array.ctypes.data for array in arrays),
         pulses=len(echoes),

@@ -49,6 +49,8 @@ def gradient(
 
     Raises
     ------
+    TypeError
+        If other than profiles are given: `range_compress` makes them from a phase history.
     ValueError
         If `dj_dimage` is not of the grid's shape, or it or a position on the ground is not finite.
     CampaignError
@@ -78,6 +80,8 @@ def gradient(
     (64, True, (128,))
     """
     if not isinstance(profiles, Profiles):
+        if "profile" not in getattr(profiles, "variables", ()):
+            raise TypeError(f"{type(profiles).__name__}: must be profiles or a stage profile, as of range_compress")
         profiles = profiles_of(profiles, lazy=True)
     slope = np.asarray(dj_dimage, np.complex128)
     if slope.shape != grid.shape:
