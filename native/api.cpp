@@ -14,7 +14,8 @@ using apertura::Patch;
 #define APERTURA_DECLARE(isa)                                                                     \
   extern "C" void apertura_add_##isa(const ApertureJob*, const Patch*, int64_t, int64_t, float*); \
   extern "C" void apertura_expand_##isa(const TableJob*, float*);                                 \
-  extern "C" void apertura_contribute_##isa(const EchoJob*);
+  extern "C" void apertura_contribute_##isa(const EchoJob*);                                      \
+  extern "C" void apertura_differentiate_##isa(const EchoJob*);
 
 APERTURA_DECLARE(portable)
 #ifdef APERTURA_X86
@@ -31,6 +32,7 @@ struct Isa {
   void (*add)(const ApertureJob*, const Patch*, int64_t, int64_t, float*);
   void (*expand)(const TableJob*, float*);
   void (*contribute)(const EchoJob*);
+  void (*differentiate)(const EchoJob*);
 };
 
 // Fastest first.
@@ -42,10 +44,13 @@ const Isa* find(const char* name) {
 #endif
   static const Isa isas[] = {
 #ifdef APERTURA_X86
-      {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512},
-      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2},
+      {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
+       apertura_differentiate_avx512},
+      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2,
+       apertura_differentiate_avx2},
 #endif
-      {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable},
+      {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable,
+       apertura_differentiate_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
@@ -140,6 +145,10 @@ __attribute__((visibility("default"))) int apertura_image(const char* name, cons
 
 __attribute__((visibility("default"))) int apertura_contribute(const char* name, const EchoJob* job) {
   return run(name, [job](const Isa& isa) { isa.contribute(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_differentiate(const char* name, const EchoJob* job) {
+  return run(name, [job](const Isa& isa) { isa.differentiate(job); });
 }
 
 }  // extern "C"

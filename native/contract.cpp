@@ -73,6 +73,8 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(EchoJob, edges),
     APERTURA_FIELD(EchoJob, columns),
     APERTURA_FIELD(EchoJob, sums),
+    APERTURA_FIELD(EchoJob, objective),
+    APERTURA_FIELD(EchoJob, slopes),
     APERTURA_FIELD(EchoJob, pulses),
     APERTURA_FIELD(EchoJob, length),
     APERTURA_FIELD(EchoJob, count),

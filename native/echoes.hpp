@@ -117,4 +117,50 @@ inline void contribute(const EchoJob& job) {
   }
 }
 
+// (7): what the objective gains at one pixel per metre that the path of each pulse of a run grows.
+inline void path_slopes(const EchoJob& job, const Weights& weights, const Looks& looks, int64_t pixel, int64_t run,
+                        int64_t count, float* slope) {
+  const float re = job.objective[2 * pixel], im = job.objective[2 * pixel + 1];
+  const float per_metre = float(job.samples_per_metre), wavenumber = float(6.283185307179586 * job.turns_per_metre);
+  for (int64_t i = 0; i < count; i++) {
+    // q = conj(G) exp(j k R); Re(q (s' + j k s)), with s and s' written out as sums over samples.
+    const float qr = re * looks.cosine[i] + im * looks.sine[i], qi = re * looks.sine[i] - im * looks.cosine[i];
+    const float* row = job.samples + (run + i) * 2 * job.length + looks.first[i];
+    const Taps level = weights(looks.u[i]) * wavenumber, rate = weights.slope(looks.u[i]) * per_metre;
+    slope[i] =
+        total(load_taps(row) * (rate * qr - level * qi) - load_taps(row + job.length) * (rate * qi + level * qr));
+  }
+}
+
+// (8): a phase centre that moves changes the path by the unit vector from the pixel to it.
+inline void add_directions(const double* antenna, int64_t pulses, int64_t count, const double* place,
+                           const float* slope, double (*sum)[kRun]) {
+  for (int64_t i = 0; i < count; i++) {
+    const double x = antenna[i] - place[0], y = antenna[pulses + i] - place[1], z = antenna[2 * pulses + i] - place[2];
+    const double share = slope[i] / __builtin_sqrt(x * x + y * y + z * z);
+    sum[0][i] += share * x, sum[1][i] += share * y, sum[2][i] += share * z;
+  }
+}
+
+inline void differentiate(const EchoJob& job) {
+  const Weights weights(job.taps);
+  Looks looks;
+  alignas(64) float slope[kRun];
+  for (int64_t run = 0; run < job.pulses; run += kRun) {
+    const int64_t count = job.pulses - run < kRun ? job.pulses - run : kRun;
+    alignas(64) double sum[7][kRun] = {};
+    for (int64_t pixel = 0; pixel < job.count; pixel++) {
+      const double* place = job.pixels + 3 * pixel;
+      look(job, pixel, run, count, looks);
+      path_slopes(job, weights, looks, pixel, run, count, slope);
+      add_directions(job.transmitter + run, job.pulses, count, place, slope, sum);
+      add_directions(job.receiver + run, job.pulses, count, place, slope, sum + 3);
+      // Echoes that lie further are looked for as if the path were shorter.
+      for (int64_t i = 0; i < count; i++) sum[6][i] -= slope[i];
+    }
+    for (int64_t axis = 0; axis < 7; axis++)
+      for (int64_t i = 0; i < count; i++) job.slopes[axis * job.pulses + run + i] += sum[axis][i];
+  }
+}
+
 }  // namespace

@@ -65,6 +65,8 @@ struct EchoJob {
   const int64_t* edges;       // (blocks + 1): pulses edges[b] .. edges[b + 1] are added to columns[b]
   const int64_t* columns;     // (blocks)
   float* sums;                // (count, width, 2): re, im, to be added to
+  const float* objective;     // (count, 2): re, im of what an objective gains per change of the sum at a pixel
+  double* slopes;             // (7, pulses), to be added to: of transmitter (3), receiver (3) and path
   int64_t pulses, length, count, blocks, width;
   int64_t weight_step;  // from one pixel's weights to the next: 0 or pulses
   double samples_per_metre, turns_per_metre;

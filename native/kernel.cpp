@@ -95,3 +95,5 @@ extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_ISA)(const TableJob* jo
 }
 
 extern "C" void APERTURA_JOIN(apertura_contribute_, APERTURA_ISA)(const EchoJob* job) { contribute(*job); }
+
+extern "C" void APERTURA_JOIN(apertura_differentiate_, APERTURA_ISA)(const EchoJob* job) { differentiate(*job); }

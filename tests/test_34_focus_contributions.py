@@ -7,7 +7,7 @@ import pytest
 
 from apertura.focus.band_limited import band_limited_image
 from apertura.focus.contributions import block_contributions
-from apertura.focus.echoes import TAPS
+from apertura.focus.echoes import DEGREE, TAPS, tap_polynomials
 from apertura.focus.engines import native, native_binding
 from tests.scenes import compiled, decibels, ecef, fly, pixel_grid, scatter
 
@@ -99,6 +99,14 @@ def test_at_the_ends_samples_beyond_count_as_zero():
     edge[:, 15:-15] = short.samples
     same = block_contributions(replace(PROFILES, samples=edge), PLACES, edges=EVEN)
     assert np.allclose(block_contributions(short, PLACES, edges=EVEN), same, atol=2e-5 * np.abs(same).max())
+
+
+def test_neither_value_nor_slope_jumps_where_another_sample_becomes_the_nearest():
+    power = np.arange(DEGREE + 1)
+    for of_end in (0.5**power, power * 0.5 ** (power - 1.0)):
+        sign = (-1.0) ** (power if of_end[0] else power + 1)
+        ahead, behind = of_end @ tap_polynomials(), (sign * of_end) @ tap_polynomials()
+        assert np.abs(np.append(ahead, 0) - np.append(0, behind)).max() < 1e-12
 
 
 @pytest.mark.usefixtures("way")

@@ -26,6 +26,7 @@ _PUBLIC = {
     "Profiles": "apertura.focus.inputs",
     "SceneGrid": "apertura.scene.grid",
     "backproject": "apertura.imaging.backproject",
+    "gradient": "apertura.imaging.gradient",
     "open_campaign": "apertura.load.results",
     "open_dem": "apertura.scene.dem_file",
     "range_compress": "apertura.imaging.range_profiles",

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.focus.echoes import Echoes, pulses_at_once, tap_polynomials, tiles
-from apertura.focus.engines.native_binding import EchoJob, available, call
+from apertura.focus.echoes import Echoes, job_of, pulses_at_once, tiles
+from apertura.focus.engines.native_binding import available, call
 from apertura.focus.inputs import Profiles
 
 Piece = tuple[int, slice]
@@ -104,13 +104,10 @@ def _add_compiled(
     sums: NDArray[np.complex64],
 ) -> None:
     columns = np.array([block for block, _part in pieces], np.int64)
-    taps, weight, borders = tap_polynomials(), weights.astype(np.float32), _borders(pieces)
-    arrays = (echoes.samples, taps, echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m, borders, columns, sums)
-    job = EchoJob(
-        *(array.ctypes.data for array in arrays),
-        len(echoes), echoes.samples.shape[2], len(places_m), columns.size, sums.shape[1], 0,
-        1 / echoes.step_m, echoes.turns_per_m,
-    )  # fmt: skip
+    weight, borders = weights.astype(np.float32)[None], _borders(pieces)
+    job = job_of(echoes, places_m, weight)
+    job.edges, job.columns, job.sums = borders.ctypes.data, columns.ctypes.data, sums.ctypes.data
+    job.blocks, job.width = columns.size, sums.shape[1]
     call("apertura_contribute", job)
 
 

@@ -8,27 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.engines.native_binding import EchoJob
 from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.inputs import Profiles
 
 TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree
 
 _BYTES_AT_ONCE = 2**25  # of samples
-_VALUES_AT_ONCE = 2**15  # pulses × pixels, without the compiled library
+_VALUES_AT_ONCE = 2**17  # pulses × places: of beams, and without the compiled library
 
 
 @lru_cache
-def tap_polynomials() -> NDArray[np.float32]:
+def tap_polynomials() -> NDArray[np.float64]:
     """Return the weight of each sample about a place as a polynomial of where between its neighbours the place is.
 
     Returns
     -------
     ndarray
-        (degree + 1, tap) float32, constant term first; of -½…½ from the middle between taps 3 and 4.
+        (degree + 1, tap) float64, constant term first; of -½…½ from the middle between taps 3 and 4.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles.
+    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles, value and
+    slope steady from one sample to the next.
 
     Examples
     --------
@@ -38,16 +40,34 @@ def tap_polynomials() -> NDArray[np.float32]:
     True
     """
     omega = np.pi / 2 * np.cos(np.pi * (np.arange(160) + 0.5) / 160)
-    place, share = np.polynomial.legendre.leggauss(24)
-    place = place / 2
+    place, share = (part / 2 for part in np.polynomial.legendre.leggauss(24))
+    powers = place[:, None] ** np.arange(DEGREE + 1)
     tap = np.arange(TAPS) - (TAPS - 1) / 2
-    given = np.exp(1j * omega[:, None] * tap)[:, None, None, :] * (place[:, None] ** np.arange(DEGREE + 1))[..., None]
-    wanted = np.exp(1j * omega[:, None] * place)
     root = np.sqrt(share)
-    given, wanted = given * root[:, None, None], wanted * root
-    columns, wanted = given.reshape(wanted.size, -1), wanted.ravel()
-    left, right = (np.concatenate([part.real, part.imag]) for part in (columns, wanted))
-    return np.asarray(np.linalg.lstsq(left, right, rcond=None)[0].reshape(DEGREE + 1, TAPS), np.float32)
+    given = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
+        -1, powers[0].size * TAPS
+    )
+    wanted = (np.exp(1j * omega[:, None] * place) * root).ravel()
+    left, right = (np.concatenate([part.real, part.imag]) for part in (given, wanted))
+    free = _joined()
+    found = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
+    return np.ascontiguousarray(found.reshape(TAPS, DEGREE + 1).T)
+
+
+@lru_cache
+def _rounded_taps() -> NDArray[np.float32]:
+    return tap_polynomials().astype(np.float32)
+
+
+def _joined() -> NDArray[np.float64]:
+    """Return (tap·power, free) the polynomials whose weights and slopes go on where the next sample becomes nearest."""
+    power = np.arange(DEGREE + 1)
+    joins: list[NDArray[np.float64]] = []
+    for end in (0.5**power, power * 0.5 ** (power - 1.0)):
+        parity = end * (-1.0) ** (power + len(joins))
+        joins.append(np.kron(np.eye(TAPS + 1, TAPS), end) - np.kron(np.eye(TAPS + 1, TAPS, k=-1), parity))
+    conditions = np.concatenate(joins)
+    return np.linalg.qr(conditions.T, mode="complete")[0][:, len(conditions) :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +143,36 @@ class Echoes:
         near = np.clip(first, 0, None)[..., None] + np.arange(TAPS)
         pulse = np.arange(len(self))[:, None, None]
         samples = self.samples[pulse, 0, near] + 1j * self.samples[pulse, 1, near]
-        u, taps = at - 0.5 - whole, tap_polynomials().astype(np.float64)
+        u, taps = at - 0.5 - whole, tap_polynomials()
         powers = u[..., None] ** np.arange(DEGREE + 1)
         level = np.einsum("pxn,nt,pxt->px", powers, taps, samples)
         rate = np.einsum("pxn,nt,pxt->px", powers[..., :-1], taps[1:] * np.arange(1, DEGREE + 1)[:, None], samples)
         carrier = np.exp(2j * np.pi * np.remainder(self.turns_per_m * path, 1.0))
         return level * carrier, (rate / self.step_m + 2j * np.pi * self.turns_per_m * level) * carrier
+
+
+def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.float32]) -> EchoJob:
+    """Return the job of looking at some places, for the compiled library; what it shall give is still to be set.
+
+    Parameters
+    ----------
+    echoes
+        Held by the caller while the job runs, as are the other arrays.
+    places_m
+        (place, 3) float64, contiguous.
+    weight
+        (place or 1, pulse) float32, contiguous: of each pulse at each place, or at all.
+    """
+    arrays = (echoes.samples, _rounded_taps(), echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m)
+    return EchoJob(
+        *(array.ctypes.data for array in arrays),
+        pulses=len(echoes),
+        length=echoes.samples.shape[2],
+        count=len(places_m),
+        weight_step=len(echoes) if len(weight) > 1 else 0,
+        samples_per_metre=1 / echoes.step_m,
+        turns_per_metre=echoes.turns_per_m,
+    )
 
 
 def pulses_at_once(profiles: Profiles) -> int:

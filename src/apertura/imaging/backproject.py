@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import illuminate
-from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job
 from apertura.imaging.checks import check_inputs
@@ -23,7 +22,7 @@ from apertura.planning.planner import make_plan
 from apertura.quality.error_bound import CONFIDENCE, ErrorBound, error_bound
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import FlatGround, Terrain
+from apertura.scene.terrain import Terrain, ground_of
 from apertura.validation import validated
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ def backproject(
         expected="choices of ImagingChoices",
     )
     inputs = inputs_of(profiles, asked.window)
-    ground = _ground(terrain, grid)
+    ground = ground_of(terrain, grid)
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     models = GroundModels.of(ground, None, grid)
@@ -145,17 +144,6 @@ def backproject(
         "flags": json.dumps({**flags, **plan.flags}, ensure_ascii=False),
     }
     return xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
-
-
-def _ground(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
-    if terrain is None and grid.frame == "ecef":
-        raise CampaignError(
-            "no terrain for a grid on Earth",
-            where="backproject: terrain",
-            expected=f"how high the ground of {grid.crs} is above its ellipsoid",
-            remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
-        )
-    return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:

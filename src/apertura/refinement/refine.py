@@ -71,7 +71,7 @@ def refine(
     if evidence.accepted:
         state = search.problem.sharper(state, np.ones_like(held_out))
     left = remaining(search.problem, state)
-    unknowns, ties = tied(search.problem, state.unknowns, reference_points, axes)
+    unknowns, ties = tied(search.problem, state.unknowns, reference_points, search.axes)
     report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
     correction = search.problem.correction(unknowns)
     return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)

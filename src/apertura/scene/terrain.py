@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apertura.errors import CampaignError
 from apertura.scene.grid import SceneGrid
 
 Floats = NDArray[np.float64]
@@ -154,6 +155,29 @@ class Plane(Terrain):
     def spec(self) -> dict[str, Any]:
         """A point and the slope."""
         return asdict(self)
+
+
+def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
+    """Return the ground that was given, flat where it is one height; in a local frame it may be left out, and is at 0.
+
+    Raises
+    ------
+    CampaignError
+        If it was left out of a grid on Earth.
+
+    Examples
+    --------
+    >>> ground_of(2.5, SceneGrid("local", 0.0, 0.0, 1.0, (4, 4)))
+    FlatGround(height_m=2.5)
+    """
+    if terrain is None and grid.frame == "ecef":
+        raise CampaignError(
+            "no terrain for a grid on Earth",
+            where="terrain",
+            expected=f"how high the ground of {grid.crs} is above its ellipsoid",
+            remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
+        )
+    return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
 
 
 class _Array(Protocol):

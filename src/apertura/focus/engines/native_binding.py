@@ -69,7 +69,7 @@ class EchoJob(ctypes.Structure):
 
     _fields_ = [
         *((name, _pointer) for name in ("samples", "taps", "transmitter", "receiver", "start", "weight", "pixels")),
-        *((name, _pointer) for name in ("edges", "columns", "sums")),
+        *((name, _pointer) for name in ("edges", "columns", "sums", "objective", "slopes")),
         *((name, _int64) for name in ("pulses", "length", "count", "blocks", "width", "weight_step")),
         *((name, _double) for name in ("samples_per_metre", "turns_per_metre")),
     ]
