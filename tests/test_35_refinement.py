@@ -1,13 +1,26 @@
 """Tracks refined by the image itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.contributions import block_contributions
 from apertura.focus.engines import reference
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.candidates import bright_places
+from apertura.refinement.evidence import range_shifts
+from apertura.refinement.gauge import effects
+from apertura.refinement.inputs import ReferencePoint, TrackErrors
+from apertura.refinement.objective import Sharpness
+from apertura.refinement.prior import NodePrior, Prior
+from apertura.refinement.refine import LEAST_RATIO, Search, refine
+from apertura.scene.terrain import FlatGround
+from benchmarks.refinement import case, judge
+from benchmarks.refinement.scenes import GRID
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = np.linspace(0, 30, 300)
@@ -15,8 +28,7 @@ TARGET_M = np.array([[1.0, 12.0, 0.0]])
 
 
 def flown(ahead_m=0.0):
-    along = np.stack([TIME_S - 15 + ahead_m, np.zeros(300), np.full(300, 10.0)], -1)
-    return along
+    return np.stack([TIME_S - 15 + ahead_m, np.zeros(300), np.full(300, 10.0)], -1)
 
 
 def echo(true, logged, sidelink):
@@ -42,3 +54,152 @@ def test_a_corrected_track_focuses_as_the_true_one(pair, ahead_m):
     further = correction.sidelink_m(between, pair, TIME_S) if pair == "a-b" else np.zeros(300)
     mended = history.moved(true, further)
     assert abs(reference.form(mended, TARGET_M)[0] / 300 - 1) < 1e-5
+
+
+@pytest.fixture(scope="module")
+def two_centimetres():
+    return case("five", "straight", "joint", 0.02, 10.0, 1)
+
+
+def searched(one):
+    return Search.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
+
+
+@pytest.fixture(scope="module")
+def search(two_centimetres):
+    return searched(two_centimetres)
+
+
+def test_points_are_found_where_they_are_whatever_blurs_them():
+    one = case("five", "straight", "joint", 0.03, 10.0, 2)
+    places, ratio = bright_places(one.sightings, GRID, FlatGround(0.0), lasting_s=1.0)
+    found = places[ratio > LEAST_RATIO]
+    apart = np.linalg.norm(found[:, None] - one.targets_m, axis=2)
+    assert apart.shape == (5, 5)
+    assert apart.min(axis=1).max() < 0.3
+
+
+def test_blocks_add_what_their_pulses_do(search):
+    blocks, echo = search.problem.pairs[1], search.problem.echoes[1][0]
+    still = blocks.moves({node: np.zeros((len(search.problem.knots_s), 3)) for node in ("uav1", "uav2")})
+    summed = blocks.contribution(echo, still).values
+    whole = block_contributions(blocks.sighting.profiles, echo.patch.pixels_m, edges=blocks.edges)
+    # Blocks keep each pulse's carrier at the patch's middle, and that of their mean place beside it.
+    phase = np.exp(1j * np.angle((summed.conj() * whole).sum(axis=0)))
+    error = np.linalg.norm(summed * phase - whole) / np.linalg.norm(whole)
+    assert error < 0.03
+    assert np.abs(np.angle(phase)).max() < 0.1
+
+
+def test_the_prior_has_the_variance_and_the_lasting_that_the_log_states():
+    knots = np.arange(0, 400, 0.1)
+    axes = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
+    prior = NodePrior.of(TrackErrors((0.01, 0.02, 0.03), correlation_s=2.0), knots, axes)
+    tracks = prior.tracks(np.random.default_rng(3).standard_normal((40, prior.size))) @ axes.T
+    assert tracks.std(axis=(0, 1)) == pytest.approx([0.01, 0.02, 0.03], rel=0.03)
+    lags = {lag: (tracks[:, :-lag] * tracks[:, lag:]).mean(axis=(0, 1)) / tracks.var(axis=(0, 1)) for lag in (10, 20)}
+    assert lags[10] == pytest.approx(np.full(3, 0.5), abs=0.04)
+    assert lags[20] == pytest.approx(np.zeros(3), abs=0.04)
+
+
+@pytest.mark.parametrize("drift_m", [0.0, 0.05])
+def test_the_adjoint_of_the_prior_is_its_transpose(drift_m):
+    generator, knots = np.random.default_rng(4), np.arange(0, 5, 0.1)
+    prior = Prior({node: NodePrior.of(TrackErrors((0.01,) * 3, 1.0, drift_m), knots, np.eye(3)) for node in "ab"})
+    unknowns, gradient = generator.standard_normal(prior.size), {n: generator.standard_normal((50, 3)) for n in "ab"}
+    forward = sum(float((track * gradient[node]).sum()) for node, track in prior.tracks(unknowns).items())
+    assert prior.adjoint(gradient) @ unknowns == pytest.approx(forward, rel=1e-12)
+
+
+def test_the_gradient_of_sharpness_is_its_finite_difference(search):
+    problem, begun = search.problem, search.begun
+    sharpness = Sharpness(problem.pairs, begun.cached, begun.tracks, begun.seen, np.ones(len(problem.patches), bool))
+    generator = np.random.default_rng(5)
+    at = 0.3 * generator.standard_normal(problem.prior.size)
+    gradient = problem.prior.adjoint(sharpness(problem.prior.tracks(at))[1])
+    along = gradient / np.linalg.norm(gradient) + generator.standard_normal(gradient.size) / np.sqrt(gradient.size)
+    ahead, behind = (sharpness(problem.prior.tracks(at + step * along))[0] for step in (5e-3, -5e-3))
+    assert gradient @ along == pytest.approx((ahead - behind) / 1e-2, rel=2e-3)
+
+
+def test_a_shift_of_all_tracks_moves_points_and_blurs_none(search):
+    problem = search.problem
+    for axis in np.eye(3):
+        tracks = {node: np.ones((1, len(problem.knots_s), 3)) * axis for node in problem.prior.nodes}
+        for blocks, patches in zip(problem.pairs, search.begun.cached, strict=True):
+            moved = {node: blocks.average_of(tracks[node]) for node in blocks.sighting.nodes}
+            for patch in patches:
+                blur_rad, shift_m = effects(patch, moved, np.eye(3))
+                assert np.sqrt((blur_rad**2).sum()) < 0.01 * patch.wavenumber
+                assert shift_m[:, 0] == pytest.approx(axis[:2] if axis[2] == 0 else shift_m[:, 0], abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def refined(two_centimetres):
+    return refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors)
+
+
+def test_two_centimetres_are_mended_at_places_that_no_fit_saw(two_centimetres, refined):
+    before, after = judge(two_centimetres), judge(two_centimetres, refined.correction)
+    assert before.probe_loss_db < -5
+    assert after.probe_loss_db > -0.4
+    assert refined.accepted
+    assert not refined.flags
+
+
+def test_refinement_does_not_move_the_image(two_centimetres, refined, search):
+    before, after = judge(two_centimetres), judge(two_centimetres, refined.correction)
+    assert after.target_shift_cm < before.target_shift_cm + 0.3
+    # What is held would move it, and nothing would tell: all motions that it holds, from the true tracks on.
+    problem = search.problem
+    truth = {node: two_centimetres.truth.at(node, problem.knots_s) for node in ("uav1", "uav2")}
+    held = problem.prior.tracks(problem.gauge.modes[-3:].sum(axis=0))
+    moved = TrackCorrection(problem.knots_s, {node: truth[node] + held[node] for node in truth})
+    here, there = (judge(two_centimetres, one) for one in (TrackCorrection(problem.knots_s, truth), moved))
+    assert there.target_shift_cm > here.target_shift_cm + 3
+    assert there.probe_loss_db > here.probe_loss_db - 0.1
+
+
+def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refined):
+    known = [ReferencePoint(f"corner {number}", tuple(two_centimetres.targets_m[number]), 0.005) for number in range(4)]
+    tied = refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors, reference_points=known)
+    before, after = (judge(two_centimetres, one.correction) for one in (refined, tied))
+    assert after.target_shift_cm < 0.5 * before.target_shift_cm
+    assert after.target_shift_cm < 1.5
+    assert after.probe_loss_db > before.probe_loss_db - 0.1
+    assert {one["name"] for one in tied.report["reference_points"]} == {one.name for one in known}
+
+
+def test_a_log_that_states_four_times_its_errors_is_flagged(two_centimetres, refined):
+    stated = {node: TrackErrors((0.08,) * 3) for node in two_centimetres.errors}
+    found = refine(two_centimetres.sightings, GRID, FlatGround(0.0), stated)
+    assert "prior_inconsistent" in found.flags
+    assert "prior_inconsistent" not in refined.flags
+    assert judge(two_centimetres, found.correction).probe_loss_db > -0.5  # and yet focused
+
+
+def test_a_wavelength_of_path_over_a_part_of_the_aperture_is_told(two_centimetres, search):
+    problem, wavelength_m = search.problem, search.wavelength_m
+    truth = {node: two_centimetres.truth.at(node, problem.knots_s) for node in ("uav1", "uav2")}
+    slip = np.zeros((len(problem.knots_s), 3))
+    slip[75:115, 1] = -0.8 * wavelength_m  # away from the scene: a bit more than half a wavelength there and back
+
+    def slipped(tracks):
+        state = problem.at(tracks)
+        return range_shifts(problem, state, search.axes).slipped(wavelength_m)
+
+    assert not slipped(truth).any()
+    assert slipped({"uav1": truth["uav1"] + slip, "uav2": truth["uav2"]})[0, 2]
+
+
+def test_speckle_is_refused(two_centimetres):
+    generator = np.random.default_rng(6)
+    noisy = []
+    for one in two_centimetres.sightings:
+        shape = one.profiles.samples.shape
+        noise = generator.standard_normal((*shape, 2)).astype(np.float32).view(np.complex64)[..., 0]
+        noisy.append(replace(one, profiles=replace(one.profiles, samples=noise)))
+    refused = refine(noisy, GRID, FlatGround(0.0), two_centimetres.errors)
+    assert not refused.accepted
+    assert "refinement_too_few_patches" in refused.flags
+    assert not any(moved.any() for moved in refused.correction.moved_m.values())

@@ -43,9 +43,7 @@ class TrackCorrection:
         tx, rx = pair.split("-")
         return Aperture(logged.tx_m + self.at(tx, time_s), logged.rx_m + self.at(rx, time_s))
 
-    def sidelink_m(
-        self, between_m: NDArray[np.float64], pair: str, time_s: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def sidelink_m(self, between_m: NDArray[np.float64], pair: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much the sidelink of a pair is longer than from the logs: so much longer are its echoes' paths.
 
         Parameters

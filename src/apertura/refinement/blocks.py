@@ -133,10 +133,12 @@ class Blocks:
         some = self.sighting.profiles.aperture.sample(64)
         aperture, step_m = self.sighting.profiles.aperture[some], self.sighting.profiles.step_m
         corners = patch.pixels_m[:: max(1, len(patch.pixels_m) - 1)]
-        corners = np.concatenate([corners, 2 * patch.place_m - corners, patch.pixels_m[:: max(1, len(patch.pixels_m) // 8)]])
+        corners = np.concatenate(
+            [corners, 2 * patch.place_m - corners, patch.pixels_m[:: max(1, len(patch.pixels_m) // 8)]]
+        )
         reach = float(np.abs(aperture.path(corners) - aperture.path(patch.place_m[None])).max())
         half = int(np.ceil(reach / step_m)) + _MARGIN
-        return np.arange(-half, half + 1) * step_m
+        return np.asarray(np.arange(-half, half + 1) * step_m, np.float64)
 
     def _echo(self, patch: Patch, offsets: Floats, sums: NDArray[np.complex64]) -> PatchEcho:
         seen = np.flatnonzero(np.abs(sums).any(axis=0))

@@ -47,8 +47,8 @@ def bright_places(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "Patches". Power is summed over images of parts of the aperture, on every so many-th
-    pixel of the grid; each part as long as an error lasts is focused whatever the error.
+    Source: docs/theory/autofocus.md, "Patches". Power is summed over images of parts of the aperture, on every
+    so many-th pixel of the grid; a part as long as an error lasts is focused whatever the error.
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
@@ -65,14 +65,15 @@ def bright_places(
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
-    about = median_filter(power[:: reach // 3 or 1, :: reach // 3 or 1], size=7, mode="nearest")
-    about = np.repeat(np.repeat(about, reach // 3 or 1, 0), reach // 3 or 1, 1)[: power.shape[0], : power.shape[1]]
+    thin = max(1, reach // 3)
+    about = median_filter(power[::thin, ::thin], size=7, mode="nearest")
+    about = np.repeat(np.repeat(about, thin, 0), thin, 1)[: power.shape[0], : power.shape[1]]
     ratio = power / np.maximum(about, _SIDELOBES * power.max())
     top = (maximum_filter(power, 2 * max(1, reach // 6) + 1) == power) & (power > 0)
-    row, column = np.nonzero(top)
-    order = np.argsort(-ratio[row, column], kind="stable")[:_MOST_PLACES]
-    row, column = row[order], column[order]
-    return terrain.positions_at(grid, rows[row], columns[column]), ratio[row, column]
+    down, right = np.nonzero(top)
+    order = np.argsort(-ratio[down, right], kind="stable")[:_MOST_PLACES]
+    down, right = down[order], right[order]
+    return terrain.positions_at(grid, rows[down], columns[right]), ratio[down, right]
 
 
 def east_north_up(grid: SceneGrid, places_m: Floats) -> Floats:

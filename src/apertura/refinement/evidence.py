@@ -23,11 +23,12 @@ LEAST_GAIN_DB, LEAST_BETTER = 0.3, 0.75
 PARTS = 8
 """Of the aperture, whose images of a point are compared in range."""
 
-_LEAST_SETTLED = 8
-_LOG_POWER = float(np.log(2.5))
-_REACH_CELLS, _STEPS = 1.5, 25
+_BY_CHANCE = 1e-3  # how often errors as the log states them would be called inconsistent
+_SLACK = 1.5  # what the image settles is not settled wholly
+_REACH_CELLS, _STEPS = 3.0, 37
 _SLIP_SURE = 4.0
-_DOMINATES = 3.0  # peak power of a part's image of a point against the median of a line through it
+_LEAST_POINTS = 3  # that must agree on where a part of the aperture sees them
+_DOMINATES = 4.0  # peak power of a part's image of a point against the median of a line through it
 _LEAST_SLOPE = 0.05  # of the path over ground: a point seen from all around has no direction of range
 
 
@@ -86,12 +87,14 @@ class Evidence:
     @cached_property
     def inconsistent(self) -> str:
         """What is wrong with the errors that the logs state; nothing where they fit what was found."""
+        from scipy.stats import chi2  # slow to import
+
         count = len(self.settled)
-        if count < _LEAST_SETTLED:
+        if not count:
             return ""
         power = float((self.settled**2).mean())
-        spread = np.sqrt(2 / count)
-        if np.exp(-_LOG_POWER - 3 * spread) < power < np.exp(_LOG_POWER + 3 * spread):
+        low, high = chi2.ppf([_BY_CHANCE, 1 - _BY_CHANCE], count) / count
+        if low / _SLACK < power < high * _SLACK:
             return ""
         return (
             f"the {count} motions that the image settles are {np.sqrt(power):.2f} times as large as the logs' errors "
@@ -138,7 +141,7 @@ def gains_db(before: Sequence[Sequence[Seen]], after: Sequence[Sequence[Seen]]) 
     array([[3.01]])
     """
     ratio = [[b.contrast / a.contrast for a, b in zip(*both, strict=True)] for both in zip(before, after, strict=True)]
-    return 10 * np.log10(np.array(ratio))
+    return np.asarray(10 * np.log10(np.array(ratio)), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +153,13 @@ class RangeShifts:
     shift_m, std_m
         (pair, part) float64, metres of total path: median over points and its standard deviation; NaN where no
         point was seen.
+    points
+        (pair, part) int64, how many were seen.
     """
 
     shift_m: Floats
     std_m: Floats
+    points: NDArray[np.int64]
 
     @property
     def rms_m(self) -> float | None:
@@ -164,7 +170,8 @@ class RangeShifts:
     def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
         """Return (pair, part) bool: parts that are nearer to a whole turn off than to none, for sure."""
         off = np.abs(self.shift_m)
-        return np.asarray((off > 0.6 * wavelength_m) & (off > _SLIP_SURE * self.std_m))
+        agreed = (self.points >= _LEAST_POINTS) & (self.std_m < wavelength_m / 3 / np.sqrt(np.maximum(self.points, 1)))
+        return np.asarray(agreed & (off > 0.6 * wavelength_m) & (off > _SLIP_SURE * self.std_m))
 
 
 def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
@@ -179,7 +186,7 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 13. A path that is wrong by a wavelength over a part of the aperture keeps its
+    Source: docs/theory/autofocus.md, eq. 16. A path that is wrong by a wavelength over a part of the aperture keeps its
     phase, but not its delay.
     """
     pairs = zip(problem.pairs, problem.echoes, state.images, strict=True)
@@ -193,12 +200,10 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
         middle = np.nanmedian(shifts, axis=1)
         spread = 1.4826 * np.nanmedian(np.abs(shifts - middle[:, None]), axis=1)
     count = np.isfinite(shifts).sum(axis=1)
-    return RangeShifts(middle, np.where(count > 2, spread / np.sqrt(np.maximum(count, 1)), np.inf))
+    return RangeShifts(middle, np.where(count > 2, spread / np.sqrt(np.maximum(count, 1)), np.inf), count)
 
 
-def _by_part(
-    blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats
-) -> Floats:
+def _by_part(blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats) -> Floats:
     """Return (part,) float64, metres of total path by which each part sees a point farther; NaN where it does not."""
     nothing = np.full(PARTS, np.nan)
     place = echo.patch.pixels_m[int(np.abs(image).argmax())]

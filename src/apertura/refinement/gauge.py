@@ -14,11 +14,11 @@ Floats = NDArray[np.float64]
 SEEN_RAD = 0.03
 """A mode that turns phases by less, rms over the aperture per standard deviation of the log, is not seen."""
 
-LEAST_SHIFT_M = 1e-3
+LEAST_SHIFT_M = 3e-4
 """Modes that move patches by less are left to the solver."""
 
-SURE_RAD = 0.1
-"""A mode that turns phases by more is settled by the image, whatever the log says."""
+SURE = 10.0
+"""A mode of which the image tells so many times as much as the log is settled by it."""
 
 _PIECES = 5  # of the time for which a patch is seen, to a cubic piece of a smooth mode
 
@@ -33,17 +33,18 @@ class Gauge:
         (mode, unknown) float64, orthonormal, in the prior's unknowns.
     shift_m
         (mode, pair and patch, 2) float64, metres per unit of each: how the image of every patch moves east and north.
-    sure
-        (mode, unknown) float64, orthonormal: other modes, which blur so much that the image alone settles them.
+    blurs_rad2, blurring
+        (other,) and (other, unknown) float64: mean square of the phase that orthonormal modes turn, largest last.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 8 to 10.
+    Source: docs/theory/autofocus.md, eq. 13 and 14.
     """
 
     modes: Floats
     shift_m: Floats
-    sure: Floats
+    blurs_rad2: Floats
+    blurring: Floats
 
     def held(self, unknowns: Floats) -> Floats:
         """Return unknowns, or a gradient, without their part along the modes."""
@@ -57,7 +58,20 @@ class Gauge:
     @classmethod
     def none(cls, unknowns: int) -> "Gauge":
         """Return the gauge that holds nothing."""
-        return cls(np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros((0, unknowns)))
+        return cls(np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, unknowns)))
+
+    def settled(self, unknowns: Floats, *, known: float) -> Floats:
+        """Return (mode,) float64, the unknowns that an image settles whatever the log says.
+
+        Parameters
+        ----------
+        unknowns
+            As solved.
+        known
+            What the phases tell of a mode that turns them by a radian: 2·power of points against their surroundings,
+            summed over pairs and patches.
+        """
+        return np.asarray(self.blurring[self.blurs_rad2 * known > SURE] @ unknowns)
 
 
 def find_gauge(
@@ -78,7 +92,7 @@ def find_gauge(
             blurs.append(blur)
             shifts.append(shift)
     count = len(blurs)
-    focus = sum(blur.T @ blur for blur in blurs) / count
+    focus = np.sum([blur.T @ blur for blur in blurs], axis=0) / count
     shift = np.concatenate(shifts) / np.sqrt(count)
     spread = np.linalg.solve(focus + SEEN_RAD**2 * np.eye(len(focus)), shift.T)
     power, turn = np.linalg.eigh(shift @ spread)
@@ -86,8 +100,7 @@ def find_gauge(
     inside, _ = np.linalg.qr(spread @ turn[:, keep])
     moves = np.stack([one @ inside for one in shifts])
     blurred, shapes = np.linalg.eigh(focus)
-    sure = shapes[:, blurred > SURE_RAD**2].T @ unknowns
-    return Gauge(inside.T @ unknowns, np.moveaxis(moves, -1, 0), sure)
+    return Gauge(inside.T @ unknowns, np.moveaxis(moves, -1, 0), blurred, shapes.T @ unknowns)
 
 
 def _smooth_unknowns(

@@ -68,7 +68,7 @@ class Sharpness:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 5 to 7.
+    Source: docs/theory/autofocus.md, eq. 11 and 12.
     """
 
     pairs: Sequence[Blocks]
@@ -95,15 +95,17 @@ class Sharpness:
         return total, gradient
 
 
-def turns(patch: Contribution, moved: Tracks) -> NDArray[np.complex64]:
-    """Return (block,) complex64 by which contributions turn where the nodes of each block have moved."""
-    path = sum(np.einsum("bi,bi->b", slope, moved[node][patch.blocks]) for node, slope in patch.slopes.items())
-    return np.exp(1j * patch.wavenumber * np.asarray(path)).astype(np.complex64)
+def phases(patch: Contribution, moved: Tracks) -> Floats:
+    """Return (block,) float64, rad by which contributions turn where the nodes of each block have moved."""
+    path = np.zeros(patch.blocks.stop - patch.blocks.start)
+    for node, slope in patch.slopes.items():
+        path += np.einsum("bi,bi->b", slope, moved[node][patch.blocks])
+    return patch.wavenumber * path
 
 
 def _patch(patch: Contribution, now: Seen, moved: Tracks) -> tuple[float, Floats]:
     """Return the value of a patch and its derivative by the phase of each block."""
-    turn = turns(patch, moved)
+    turn = np.exp(1j * phases(patch, moved)).astype(np.complex64)
     image = patch.values @ turn
     power = (image.real**2 + image.imag**2).astype(np.float64)
     fourth = float((power**2).sum())

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class NodePrior:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 4. The autocorrelation of such noise falls linearly to zero over w knots.
+    Source: docs/theory/autofocus.md, eq. 10. The autocorrelation of such noise falls linearly to zero over w knots.
 
     Examples
     --------
@@ -60,7 +61,7 @@ class NodePrior:
     @property
     def size(self) -> int:
         """How many unknowns there are, each of unit variance."""
-        return 3 * (self.knots + self.smooth - 1 + self.slow.shape[1])
+        return 3 * (self.knots + self.smooth - 1 + int(self.slow.shape[1]))
 
     def tracks(self, unknowns: Floats) -> Floats:
         """Return (..., knot, 3) float64 corrections, metres in the frame, of (..., size) unknowns."""
@@ -108,4 +109,5 @@ class Prior:
 
     def _parts(self) -> list[tuple[tuple[str, NodePrior], slice]]:
         ends = np.cumsum([0, *(node.size for node in self.nodes.values())])
-        return [(item, slice(*pair)) for item, pair in zip(self.nodes.items(), zip(ends, ends[1:], strict=False), strict=True)]
+        parts = [slice(*pair) for pair in pairwise(ends.tolist())]
+        return list(zip(self.nodes.items(), parts, strict=True))

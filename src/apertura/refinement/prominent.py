@@ -1,4 +1,4 @@
-"""Tracks from the unwrapped phases of the patches' brightest points: where the search may start instead of at the log."""
+"""Tracks from the unwrapped phases of the patches' brightest points: another start of the search than the log."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ SMOOTHED = (2.0, 1.5, 1.0)
 
 
 def prominent(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
-    """Return the tracks that explain the phase histories of the patches' brightest pixels, least squares with the prior.
+    """Return the tracks that explain the phases of the patches' brightest pixels, least squares with the prior.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 11.
+    Source: docs/theory/autofocus.md, "Sharpness".
     """
     state = start
     for smoothed in SMOOTHED:
@@ -70,7 +70,9 @@ class _Fit:
                 if not counts:
                     continue
                 patch = one.patch
-                path = sum(np.einsum("bi,bi->b", slope, moved[node][patch.blocks]) for node, slope in patch.slopes.items())
+                path = sum(
+                    np.einsum("bi,bi->b", slope, moved[node][patch.blocks]) for node, slope in patch.slopes.items()
+                )
                 left = one.weight * (patch.wavenumber * np.asarray(path) + one.phase)
                 left -= one.known @ (one.known.T @ left)
                 total += 0.5 * float(left @ left)

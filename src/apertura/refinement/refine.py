@@ -20,7 +20,7 @@ from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
 from apertura.refinement.solve import Problem, State
 from apertura.refinement.ties import tied
-from apertura.refinement.uncertainty import remaining
+from apertura.refinement.uncertainty import MOST_RATIO, remaining
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
@@ -63,7 +63,7 @@ def refine(
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps what it found; images are formed without it.
     """
-    search = _Search.begin(sightings, grid, terrain, errors)
+    search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
         return search.refused(errors, found=len(search.problem.patches))
     held_out = np.arange(len(search.problem.patches)) % _HELD_OUT == 2
@@ -78,7 +78,7 @@ def refine(
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class Search:
     """The problem, and what its patches show from the logs."""
 
     problem: Problem
@@ -89,7 +89,8 @@ class _Search:
     @classmethod
     def begin(
         cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
-    ) -> "_Search":
+    ) -> "Search":
+        """Return the problem of a flight, as its logs have it."""
         lasting_s = min(one.correlation_s for one in errors.values())
         places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
         axes = east_north_up(grid, places_m)
@@ -117,7 +118,9 @@ class _Search:
         evidence = Evidence(
             fitted_db=gains[:, fitted],
             held_out_db=gains[:, held_out],
-            settled=problem.gauge.sure @ state.unknowns,
+            settled=problem.gauge.settled(
+                state.unknowns, known=2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
+            ),
             before=range_shifts(problem, begun, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
@@ -134,7 +137,9 @@ class _Search:
         )
         knots_s = self.problem.knots_s
         nothing = {node: np.zeros((len(knots_s), 3)) for node in errors}
-        std_m = {node: np.tile(np.abs(np.array(one.std_m) @ self.axes), (len(knots_s), 1)) for node, one in errors.items()}
+        std_m = {
+            node: np.tile(np.abs(np.array(one.std_m) @ self.axes), (len(knots_s), 1)) for node, one in errors.items()
+        }
         report: dict[str, Any] = {"patches": found}
         flags = {"refinement_too_few_patches": line}
         return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)

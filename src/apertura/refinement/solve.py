@@ -51,12 +51,15 @@ class Problem:
 
     def state(self, unknowns: Floats) -> "State":
         """Return what blocks add to the patches from tracks as corrected."""
-        tracks = self.prior.tracks(unknowns)
+        return replace(self.at(self.prior.tracks(unknowns)), unknowns=unknowns)
+
+    def at(self, tracks: Tracks) -> "State":
+        """Return the same of tracks whose unknowns nobody asks for."""
         cached = []
         for blocks, echoes in zip(self.pairs, self.echoes, strict=True):
             moved = blocks.moves(tracks)
             cached.append([blocks.contribution(echo, moved) for echo in echoes])
-        return State(unknowns, tracks, cached)
+        return State(np.zeros(0), tracks, cached)
 
     @property
     def patches(self) -> list[Patch]:

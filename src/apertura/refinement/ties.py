@@ -17,7 +17,8 @@ from apertura.refinement.solve import Problem
 Floats = NDArray[np.float64]
 
 _LEAST_RATIO = 30.0  # peak power of a reference point against its speckle
-_ZOOMS, _SIDE = 4, 9
+_ZOOMS, _SIDE = 5, 9
+_ROUNDS = 3
 
 
 def tied(
@@ -36,17 +37,31 @@ def tied(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 14: least squares in the gauge alone, with the log's prior.
+    Source: docs/theory/autofocus.md, eq. 15: least squares in the gauge alone, with the log's prior.
     """
     if not points or not len(problem.gauge.modes):
         return unknowns, {}
-    correction = problem.correction(unknowns)
-    rows, apart, report = [], [], []
-    found_tracks, tracks = problem.prior.tracks(unknowns), problem.prior.tracks(problem.gauge.modes)
-    lasting_s = problem.knots_s[1] - problem.knots_s[0]
+    settled: Floats = np.zeros(len(problem.gauge.modes))
+    for _ in range(_ROUNDS):
+        matrix, misses, report = _misses(problem, unknowns + settled @ problem.gauge.modes, points, axes)
+        if not len(misses):
+            return unknowns, {"reference_points": []}
+        # Where the misses are linear in the modes: those of the log itself, from which the prior counts.
+        normal = matrix.T @ matrix + np.eye(len(settled))
+        settled = np.asarray(np.linalg.solve(normal, matrix.T @ (matrix @ settled - misses)), np.float64)
+    return unknowns + settled @ problem.gauge.modes, {"reference_points": report}
+
+
+def _misses(
+    problem: Problem, unknowns: Floats, points: Sequence[ReferencePoint], axes: Floats
+) -> tuple[Floats, Floats, list[dict[str, Any]]]:
+    """Return how far points lie from where they belong, in their standard deviations, and how modes change that."""
+    rows, apart, report = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)], []
+    correction, tracks = problem.correction(unknowns), problem.prior.tracks(problem.gauge.modes)
+    found_tracks = problem.prior.tracks(unknowns)
     for point in points:
         place = np.array(point.place_m)
-        patch = patch_at(place, [blocks.sighting for blocks in problem.pairs], axes, correlation_s=10 * lasting_s)
+        patch = patch_at(place, [blocks.sighting for blocks in problem.pairs], axes, correlation_s=_lasting_s(problem))
         for blocks in problem.pairs:
             [echo] = blocks.echoes([patch])
             seen = blocks.contribution(echo, blocks.moves(found_tracks))
@@ -55,15 +70,17 @@ def tied(
                 continue
             moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.sighting.nodes)}
             _, shift = effects(seen, moved, axes)
-            found = _peak(blocks.sighting.moved(correction), patch.pixels_m[int(power.argmax())], axes) - place
+            profiles = blocks.sighting.moved(correction)
+            found = _peak(profiles, patch.pixels_m[int(power.argmax())], axes) - place
             rows.append(shift / point.std_m)
             apart.append(axes[:2] @ found / point.std_m)
             report.append({"name": point.name, "pair": blocks.sighting.pair, "apart_m": _rounded(axes[:2] @ found)})
-    if not rows:
-        return unknowns, {"reference_points": []}
-    matrix, misses = np.concatenate(rows), np.concatenate(apart)
-    moves = np.linalg.solve(matrix.T @ matrix + np.eye(matrix.shape[1]), -matrix.T @ misses)
-    return unknowns + moves @ problem.gauge.modes, {"reference_points": report}
+    return np.concatenate(rows), np.concatenate(apart), report
+
+
+def _lasting_s(problem: Problem) -> float:
+    """Return how long errors last, seconds."""
+    return min(node.smooth for node in problem.prior.nodes.values()) * float(problem.knots_s[1] - problem.knots_s[0])
 
 
 def _peak(profiles: Profiles, start_m: Floats, axes: Floats) -> Floats:

@@ -11,7 +11,8 @@ from apertura.refinement.solve import Problem, State
 
 Floats = NDArray[np.float64]
 
-_MOST_RATIO = 1e3  # a point's surroundings, not its noise, bound what its phase tells
+MOST_RATIO = 1e3
+"""A point's neighbours, not its noise, bound what its phase tells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ def remaining(problem: Problem, state: State) -> Remaining:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 12. What the gauge leaves is added to the standard deviations.
+    Source: docs/theory/autofocus.md, eq. 18. What the gauge leaves is added to the standard deviations.
     """
     nodes, knots = problem.prior.nodes, len(problem.knots_s)
     column = {node: slice(3 * number, 3 * number + 3) for number, node in enumerate(nodes)}
@@ -58,7 +59,7 @@ def remaining(problem: Problem, state: State) -> Remaining:
     smooth = max(prior.smooth for prior in nodes.values())
     for patches, seen in zip(state.cached, state.seen, strict=True):
         for patch, now in zip(patches, seen, strict=True):
-            ratio = min(now.ratio, _MOST_RATIO)
+            ratio = min(now.ratio, MOST_RATIO)
             row = np.zeros((patch.blocks.stop - patch.blocks.start, 3 * len(nodes)))
             for node, slope in patch.slopes.items():
                 row[:, column[node]] = patch.wavenumber * slope
