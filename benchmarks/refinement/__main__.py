@@ -10,15 +10,17 @@ import csv
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
-from importlib import import_module
 from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 from apertura.refinement.outcome import Refinement
+from apertura.refinement.refine import refine
+from apertura.scene.terrain import FlatGround
 from benchmarks.refinement.cases import Case, case
 from benchmarks.refinement.measures import UNCORRECTED, image_seconds, judge
+from benchmarks.refinement.scenes import GRID
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")
@@ -26,8 +28,7 @@ NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")
 
 def refined(one: Case) -> Refinement:
     """Return what the product makes of a case."""
-    refine = import_module("apertura.refinement.refine").refine
-    return refine(one.sightings, one.errors)
+    return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
 
 
 def left(_: Case) -> Refinement:
