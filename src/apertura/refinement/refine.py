@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.blocks import Blocks
+from apertura.refinement.blocks import Blocks, PatchEcho
 from apertura.refinement.candidates import bright_places, east_north_up
 from apertura.refinement.evidence import Evidence, gains_db, range_shifts
 from apertura.refinement.gauge import Gauge, find_gauge
@@ -31,6 +31,10 @@ LEAST_PATCHES = 4
 LEAST_RATIO = 5.0
 """Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
 
+MOST_BYTES = 2**30
+"""Of what blocks add to patches: with more, fewer patches are looked at."""
+
+_BYTES = 8  # of a complex64
 _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
 _HELD_OUT = 4  # every so many-th patch is not fitted
@@ -100,8 +104,9 @@ class Search:
         patches = _patches(sightings, places_m[ratio > LEAST_RATIO], lasting_s, axes)
         echoes = [blocks.echoes(patches) for blocks in pairs]
         problem = Problem(pairs, echoes, knots_s, prior, Gauge.none(prior.size))
+        problem = problem.of(range(_affordable(echoes)))
         begun = problem.state(np.zeros(prior.size))
-        if len(patches) >= LEAST_PATCHES:
+        if len(problem.patches) >= LEAST_PATCHES:
             problem = replace(problem, gauge=find_gauge(pairs, begun.cached, prior, knots_s, axes))
         wavelength_m = SPEED_OF_LIGHT_M_S / sightings[0].profiles.centre_frequency_hz
         return cls(problem, axes, begun, wavelength_m)
@@ -143,6 +148,14 @@ class Search:
         report: dict[str, Any] = {"patches": found}
         flags = {"refinement_too_few_patches": line}
         return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)
+
+
+def _affordable(echoes: Sequence[Sequence[PatchEcho]]) -> int:
+    """Return how many patches may be kept in memory: those of a long flight have many blocks."""
+    bytes_of = np.sum(
+        [[_BYTES * len(one.patch.pixels_m) * len(one.profiles) for one in pair] for pair in echoes], axis=0
+    )
+    return max(int((np.cumsum(bytes_of) <= MOST_BYTES).sum()), min(LEAST_PATCHES, bytes_of.size))
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:
