@@ -12,9 +12,10 @@ from apertura.refinement.inputs import Sighting
 
 Floats = NDArray[np.float64]
 
-MOST_PATCHES = 12
-"""More cost more and tell little: docs/theory/autofocus.md, "Patches"."""
+MOST_PATCHES, CLEAR = 32, 20.0
+"""Patches are taken until they tell as much as a dozen whose points stand out so many times."""
 
+_ENOUGH = 12 * CLEAR
 _SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are worse held
 _RANGE_CELLS = 1.5  # half of a patch along the line of sight
 _LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half of a patch across it
@@ -40,19 +41,19 @@ class Patch:
     pixels_m: Floats
 
 
-def spread_out(places_m: Floats, axes: Floats, *, apart_m: float, count: int = MOST_PATCHES) -> Floats:
-    """Return the first of some places that stand apart and do not crowd one part of the scene.
+def spread_out(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) -> Floats:
+    """Return the first of some places that stand apart and do not crowd one part of the scene, as many as are needed.
 
     Parameters
     ----------
     places_m
-        (place, 3) float64, metres in the frame, brightest first.
+        (place, 3) float64, metres in the frame, clearest first.
+    ratio
+        (place,) float64, power of each against what lies about it.
     axes
         (3, 3) float64, rows are east, north, up.
     apart_m
         Least distance between two.
-    count
-        At most so many are taken.
 
     Returns
     -------
@@ -62,17 +63,18 @@ def spread_out(places_m: Floats, axes: Floats, *, apart_m: float, count: int = M
     Examples
     --------
     >>> places = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [0, 5, 0]])
-    >>> len(spread_out(places, np.eye(3), apart_m=1.0))
+    >>> len(spread_out(places, np.full(4, 10.0), np.eye(3), apart_m=1.0))
     3
     """
     level = (places_m - places_m.mean(axis=0)) @ axes[:2].T
     low, extent = level.min(axis=0), np.maximum(np.ptp(level, axis=0), 1e-9)
     ninth = np.minimum((level - low) / extent * 3, 2.999).astype(int) @ np.array([3, 1])
-    most = max(2, int(np.ceil(_SHARE * count)))
     taken: list[int] = []
     for number in range(len(places_m)):
-        if len(taken) == count:
+        told = float(np.minimum(ratio[taken], CLEAR).sum())
+        if len(taken) == MOST_PATCHES or told >= _ENOUGH:
             break
+        most = max(2, int(np.ceil(_SHARE * min(MOST_PATCHES, _ENOUGH / min(CLEAR, ratio[number])))))
         near = any(np.linalg.norm(level[number] - level[other]) < apart_m for other in taken)
         if not near and sum(ninth[other] == ninth[number] for other in taken) < most:
             taken.append(number)

@@ -31,6 +31,9 @@ LEAST_PATCHES = 4
 LEAST_RATIO = 5.0
 """Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
 
+HELPFUL_RATIO = 3.5
+"""Where there are points, places that stand out less help too."""
+
 MOST_BYTES = 2**30
 """Of what blocks add to patches: with more, fewer patches are looked at."""
 
@@ -69,7 +72,7 @@ def refine(
     """
     search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
-        return search.refused(errors, found=len(search.problem.patches))
+        return search.refused(errors)
     held_out = np.arange(len(search.problem.patches)) % _HELD_OUT == 2
     state, evidence = search.judged(held_out)
     if evidence.accepted:
@@ -88,6 +91,7 @@ class Search:
     problem: Problem
     axes: Floats
     begun: State
+    points: int
     wavelength_m: float
 
     @classmethod
@@ -101,7 +105,7 @@ class Search:
         knots_s = _knots(sightings, errors)
         prior = Prior({node: NodePrior.of(one, knots_s, axes) for node, one in sorted(errors.items())})
         pairs = [Blocks.of(sighting, knots_s) for sighting in sightings]
-        patches = _patches(sightings, places_m[ratio > LEAST_RATIO], lasting_s, axes)
+        patches = _patches(sightings, places_m, ratio, lasting_s, axes) if _points(ratio) >= LEAST_PATCHES else []
         echoes = [blocks.echoes(patches) for blocks in pairs]
         problem = Problem(pairs, echoes, knots_s, prior, Gauge.none(prior.size))
         problem = problem.of(range(_affordable(echoes)))
@@ -109,7 +113,7 @@ class Search:
         if len(problem.patches) >= LEAST_PATCHES:
             problem = replace(problem, gauge=find_gauge(pairs, begun.cached, prior, knots_s, axes))
         wavelength_m = SPEED_OF_LIGHT_M_S / sightings[0].profiles.centre_frequency_hz
-        return cls(problem, axes, begun, wavelength_m)
+        return cls(problem, axes, begun, _points(ratio), wavelength_m)
 
     def judged(self, held_out: Bools) -> tuple[State, Evidence]:
         """Return what the patches that are not held out ask for, and what the others say of it."""
@@ -134,10 +138,10 @@ class Search:
         )
         return state, evidence
 
-    def refused(self, errors: Mapping[str, TrackErrors], *, found: int) -> Refinement:
+    def refused(self, errors: Mapping[str, TrackErrors]) -> Refinement:
         """Return that too few points stand out."""
         line = (
-            f"{found} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
+            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
             f"{LEAST_PATCHES} are needed"
         )
         knots_s = self.problem.knots_s
@@ -145,7 +149,7 @@ class Search:
         std_m = {
             node: np.tile(np.abs(np.array(one.std_m) @ self.axes), (len(knots_s), 1)) for node, one in errors.items()
         }
-        report: dict[str, Any] = {"patches": found}
+        report: dict[str, Any] = {"patches": self.points}
         flags = {"refinement_too_few_patches": line}
         return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)
 
@@ -169,10 +173,16 @@ def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> 
     return first + (np.arange(count) + 0.5) * (last - first) / count
 
 
-def _patches(sightings: Sequence[Sighting], places_m: Floats, lasting_s: float, axes: Floats) -> list[Patch]:
-    if not len(places_m):
-        return []
+def _points(ratio: Floats) -> int:
+    """Return how many places are points."""
+    return int((ratio > LEAST_RATIO).sum())
+
+
+def _patches(
+    sightings: Sequence[Sighting], places_m: Floats, ratio: Floats, lasting_s: float, axes: Floats
+) -> list[Patch]:
     typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
     apart_m = float(np.ptp((typical.pixels_m - typical.place_m) @ axes[:2].T, axis=0).max()) / 2
-    chosen = spread_out(places_m, axes, apart_m=apart_m)
+    helpful = ratio > HELPFUL_RATIO
+    chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
     return [patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen]
