@@ -47,8 +47,15 @@ def steps(root: Path) -> list[tuple[str, ...]]:
     campaign, found = Campaign.load(root), []
     for name, result in results_of(campaign):
         where = Path(result.manifest).parts[1:-1]
-        step = {"raw": "ingest", "track": "", "assessment": "assess", "calibration": "calibrate", "fused": "export"}
-        step |= {"speed_accuracy": "", "whole": ""}
+        step = {
+            "raw": "ingest",
+            "track": "",
+            "assessment": "assess",
+            "refined_track": "refine",
+            "calibration": "calibrate",
+            "fused": "export",
+        }
+        step |= {"refined_track": "refine", "speed_accuracy": "", "whole": ""}
         if step.get(name, name):
             found.append((step.get(name, name), *where))
     return [one if one[0] not in {"scene", "cube", "terrain", "coverage"} else one[:1] for one in found]
@@ -57,7 +64,7 @@ def steps(root: Path) -> list[tuple[str, ...]]:
 def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, object]:
     """Run one step in a process of its own; return what it took."""
     command = [str(Path(sys.executable).with_name("apertura")), "step", *step, "--campaign", str(root)]
-    command += ["--threads", str(threads)] * (step[0] in {"image", "layers"})
+    command += ["--threads", str(threads)] * (step[0] in {"refine", "image", "layers"})
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)

@@ -23,7 +23,7 @@ from spoiling.of_logs import logs, noisy
 
 from apertura.campaign import Campaign
 from apertura.load.scene import settled_scene
-from apertura.steps import echo, image, ingest, profile, scene
+from apertura.steps import echo, image, ingest, profile, refine, scene
 from apertura.store import open_stage
 
 SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
@@ -106,6 +106,8 @@ def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
         scene.scene(campaign)
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
+        refine.refine(campaign, flight.name)
+        for pair in flight.pairs:
             image.image(campaign, flight.name, pair)
     for pair in flight.pairs:
         stage = open_stage(campaign.stage("image", flight.name, pair), "image")

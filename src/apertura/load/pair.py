@@ -44,12 +44,17 @@ class OpenPair:
         Longest total path inside the cyclic prefix.
     time_s
         (pulse,) float64, seconds from the first.
+    began
+        The first pulse, UTC.
     positions
         What is known of the node's positions, or of the transmitter's and the receiver's.
     history
         The echo itself; None before it is formed.
     beams
         Of the antennas; None where they are isotropic.
+    sidelink_m
+        (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
+        given back a sidelink's length, and before it is formed.
     report
         What the echo stage says of itself: its attributes; empty before it is formed.
     """
@@ -61,9 +66,11 @@ class OpenPair:
     weight: NDArray[np.float64]
     path_limit_m: float
     time_s: NDArray[np.float64]
+    began: np.datetime64
     positions: tuple[NodePositions, ...]
     history: PhaseHistory | None = None
     beams: Beams | None = None
+    sidelink_m: NDArray[np.float64] | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -100,9 +107,11 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         history.weight,
         limit_m,
         time_s=_seconds(echo.time.values),
+        began=echo.time.values[0],
         positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
         history=history,
         beams=beams,
+        sidelink_m=echo.sidelink_vector.values if "sidelink_vector" in echo else None,
         report=echo.attrs,
     )
 
@@ -159,6 +168,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
         weight,
         limit_m,
         time_s=_seconds(times),
+        began=times[0],
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
     )

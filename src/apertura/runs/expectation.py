@@ -31,6 +31,7 @@ _COSTS = {
     "ingest": _Cost(1.3, mb=0.01),
     "echo": _Cost(2.8, mb=0.02),
     "profile": _Cost(1.8, mb=0.01),
+    "refine": _Cost(3.0, mpx=1.0),
     "image": _Cost(3.5, mpx=2.0, mb_mpx=0.06),
     "tiles": _Cost(3.0, mb_mpx=0.06),
     "layers": _Cost(1.4, mpx=0.5),
@@ -41,7 +42,7 @@ _COSTS = {
 }
 """Rule → what it costs, on two cores of 2023; only its form counts once a step has been timed."""
 
-_WIDE = frozenset({"image", "tiles"})
+_WIDE = frozenset({"refine", "image", "tiles"})
 """Rules whose jobs take all cores."""
 _BESIDE = frozenset({"layers", "export", "scene"})
 """Rules that no other waits for, or hardly."""
@@ -191,7 +192,7 @@ class Outlook:
             return [(flight.name, node) for flight in flights for node in flight.participants]
         if rule in {"echo", "profile", "image", "tiles", "export"}:
             return [(flight.name, pair) for flight in flights for pair in flight.pairs]
-        if rule in {"assess", "calibrate", "export_fused"}:
+        if rule in {"assess", "calibrate", "export_fused", "refine"}:
             return [(flight.name,) for flight in flights]
         return [()]
 
