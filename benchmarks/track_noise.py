@@ -73,7 +73,10 @@ def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str
         logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
     logs(saying(max(size_cm, 1e-2) / 100), RX)(Folder(spoilt))
     Folder(spoilt).edit_config(
-        lambda document: [node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()]
+        lambda document: [
+            document.setdefault("processing", {}).update(autofocus="off"),
+            *(node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()),
+        ]
     )
     found = []
     for pair, quality, predicted_db, now in _imaged(spoilt):
