@@ -137,7 +137,7 @@ STAGES: Mapping[str, Stage] = {
             "nodes": "names along `node`",
             "decision": "whether tracks were to be refined, and why",
             "accepted": "whether images are formed with the correction; why: a line; report: what was measured",
-            "left": "node → what is left of its errors: std_m east, north, up, and correlation_s",
+            "left": "what is left of errors of position does to an image: loss_db, shift_m, phase_rad",
         },
     ),
     "terrain": Stage(

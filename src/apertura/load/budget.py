@@ -72,6 +72,8 @@ def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> f
 
 
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
+    if pair.left is not None:
+        return [BudgetLine("positions", "what the refined tracks leave", pair.left)]
     sidelink = not pair.monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
     return position_lines(paths, pair.positions, sidelink=sidelink)
 

@@ -24,6 +24,7 @@ from apertura.load.positions import position_error
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions
+from apertura.quality.path_errors import Effect
 from apertura.settings import Node, OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
@@ -55,6 +56,8 @@ class OpenPair:
     sidelink_m
         (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
         given back a sidelink's length, and before it is formed.
+    left
+        What is left of errors of position after the tracks were refined; None where they are those of the logs.
     report
         What the echo stage says of itself: its attributes; empty before it is formed.
     """
@@ -71,6 +74,7 @@ class OpenPair:
     history: PhaseHistory | None = None
     beams: Beams | None = None
     sidelink_m: NDArray[np.float64] | None = None
+    left: Effect | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
 
     @property

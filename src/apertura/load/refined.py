@@ -19,9 +19,10 @@ from apertura.load.scene import OpenScene
 from apertura.planning.autofocus import decide_autofocus
 from apertura.planning.plan import Decision
 from apertura.quality.budget import NodePositions
+from apertura.quality.path_errors import Effect
 from apertura.store import manifest_of, open_stage
 
-_QUOTED = ("gain_claimed_db", "gain_held_out_db")
+_QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better", "start")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,8 @@ class RefinedTrack:
             return logged
         aperture, further_m = self._moved(self.correction, logged)
         history = None if logged.history is None else logged.history.moved(aperture, further_m)
-        return replace(logged, aperture=aperture, history=history, positions=self._left(logged))
+        left = self.stage.attrs["left"]
+        return replace(logged, aperture=aperture, history=history, left=Effect(**left) if left else None)
 
     def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
         """Return the range profiles of a pair as images are formed from them."""
@@ -99,13 +101,6 @@ class RefinedTrack:
         if logged.sidelink_m is None:
             return aperture, np.zeros(len(time_s))
         return aperture, correction.sidelink_m(logged.sidelink_m, logged.name, time_s)
-
-    def _left(self, logged: OpenPair) -> tuple[NodePositions, ...]:
-        left = self.stage.attrs["left"]
-        return tuple(
-            NodePositions(tuple(left[node]["std_m"]), left[node]["correlation_s"], "refinement")
-            for node in dict.fromkeys(logged.name.split("-"))
-        )
 
 
 def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:

@@ -22,6 +22,7 @@ from apertura.planning.plan import Decision
 from apertura.provenance import merged
 from apertura.refinement.inputs import Sighting
 from apertura.refinement.outcome import Refinement
+from apertura.refinement.refine import refine as search
 from apertura.steps.stamping import stamped
 from apertura.store import open_stage, save_stage
 
@@ -38,8 +39,8 @@ def refine(campaign: Campaign, flight: str, *, threads: int = 1) -> Path:
     if decision.value == "on":
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
         profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
-        given = seen(campaign, profiles, scene, threads=threads, scheduler=asked.scheduler)
-        found = _solved(given, scene)
+        given = seen(campaign, profiles, scene, threads=threads)
+        found = search(given.sightings, given.places_m, given.errors, axes=scene.axes, reference_points=given.points)
         stage = refined_stage(found, decision, given, scene)
     else:
         found = _unrefined(node for pair in names for node in pair.split("-"))
@@ -52,11 +53,6 @@ def refine(campaign: Campaign, flight: str, *, threads: int = 1) -> Path:
     how: dict[str, Any] = {"modules": _MODULES, "settings": settings, **(inherits if found.accepted else {})}
     save_stage(stamped(stage, "refined_track", **how), folder, lineage=lineage)
     return folder
-
-
-def _solved(given: Seen, scene: OpenScene) -> Refinement:
-    """Return what the images say of the tracks."""
-    return _unrefined(given.errors)
 
 
 def _unrefined(nodes: Any) -> Refinement:
@@ -99,7 +95,7 @@ def refined_stage(found: Refinement, decision: Decision, given: Seen | None, sce
             "accepted": found.accepted,
             "why": found.why,
             "report": dict(found.report),
-            "left": {} if given is None else _left(found, given, scene),
+            "left": _left(found.report),
         },
     )
 
@@ -113,11 +109,7 @@ def _logged(sightings: Collection[Sighting], knots_s: NDArray[np.float64]) -> Ma
     return places
 
 
-def _left(found: Refinement, given: Seen, scene: OpenScene) -> dict[str, Any]:
-    """Return node → what is left of its errors, east, north, up: what the budget of its images reckons with."""
-    left = {}
-    for node, std_m in found.std_m.items():
-        variance = np.square(std_m).mean(axis=0) if len(std_m) else np.zeros(3)
-        east_north_up = np.sqrt(np.square(scene.axes) @ variance).tolist()
-        left[node] = {"std_m": east_north_up, "correlation_s": given.errors[node].correlation_s}
-    return left
+def _left(report: Mapping[str, Any]) -> dict[str, float]:
+    """Return what the errors left do to an image, as `Effect` names it; {} where that is not known."""
+    named = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
+    return {effect: report[name] for effect, name in named.items()} if {*named.values()} <= report.keys() else {}
