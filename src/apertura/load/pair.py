@@ -18,8 +18,9 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
-from apertura.ingest import open_recording, read_phase_history, read_track
+from apertura.ingest import open_recording, read_track
 from apertura.load.antennas import beams_of, body_axes
+from apertura.load.echo import recorded_echo
 from apertura.load.positions import position_error
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
@@ -97,8 +98,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     if echo is None:
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
-        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
+        echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair, waveform.format))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))

@@ -61,17 +61,14 @@ class RefinedTrack:
     def report(self, pair: str) -> dict[str, Any]:
         """Return what image.json says of a pair's tracks."""
         told = self.stage.attrs
-        rms_cm = {
-            node: round(100 * float(np.sqrt((moved**2).sum(axis=-1).mean())), 2) if len(moved) else 0.0
-            for node, moved in zip(told["nodes"], self.stage.correction.values, strict=True)
-            if node in pair.split("-")
-        }
+        moved = {} if self.correction is None else self.correction.moved_m
+        rms_cm = {node: _rms_cm(moved[node]) for node in dict.fromkeys(pair.split("-")) if node in moved}
         return {
             "decision": f"{told['decision']['value']}: {told['decision']['reason']}",
             "accepted": told["accepted"],
             "why": told["why"],
             **{name: told["report"][name] for name in _QUOTED if name in told["report"]},
-            "rms_cm": rms_cm,
+            **({"rms_cm": rms_cm} if rms_cm else {}),
         }
 
     def pair(self, logged: OpenPair) -> OpenPair:
@@ -138,6 +135,10 @@ def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
 def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
     """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
     return pair.time_s + float(_seconds(pair.began - began))
+
+
+def _rms_cm(moved_m: NDArray[np.float64]) -> float:
+    return round(100 * float(np.sqrt((moved_m**2).sum(axis=-1).mean())), 2)
 
 
 def _seconds(span: Any) -> Any:
