@@ -64,7 +64,7 @@ def steps(root: Path) -> list[tuple[str, ...]]:
 def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, object]:
     """Run one step in a process of its own; return what it took."""
     command = [str(Path(sys.executable).with_name("apertura")), "step", *step, "--campaign", str(root)]
-    command += ["--threads", str(threads)] * (step[0] in {"refine", "image", "layers"})
+    command += ["--threads", str(threads)] * (step[0] in {"image", "layers"})
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)

@@ -69,7 +69,7 @@ def make_images(campaign: Campaign, flight: str) -> None:
     pairs = campaign.flight(flight).pairs
     for pair in pairs:
         profile.profile(campaign, flight, pair)
-    refine.refine(campaign, flight, threads=2)
+    refine.refine(campaign, flight)
     for pair in pairs:
         image.image(campaign, flight, pair, threads=2)
 

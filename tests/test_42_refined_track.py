@@ -19,7 +19,7 @@ from apertura.load.pair import open_pair
 from apertura.load.refined import RefinedTrack, clock_s, open_refined
 from apertura.load.results import open_campaign
 from apertura.load.scene import open_scene
-from apertura.load.sightings import Seen, bright_places, reference_points
+from apertura.load.sightings import Seen, reference_points
 from apertura.load.suspects import evidence_of, seen_from
 from apertura.planning.autofocus import BORNE_DB, decide_autofocus
 from apertura.planning.plan import Decision
@@ -113,7 +113,7 @@ def write_track(campaign, began, correction, *, accepted=True, flags=None):
     std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
     report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
     found = Refinement(correction, std_m, accepted, "as told", report, flags or {})
-    given = Seen(tuple(sightings), np.zeros((0, 3)), {}, (), began)
+    given = Seen(tuple(sightings), {}, (), began)
     stage = refine.refined_stage(found, FOUND, given, opened)
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
 
@@ -202,14 +202,6 @@ def test_the_plan_says_whether_tracks_will_be_refined_and_then_what_became_of_it
     print_plan(Campaign.load(tiny))
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert told.count("autofocus on auto: errors of position that are stated cost") == 2
-
-
-def test_bright_places_lie_where_the_image_is_bright_the_brightest_first(finished_tiny):
-    opened = open_scene(finished_tiny)
-    power = np.full(opened.grid.shape, 1e-3, np.float32)
-    power[10, 40], power[33, 12] = 4.0, 9.0
-    rows, columns, _ = opened.grid.pixel_below(bright_places(power, opened)[:2]).T
-    np.testing.assert_allclose(np.stack([rows, columns], -1), [[33, 12], [10, 40]], atol=1e-3)
 
 
 def test_a_track_may_be_refined_without_its_sidelink_being_known(spoilt):

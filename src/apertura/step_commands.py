@@ -77,9 +77,9 @@ def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 
 @app.command()
-def refine(flight: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
+def refine(flight: str, campaign: Directory = HERE) -> None:
     """Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr."""
-    _run("apertura.steps.refine:refine", campaign, flight, threads=threads)
+    _run("apertura.steps.refine:refine", campaign, flight)
 
 
 @app.command()

@@ -98,7 +98,7 @@ rule refine:
     message:
         "{wildcards.flight}: refining the tracks of its nodes where that pays"
     shell:
-        "apertura step refine {wildcards.flight} --threads {threads} > {log} 2>&1"
+        "apertura step refine {wildcards.flight} > {log} 2>&1"
 
 
 rule tiles:

@@ -62,34 +62,18 @@ def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) ->
     >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], apart_px=16)]
     [(30.2, 33.5), (20.0, 90.0)]
     """
-    kept = bright_pixels(image, windows, apart_px=apart_px, most=MOST_POINTS, deepest_db=DEEPEST_DB)
-    return [_bright_point(image, row, column) for row, column in kept.tolist()]
-
-
-def bright_pixels(
-    image: Raster, windows: Iterable[Window], *, apart_px: int, most: int, deepest_db: float
-) -> NDArray[np.int64]:
-    """Return row and column, (pixel, 2), of the brightest local maxima that stand apart, brightest first.
-
-    Parameters
-    ----------
-    image, windows, apart_px
-        As of `bright_points`.
-    most, deepest_db
-        At most so many, and none further below the brightest.
-    """
     found: list[tuple[float, int, int]] = []
     for window in windows:
         magnitude = np.abs(np.nan_to_num(np.asarray(image[window])))
         found += _cell_maxima(magnitude, window, apart_px)
     found.sort(key=lambda one: (-one[0], one[1], one[2]))
-    kept = np.empty((0, 2), np.int64)
-    for magnitude, *at in found:
-        if not magnitude > found[0][0] * 10 ** (deepest_db / 20) or len(kept) == most:
+    kept: list[tuple[float, int, int]] = []
+    for one in found:
+        if not one[0] > found[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
             break
-        if (np.hypot(*(kept - at).T) >= apart_px).all():
-            kept = np.vstack([kept, at])
-    return kept
+        if all(np.hypot(one[1] - row, one[2] - column) >= apart_px for _, row, column in kept):
+            kept.append(one)
+    return [_bright_point(image, row, column) for _, row, column in kept]
 
 
 def shows_point(image: Raster, row: int, column: int, *, reach: int) -> bool:

@@ -42,7 +42,7 @@ _COSTS = {
 }
 """Rule → what it costs, on two cores of 2023; only its form counts once a step has been timed."""
 
-_WIDE = frozenset({"refine", "image", "tiles"})
+_WIDE = frozenset({"image", "tiles"})
 """Rules whose jobs take all cores."""
 _BESIDE = frozenset({"layers", "export", "scene"})
 """Rules that no other waits for, or hardly."""

@@ -29,18 +29,18 @@ from apertura.store import open_stage, save_stage
 _MODULES = [__name__, *ENGINES.values()]
 
 
-def refine(campaign: Campaign, flight: str, *, threads: int = 1) -> Path:
+def refine(campaign: Campaign, flight: str) -> Path:
     """Write results/<flight>/refined_track.zarr; where tracks are left as they are it says why, and has no knots."""
     lineage = result_of(campaign, "refined_track", flight).begin(campaign.root, _MODULES)
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
-    asked = campaign.settings.processing
-    pairs = [] if asked.autofocus == "off" else [open_pair(campaign, flight, pair) for pair in names]
+    asked = campaign.settings.processing.autofocus
+    pairs = [] if asked == "off" else [open_pair(campaign, flight, pair) for pair in names]
     decision, folder = autofocus_of(campaign, pairs, scene), campaign.stage("refined_track", flight)
     if decision.value == "on":
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
         profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
-        given = seen(campaign, profiles, scene, threads=threads)
-        found = search(given.sightings, given.places_m, given.errors, axes=scene.axes, reference_points=given.points)
+        given = seen(campaign, profiles, scene)
+        found = search(given.sightings, scene.grid, scene.terrain, given.errors, reference_points=given.points)
         stage = refined_stage(found, decision, given, scene)
     else:
         found = _unrefined(node for pair in names for node in pair.split("-"))
