@@ -1,11 +1,14 @@
 """Tracks refined by the images: whether it is done, what images are then formed from, and what they say of it."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import copy_writable, edit_config, ingest_all, quality_of
+from folders import copy_writable, edit_config, ingest_all, quality_of, run_steps
 from spoiling.logs import read_log, write_log
+from spoiling.of_logs import noisy
+from track_noise import saying
 
 from apertura.campaign import Campaign
 from apertura.check import as_line, problems
@@ -25,9 +28,11 @@ from apertura.planning.autofocus import BORNE_DB, decide_autofocus
 from apertura.planning.plan import Decision
 from apertura.refinement.inputs import Sighting
 from apertura.refinement.outcome import Refinement
+from apertura.simulation import ImageGrid, preset, simulate
 from apertura.steps import echo, image, profile, refine, scene
 from apertura.steps.plan import print_plan
 from apertura.steps.stamping import stamped
+from apertura.steps.verify import verify
 from apertura.store import open_stage, save_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -37,6 +42,16 @@ FOUND = Decision("autofocus", "on", "asked for")
 def state(root, section, **keys):
     edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
     return Campaign.load(root)
+
+
+def refresh(campaign):
+    """Make what images of the first flight begin with."""
+    ingest_all(campaign)
+    for pair in PAIRS:
+        echo.echo(campaign, "f01", pair)
+    scene.scene(campaign)
+    for pair in PAIRS:
+        profile.profile(campaign, "f01", pair)
 
 
 def image_of(campaign, pair):
@@ -92,12 +107,7 @@ def spoilt(finished_tiny, tmp_path_factory):
     moved = log.moved(error_m)
     write_log(path, moved)
     campaign = Campaign.load(root)
-    ingest_all(campaign)
-    for pair in PAIRS:
-        echo.echo(campaign, "f01", pair)
-    scene.scene(campaign)
-    for pair in PAIRS:
-        profile.profile(campaign, "f01", pair)
+    refresh(campaign)
     back_m = ecef_from_geodetic(*log.geodetic.T) - ecef_from_geodetic(*moved.geodetic.T)
     return campaign, (log.begun, TrackCorrection(log.time_s, {"uav1": back_m, "uav2": np.zeros_like(back_m)}))
 
@@ -202,6 +212,64 @@ def test_the_plan_says_whether_tracks_will_be_refined_and_then_what_became_of_it
     print_plan(Campaign.load(tiny))
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert told.count("autofocus on auto: errors of position that are stated cost") == 2
+
+
+def asked_on(folder, *, pulses, half_m):
+    """A flight with right logs, of so many pulses, whose tracks are to be refined; profiles made."""
+    plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=half_m, spacing_m=0.1))
+    root = simulate(folder / "campaign", plan, seed=7)
+    campaign = state(root, "processing", autofocus="on")
+    refresh(campaign)
+    return campaign
+
+
+@pytest.mark.parametrize(
+    ("pulses", "half_m", "flag"), [(40, 3.0, "refinement_too_few_patches"), (100, 6.0, "refinement_rejected")]
+)
+def test_a_refinement_that_has_too_little_to_go_by_is_flagged_and_moves_nothing(tmp_path, pulses, half_m, flag):
+    campaign = asked_on(tmp_path, pulses=pulses, half_m=half_m)
+    refine.refine(campaign, "f01")
+    image.image(campaign, "f01", "uav1-uav1")
+    quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
+    assert flag in quality["flags"]
+    assert quality["flags"].items() >= stage.attrs["flags"].items()
+    assert quality["autofocus"]["accepted"] is False
+    assert quality["models"]["autofocus"].startswith("on: asked for; ")
+    assert json.loads(stage.attrs["runspec"]) == {"autofocus": "on", "reference_points": [], "refined": False}
+    pair = open_pair(campaign, "f01", "uav1-uav1")
+    assert open_refined(campaign, "f01").pair(pair) is pair
+
+
+@pytest.mark.slow
+def test_a_campaign_whose_logs_err_by_2_cm_refines_itself(tmp_path):
+    right, spoilt = (tmp_path / name for name in ("right", "spoilt"))
+    simulate(right, preset("demo", pulses=600), seed=7)
+    copy_writable(right, spoilt)
+    for path in sorted((spoilt / "raw" / "f01").glob("*.track.*")):
+        log = noisy(0.02, seed=3)(read_log(path))
+        write_log(path, log if log.attitude_deg is not None else saying(0.02)(log))
+    state(spoilt, "nodes", uav1=state(spoilt, "processing").values["nodes"]["uav1"] | {"position_std_m": 0.02})
+    found = {}
+    for name, root in (("off", copy_writable(spoilt, tmp_path / "off")), ("auto", spoilt)):
+        state(root, "processing", autofocus=name)
+        campaign = run_steps(root)
+        found[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
+        worst_m = {
+            pair: max(one.error_m for one in verify(campaign) if one.image == pair) for pair in (*PAIRS, "fused")
+        }
+    for pair in PAIRS:
+        quality = quality_of(campaign, pair)
+        assert quality["autofocus"]["accepted"]
+        assert quality["focus"]["verdict"] == "focused"
+        assert found["off"][pair] < -1.0
+        assert found["auto"][pair] > -0.3
+        assert quality["focus"]["expected_db"] == pytest.approx(quality["focus"]["loss_db"], abs=0.2)
+    assert worst_m < 0.03
+    report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
+    assert report["autofocus"]["gain_held_out_db"] > 0.3
+    runspec = json.loads(open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").attrs["runspec"])
+    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image stands on the other pair, too
+    assert runspec["refined"] is True
 
 
 def test_a_track_may_be_refined_without_its_sidelink_being_known(spoilt):
