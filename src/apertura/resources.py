@@ -106,7 +106,7 @@ DEMANDS: Mapping[str, Demand] = {
     "layers": Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
     "coverage": Demand(600, pulse_bytes=500, pixel_s=1),
     "profile": Demand(500, pulse_bytes=500, recorded_s=120),
-    "refine": _IMAGE,
+    "refine": Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
     "tiles": _IMAGE,
     "image": _IMAGE,
     "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
