@@ -16,9 +16,8 @@ from apertura.echo.captures import Pulses, Saturation, blocks_of
 from apertura.echo.demodulate import remove_path
 from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
-from apertura.ingest import read_phase_history
 from apertura.load.acquisition import Acquisition, Times, common_pulses
-from apertura.load.positions import Placed, place, stated_error
+from apertura.load.positions import Placed, place
 from apertura.load.segments import keep_segments
 from apertura.load.transmitted import symbol_samples
 from apertura.settings import OfdmWaveform, Processing
@@ -69,17 +68,6 @@ class PairEcho:
         """Return the stage at some pulses, formed."""
         some = replace(self, dataset=self.dataset.isel(pulse=pulses))
         return some.promised.assign(transfer=(("pulse", "subcarrier"), np.concatenate(list(some.blocks()))))
-
-
-def recorded_echo(campaign: Campaign, flight: str, pair: str, kind: str) -> xr.Dataset:
-    """Return the echo of a recorder that hands over transfer functions, a key of `PHASE_HISTORIES`.
-
-    Its positions travel with its samples; how well they are known only the config can say.
-    """
-    tx, rx = pair.split("-")
-    nodes, files = campaign.settings.nodes, list(campaign.raw_files(flight, rx).values())
-    known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
-    return read_phase_history(kind, files, pair=pair).assign_attrs(positions=known)
 
 
 def _rows(count: int) -> tuple[str, Pulses]:

@@ -20,8 +20,8 @@ from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording, read_track
 from apertura.load.antennas import beams_of, body_axes
-from apertura.load.echo import recorded_echo
 from apertura.load.positions import position_error
+from apertura.load.recorded import recorded_echo
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions

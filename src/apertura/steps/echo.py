@@ -8,7 +8,8 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.lineage import result_of
 from apertura.load.acquisition import open_acquisition
-from apertura.load.echo import PairEcho, pair_echo, recorded_echo
+from apertura.load.echo import PairEcho, pair_echo
+from apertura.load.recorded import recorded_echo
 from apertura.load.transmitted import read_codes
 from apertura.provenance import merged
 from apertura.settings import PhaseHistoryWaveform
