@@ -47,8 +47,15 @@ def steps(root: Path) -> list[tuple[str, ...]]:
     campaign, found = Campaign.load(root), []
     for name, result in results_of(campaign):
         where = Path(result.manifest).parts[1:-1]
-        step = {"raw": "ingest", "track": "", "assessment": "assess", "calibration": "calibrate", "fused": "export"}
-        step |= {"speed_accuracy": "", "whole": ""}
+        step = {
+            "raw": "ingest",
+            "track": "",
+            "assessment": "assess",
+            "refined_track": "refine",
+            "calibration": "calibrate",
+            "fused": "export",
+        }
+        step |= {"refined_track": "refine", "speed_accuracy": "", "whole": ""}
         if step.get(name, name):
             found.append((step.get(name, name), *where))
     return [one if one[0] not in {"scene", "cube", "terrain", "coverage"} else one[:1] for one in found]

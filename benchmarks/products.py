@@ -23,7 +23,7 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.load.scene import settled_scene
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.steps import assess, echo, image, ingest, profile, scene
+from apertura.steps import assess, echo, image, ingest, profile, refine, scene
 from apertura.store import create, finish, open_array, open_stage, save_document, writing
 
 TILE = 256
@@ -46,6 +46,8 @@ def prepare(root: Path, side: int, receivers: int) -> Campaign:
     scene.scene(campaign)
     for pair in flight.pairs:
         profile.profile(campaign, flight.name, pair)
+    refine.refine(campaign, flight.name)
+    for pair in flight.pairs:
         image.image(campaign, flight.name, pair)
     assess.assess(campaign, flight.name)
     settled = json.loads(campaign.result("scene.json").read_text())

@@ -23,7 +23,7 @@ from spoiling.of_logs import logs, noisy
 
 from apertura.campaign import Campaign
 from apertura.load.scene import settled_scene
-from apertura.steps import echo, image, ingest, profile, scene
+from apertura.steps import echo, image, ingest, profile, refine, scene
 from apertura.store import open_stage
 
 SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
@@ -73,7 +73,10 @@ def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str
         logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
     logs(saying(max(size_cm, 1e-2) / 100), RX)(Folder(spoilt))
     Folder(spoilt).edit_config(
-        lambda document: [node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()]
+        lambda document: [
+            document.setdefault("processing", {}).update(autofocus="off"),
+            *(node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()),
+        ]
     )
     found = []
     for pair, quality, predicted_db, now in _imaged(spoilt):
@@ -106,6 +109,8 @@ def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
         scene.scene(campaign)
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
+        refine.refine(campaign, flight.name)
+        for pair in flight.pairs:
             image.image(campaign, flight.name, pair)
     for pair in flight.pairs:
         stage = open_stage(campaign.stage("image", flight.name, pair), "image")

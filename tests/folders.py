@@ -30,7 +30,7 @@ from apertura.simulation import (
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.steps import assess, coverage, cube, echo, export, image, ingest, layers, profile, scene, terrain
+from apertura.steps import assess, coverage, cube, echo, export, image, ingest, layers, profile, refine, scene, terrain
 from apertura.store import open_stage
 
 ROOT = Path(__file__).parents[1]
@@ -64,6 +64,16 @@ def ingest_all(campaign: Campaign) -> None:
         ingest.ingest(campaign, "f01", node)
 
 
+def make_images(campaign: Campaign, flight: str) -> None:
+    """Run the steps between the scene's grid and the images of a flight."""
+    pairs = campaign.flight(flight).pairs
+    for pair in pairs:
+        profile.profile(campaign, flight, pair)
+    refine.refine(campaign, flight)
+    for pair in pairs:
+        image.image(campaign, flight, pair, threads=2)
+
+
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
@@ -75,9 +85,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
             echo.echo(campaign, flight.name, pair)
     settle_ground(campaign)
     for flight in campaign.image_flights:
-        for pair in flight.pairs:
-            profile.profile(campaign, flight.name, pair)
-            image.image(campaign, flight.name, pair, threads=2)
+        make_images(campaign, flight.name)
         assess.assess(campaign, flight.name)
     cube.cube(campaign)
     if exports:

@@ -9,7 +9,7 @@ from folders import complaint, edit_config, ingest_all, quality_of
 from apertura.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
-from apertura.steps import echo, image, profile, scene
+from apertura.steps import echo, image, profile, refine, scene
 from apertura.store import open_stage
 
 
@@ -17,7 +17,9 @@ def flown(folder, node="uav2", *, pulses=40, **impairments):
     """A tandem flight whose one node has other impairments; its echo stages made."""
     plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     changed = {node: replace(plan.nodes[node].impairments, **impairments)}
-    campaign = Campaign.load(simulate(folder / "campaign", plan, impairments=changed, seed=11))
+    root = simulate(folder / "campaign", plan, impairments=changed, seed=11)
+    edit_config(root, lambda document: document.update(processing={"autofocus": False}))  # one pair alone is imaged
+    campaign = Campaign.load(root)
     ingest_all(campaign)
     return campaign
 
@@ -154,6 +156,7 @@ def test_flags_reach_image_json(tmp_path):
     dataset = echo_of(campaign)
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav2")
+    refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav2")
     report = quality_of(campaign, "uav1-uav2")
     assert report["flags"] == dataset.attrs["flags"] != {}
@@ -164,12 +167,14 @@ def test_flags_reach_image_json(tmp_path):
 def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
     campaign = flown(tmp_path)
     edit_config(
-        campaign.root, lambda document: document.update(processing={"engine": "reference", "accuracy_db": -120})
+        campaign.root,
+        lambda document: document.update(processing={"engine": "reference", "accuracy_db": -120, "autofocus": "off"}),
     )
     campaign = Campaign.load(campaign.root)
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav1")
+    refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1", threads=2)
     report = quality_of(campaign, "uav1-uav1")
     assert report["numerical_error_db"] < -120

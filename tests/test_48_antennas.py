@@ -21,7 +21,7 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.presets import DEMO_ORIGIN
-from apertura.steps import echo, image, ingest, profile, scene
+from apertura.steps import echo, image, ingest, profile, refine, scene
 from apertura.steps.plan import expected_plan
 from apertura.store import open_stage
 
@@ -86,6 +86,7 @@ def imaged(campaign):
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav1")
+    refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1", threads=2)
     folder = campaign.results / "f01" / "uav1-uav1"
     report = quality_of(campaign, "uav1-uav1")

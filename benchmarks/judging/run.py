@@ -88,6 +88,9 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
         terrain.terrain(campaign)
     for pair in flight.pairs:
         profile.profile(campaign, flight.name, pair)
+    if util.find_spec("apertura.steps.refine"):
+        import_module("apertura.steps.refine").refine(campaign, flight.name)
+    for pair in flight.pairs:
         image.image(campaign, flight.name, pair, threads=1)
     if util.find_spec("apertura.steps.assess"):
         import_module("apertura.steps.assess").assess(campaign, flight.name)

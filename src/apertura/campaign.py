@@ -149,14 +149,20 @@ class Campaign:
             },
             "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
             "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
-            "scene": {"scene": settings["scene"]},
+            "scene": {
+                "scene": {key: value for key, value in settings["scene"].items() if key != "reference_points"},
+            },
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
             "profile": {name: processing[name] for name in ("window", "integration")} | antennas,
+            "refined_track": {
+                "autofocus": processing["autofocus"],
+                "reference_points": settings["scene"]["reference_points"],
+            },
             "assess": {"fusion": processing["fusion"]},
             "image": {
                 name: value
                 for name, value in processing.items()
-                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion"}
+                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion", "autofocus"}
             }
             | antennas,
             "layers": {"integration": processing["integration"], **antennas},

@@ -46,6 +46,7 @@ _PULSE_GEOMETRY = {
     "tx_position": Variable(("pulse", "axis"), "float64", "m", "transmitting phase centre, in `frame`"),
     "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
 }
+_KNOTS = "node", "knot", "axis"
 _FRAME = {
     "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
     "pair": "transmitter-receiver",
@@ -78,14 +79,9 @@ STAGES: Mapping[str, Stage] = {
         {"node": "node name"},
         {
             "position_std": Variable(
-                ("epoch", "axis"),
-                "float64",
-                "m",
-                "what the log states of its error: north, east, up; NaN where nothing",
+                ("epoch", "axis"), "float64", "m", "what the log states of its error: north, east, up; NaN where none"
             ),
-            "fix": Variable(
-                ("epoch",), "int8", "1", "kind of solution, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"
-            ),
+            "fix": Variable(("epoch",), "int8", "1", "solution, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"),
         },
     ),
     "echo": Stage(
@@ -99,10 +95,10 @@ STAGES: Mapping[str, Stage] = {
         _FRAME,
         {
             "sidelink_delay": Variable(
-                ("pulse",),
-                "float64",
-                "m",
-                "measured delay of the sidelink times c, any constant in it; NaN without lock",
+                ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
+            ),
+            "sidelink_vector": Variable(
+                ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
             ),
         }
         | {
@@ -128,6 +124,22 @@ STAGES: Mapping[str, Stage] = {
             "window": "weighting over the subcarriers",
         },
     ),
+    "refined_track": Stage(
+        {
+            "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; between knots linear"),
+            "correction": Variable(_KNOTS, "float64", "m", "to be added to every point of the node, in `frame`"),
+            "std": Variable(_KNOTS, "float64", "m", "standard deviation of what is left, along each axis of `frame`"),
+            "position": Variable(_KNOTS, "float64", "m", "radar phase centre as the log has it, in `frame`"),
+        },
+        {
+            "frame": _FRAME["frame"],
+            "flags": "edges crossed by the refinement: flag name → what was measured, in one line",
+            "nodes": "names along `node`",
+            "decision": "whether tracks were to be refined, and why",
+            "accepted": "whether images are formed with the correction; why: a line; report: what was measured",
+            "left": "what is left of errors of position does to an image: loss_db, shift_m, phase_rad",
+        },
+    ),
     "terrain": Stage(
         {"height": Variable(("y", "x"), "float64", "m", "ground at the pixel: above the ellipsoid, or z of the frame")},
         {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest ground"},
@@ -143,10 +155,7 @@ STAGES: Mapping[str, Stage] = {
     "cube": Stage(
         {
             "image": Variable(
-                ("flight", "pair", "y", "x"),
-                "complex64",
-                "1",
-                "every image; NaN where a pair did not fly or a tile is not formed",
+                ("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN: not flown, not formed"
             ),
             "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
             "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),

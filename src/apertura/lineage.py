@@ -77,7 +77,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `RESULTS`.
     *where
         Flight and node (raw, track), flight and pair (echo, profile, image, layers, export), flight (calibration,
-        assessment, fused), nothing (scene, terrain, cube, coverage, speed_accuracy, whole).
+        refined_track, assessment, fused), nothing (scene, terrain, cube, coverage, speed_accuracy, whole).
     """
     return RESULTS[result](campaign, *where)
 
@@ -100,8 +100,9 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     if campaign.settings.scene.dem:
         yield ("terrain",)
     for flight in campaign.image_flights:
-        for stage in ("profile", "image", "layers"):
-            yield from ((stage, flight.name, pair) for pair in flight.pairs)
+        yield from (("profile", flight.name, pair) for pair in flight.pairs)
+        yield "refined_track", flight.name
+        yield from ((stage, flight.name, pair) for stage in ("image", "layers") for pair in flight.pairs)
         yield "assessment", flight.name
         yield from (("export", flight.name, pair) for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
@@ -115,8 +116,7 @@ def _raw(campaign: Campaign, flight: str, node: str) -> Result:
 
 
 def _track(campaign: Campaign, flight: str, node: str) -> Result:
-    log = campaign.relative(campaign.track_file(flight, node))
-    return Result(campaign.manifest("track", flight, node), (log,), {})
+    return Result(campaign.manifest("track", flight, node), (campaign.relative(campaign.track_file(flight, node)),), {})
 
 
 def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
@@ -124,17 +124,15 @@ def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
     nodes = dict.fromkeys(pair.split("-"))
     if isinstance(waveform, OfdmWaveform):
         sources = [campaign.manifest(stage, flight, node) for node in nodes for stage in ("raw", "track")]
-        sources = [
-            waveform.codes,
-            *(campaign.relative(campaign.recording_files(flight, node)[-1]) for node in nodes),
-            *sources,
-        ]
+        samples = [campaign.relative(campaign.recording_files(flight, node)[-1]) for node in nodes]
+        sources = [waveform.codes, *samples, *sources]
         if calibration is not None and campaign.flight(flight).kind == "image":
             sources.append(campaign.manifest("calibration", calibration.flight))
     else:
         sources = [campaign.relative(path) for path in campaign.raw_files(flight, pair.split("-")[1]).values()]
-    settings = campaign.relevant("echo", pair, flight=flight)
-    return Result(campaign.manifest("echo", flight, pair), tuple(sources), settings)
+    return Result(
+        campaign.manifest("echo", flight, pair), tuple(sources), campaign.relevant("echo", pair, flight=flight)
+    )
 
 
 def _calibration(campaign: Campaign, flight: str) -> Result:
@@ -151,43 +149,51 @@ def _scene(campaign: Campaign) -> Result:
 
 
 def _terrain(campaign: Campaign) -> Result:
-    sources = (campaign.manifest("scene"), *_heights(campaign))
-    return Result(campaign.manifest("terrain"), sources, campaign.relevant("terrain"))
+    return Result(
+        campaign.manifest("terrain"), (campaign.manifest("scene"), *_heights(campaign)), campaign.relevant("terrain")
+    )
 
 
 def _layers(campaign: Campaign, flight: str, pair: str) -> Result:
-    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
-    sources = (*stages, *_ground(campaign), *_patterns(campaign, pair))
     settings = {"campaign": campaign.settings.campaign, **campaign.relevant("layers", pair)}
-    return Result(campaign.manifest("layers", flight, pair), sources, settings)
+    return Result(
+        campaign.manifest("layers", flight, pair), _seen(campaign, flight, [pair], "echo", "profile"), settings
+    )
 
 
 def _coverage(campaign: Campaign) -> Result:
     pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
     made = [campaign.manifest(stage, *pair) for pair in pairs for stage in ("echo", "layers")]
-    settings = {"campaign": campaign.settings.campaign}
-    return Result(campaign.manifest("coverage"), (*made, campaign.manifest("scene")), settings)
+    sources = (*made, campaign.manifest("scene"))
+    return Result(campaign.manifest("coverage"), sources, {"campaign": campaign.settings.campaign})
 
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
-    sources = (campaign.manifest("echo", flight, pair), *_ground(campaign), *_patterns(campaign, pair))
+    sources = _seen(campaign, flight, [pair], "echo")
     return Result(campaign.manifest("profile", flight, pair), sources, campaign.relevant("profile", pair))
 
 
-def _patterns(campaign: Campaign, pair: str) -> list[str]:
-    return [campaign.relative(path) for path in campaign.pattern_files(pair).values()]
+def _refined_track(campaign: Campaign, flight: str) -> Result:
+    pairs = [] if campaign.settings.processing.autofocus == "off" else campaign.flight(flight).pairs
+    sources = _seen(campaign, flight, pairs, "echo", "profile")
+    return Result(campaign.manifest("refined_track", flight), sources, campaign.relevant("refined_track"))
 
 
 def _image(campaign: Campaign, flight: str, pair: str) -> Result:
-    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
-    sources = (*stages, *_ground(campaign), *_patterns(campaign, pair))
+    sources = (*_seen(campaign, flight, [pair], "echo", "profile"), campaign.manifest("refined_track", flight))
     return Result(campaign.manifest("image", flight, pair), sources, campaign.relevant("image", pair))
 
 
+def _seen(campaign: Campaign, flight: str, pairs: Sequence[str], *stages: str) -> tuple[str, ...]:
+    """Return stages of some pairs, the ground and the antennas that see it."""
+    formed = [campaign.manifest(stage, flight, pair) for pair in pairs for stage in stages]
+    patterns = [campaign.relative(path) for pair in pairs for path in campaign.pattern_files(pair).values()]
+    return tuple(dict.fromkeys([*formed, *_ground(campaign), *patterns]))
+
+
 def _assessment(campaign: Campaign, flight: str) -> Result:
-    pairs = campaign.flight(flight).pairs
-    stages = [campaign.manifest(stage, flight, pair) for pair in pairs for stage in ("echo", "image")]
-    sources = (*stages, *_ground(campaign))
+    stages = [campaign.manifest(of, flight, pair) for pair in campaign.flight(flight).pairs for of in ("echo", "image")]
+    sources = (*stages, campaign.manifest("refined_track", flight), *_ground(campaign))
     return Result(campaign.manifest("assessment", flight), sources, campaign.relevant("assess"))
 
 
@@ -196,13 +202,11 @@ def _cube(campaign: Campaign) -> Result:
     images = [campaign.manifest("image", flight.name, pair) for flight in flights for pair in flight.pairs]
     assessed = [campaign.manifest("assessment", flight.name) for flight in flights]
     sources = (*images, *assessed, campaign.manifest("scene"))
-    settings = {"tile_px": campaign.settings.processing.tile_px}
-    return Result(campaign.manifest("cube"), sources, settings)
+    return Result(campaign.manifest("cube"), sources, {"tile_px": campaign.settings.processing.tile_px})
 
 
 def _export(campaign: Campaign, flight: str, pair: str) -> Result:
-    stages = (campaign.manifest("image", flight, pair), campaign.manifest("assessment", flight))
-    sources = (*stages, campaign.manifest("scene"))
+    sources = tuple(campaign.manifest(*of) for of in (("image", flight, pair), ("assessment", flight), ("scene",)))
     return Result(campaign.manifest("export", flight, pair), sources, {"campaign": campaign.settings.campaign})
 
 
@@ -214,10 +218,8 @@ def _fused(campaign: Campaign, flight: str) -> Result:
 
 
 def _speed_accuracy(campaign: Campaign) -> Result:
-    flight, pair = charted(campaign)
-    sources = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile")]
-    settings = {"pair": [flight, pair], **campaign.relevant("image", pair)}
-    return Result(campaign.manifest("speed_accuracy", STUDY), (*sources, *_ground(campaign)), settings)
+    image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
+    return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
 
 
 def _whole(campaign: Campaign) -> Result:
@@ -250,6 +252,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "layers": _layers,
     "coverage": _coverage,
     "profile": _profile,
+    "refined_track": _refined_track,
     "image": _image,
     "assessment": _assessment,
     "cube": _cube,

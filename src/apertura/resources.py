@@ -106,6 +106,7 @@ DEMANDS: Mapping[str, Demand] = {
     "layers": Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
     "coverage": Demand(600, pulse_bytes=500, pixel_s=1),
     "profile": Demand(500, pulse_bytes=500, recorded_s=120),
+    "refine": Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
     "tiles": _IMAGE,
     "image": _IMAGE,
     "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
@@ -236,7 +237,7 @@ class RuleResources:
         """Return the time limit of a job, minutes; twice as much at each further attempt."""
         work, demand = self._work(wildcards), self.demand
         seconds = demand.recorded_s * work.recorded_bytes / 1e9 + demand.pixel_s * work.images * work.pixels / 1e6
-        seconds += demand.sum_s * work.pixels * work.pulses / 1e9
+        seconds += demand.sum_s * work.images * work.pixels * work.pulses / 1e9
         return _LEAST_MINUTES + math.ceil(_SLOWER * seconds / 60) << attempt - 1
 
     def _work(self, wildcards: Any) -> Work:

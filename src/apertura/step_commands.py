@@ -77,6 +77,12 @@ def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def refine(flight: str, campaign: Directory = HERE) -> None:
+    """Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr."""
+    _run("apertura.steps.refine:refine", campaign, flight)
+
+
+@app.command()
 def image(flight: str, pair: str, campaign: Directory = HERE, threads: Threads = 1) -> None:
     """Focus a pair's image, image.zarr."""
     _run("apertura.steps.image:image", campaign, flight, pair, threads=threads)

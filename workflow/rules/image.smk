@@ -77,6 +77,30 @@ rule layers:
         "apertura step layers {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
 
+rule refine:
+    input:
+        lambda wildcards: result_of(campaign, "refined_track", wildcards.flight).sources,
+    output:
+        "results/{flight}/refined_track.manifest.json",
+    log:
+        "results/logs/{flight}/refine.log",
+    benchmark:
+        "results/benchmarks/{flight}/refine.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["refine"].threads
+    resources:
+        mem_mb=asked["refine"].mem_mb,
+        runtime=asked["refine"].runtime,
+    params:
+        settings=campaign.relevant("refined_track"),
+        code=code_of("refined_track"),
+    message:
+        "{wildcards.flight}: refining the tracks of its nodes where that pays"
+    shell:
+        "apertura step refine {wildcards.flight} > {log} 2>&1"
+
+
 rule tiles:
     input:
         lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).sources,

@@ -34,6 +34,7 @@ CHECKS: Mapping[str, str] = {
     "coverage": "apertura.check.coverage:check_coverage",
     "patterns": "apertura.check.antennas:check_patterns",
     "crs": "apertura.check.scene:check_scene_crs",
+    "reference_points": "apertura.check.scene:check_reference_points",
     "dem": "apertura.check.dem:check_dem",
     "spikes": "apertura.check.dem:check_spikes",
     "apart": "apertura.check.places:check_nodes_apart",

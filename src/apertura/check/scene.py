@@ -15,6 +15,7 @@ from apertura.scene.map_crs import check_crs
 from apertura.settings import CONFIG
 
 _WHERE = f"{CONFIG}: scene.crs"
+_FAR_UP_M = 1000.0  # between a point and the ground: heights are known at least so well
 
 
 def check_scene_crs(inspected: Inspected) -> Iterator[CampaignError]:
@@ -26,6 +27,32 @@ def check_scene_crs(inspected: Inspected) -> Iterator[CampaignError]:
         yield _not_in_metres(inspected, asked.crs)
     elif inspected.crs not in {LOCAL, None}:
         yield from _elsewhere(inspected, str(inspected.crs))
+
+
+def check_reference_points(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield each point of known place that lies outside the scene, or so high that it is no height of the ground."""
+    grid = inspected.grid
+    if grid is None:
+        return
+    for number, point in enumerate(inspected.campaign.settings.scene.reference_points):
+        west, south, east, north = grid.bounds_m
+        x, y, height_m = point.position_m
+        where, remedy = f"{CONFIG}: scene.reference_points[{number}]", "Correct position_m, or take the point out."
+        if not (west <= x <= east and south <= y <= north):
+            swapped = west <= y <= east and south <= x <= north
+            yield CampaignError(
+                f"{point.name} at {x:.2f}, {y:.2f} lies outside the scene",
+                where=where,
+                expected=f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f} in {grid.crs}",
+                remedy="Easting comes before northing." if swapped else remedy,
+            )
+        elif inspected.ground is not None and abs(height_m - inspected.level_m) > _FAR_UP_M:
+            yield CampaignError(
+                f"{point.name} is at height {height_m:.1f} m",
+                where=where,
+                expected=f"a point of the scene, whose ground lies at about {inspected.level_m:.1f} m",
+                remedy=f"Heights count from {'the ellipsoid' if grid.frame == 'ecef' else 'the local frame'}. {remedy}",
+            )
 
 
 def _elsewhere(inspected: Inspected, crs: str) -> Iterator[CampaignError]:

@@ -4,16 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import centre_frequency
 from apertura.load.pair import OpenPair
 from apertura.load.scene import OpenScene
-from apertura.quality.budget import BudgetLine, noise_loss, offset_line, position_lines
+from apertura.quality.budget import BudgetLine, expected, noise_loss, offset_line, position_lines
 from apertura.quality.path_errors import Effect, PointPaths
-from apertura.scene.grid import SceneGrid
 from apertura.settings import OfdmWaveform
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
@@ -34,9 +32,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     paths = _paths(pair, scene)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     lines = [
-        *position_lines(
-            paths, pair.positions, sidelink=not monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
-        ),
+        *_positions(campaign, pair, paths),
         offset_line(
             paths, "heights", -paths.gradient[:, 2], campaign.settings.scene.height_std_m, unit="m", common=True
         ),
@@ -70,6 +66,18 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     return [*lines, *_between_epochs(paths, pair)]
 
 
+def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
+    """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
+    return expected(_positions(campaign, pair, _paths(pair, scene))).loss_db
+
+
+def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
+    if pair.left is not None:
+        return [BudgetLine("positions", "what the refined tracks leave", pair.left)]
+    sidelink = not pair.monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
+    return position_lines(paths, pair.positions, sidelink=sidelink)
+
+
 def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
     """Return what the spline between the epochs of the logs errs by: noise that lasts an epoch."""
     stated = pair.report.get("positions", {})
@@ -90,27 +98,13 @@ def arithmetic_line(error_db: float) -> BudgetLine:
 
 
 def _paths(pair: OpenPair, scene: OpenScene) -> PointPaths:
-    grid = scene.grid
-    row, column = (size // 2 for size in grid.shape)
-    height_m = float(scene.terrain.heights_at(grid, row, column))
     return PointPaths.of(
         pair.aperture,
         pair.time_s,
-        point_m=grid.positions_at(row, column, height_m),
-        axes=_axes(grid, row, column, height_m),
+        point_m=scene.middle_m,
+        axes=scene.axes,
         wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
     )
-
-
-def _axes(grid: SceneGrid, row: int, column: int, height_m: float) -> NDArray[np.float64]:
-    """Return unit vectors along the grid's easting, northing and height in the frame of the pixels."""
-    here = grid.positions_at(row, column, height_m)
-    steps = [
-        grid.positions_at(row, column + 1, height_m) - here,
-        grid.positions_at(row - 1, column, height_m) - here,
-        grid.positions_at(row, column, height_m + 1) - here,
-    ]
-    return np.array([step / np.linalg.norm(step) for step in steps])
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:

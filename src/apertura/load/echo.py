@@ -111,6 +111,7 @@ def pair_echo(
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
             **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
             **_axes((tx, rx), at),
+            **_sidelink_vector((tx, rx), at),
         },
         attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m},
@@ -205,6 +206,14 @@ def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[
         for name, node, beam in zip(("tx_axes", "rx_axes"), nodes, beams, strict=True)
         if beam is not None
     }
+
+
+def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:
+    """Return b of docs/theory/autofocus.md, eq. 2, where the echo was given back its length."""
+    tx, rx = nodes
+    if tx.name == rx.name:
+        return {}
+    return {"sidelink_vector": (("pulse", "axis"), tx.antenna("sidelink", at) - rx.antenna("sidelink", at))}
 
 
 def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:

@@ -18,12 +18,14 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
-from apertura.ingest import open_recording, read_phase_history, read_track
+from apertura.ingest import open_recording, read_track
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.positions import position_error
+from apertura.load.recorded import recorded_echo
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions
+from apertura.quality.path_errors import Effect
 from apertura.settings import Node, OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
@@ -44,12 +46,19 @@ class OpenPair:
         Longest total path inside the cyclic prefix.
     time_s
         (pulse,) float64, seconds from the first.
+    began
+        The first pulse, UTC.
     positions
         What is known of the node's positions, or of the transmitter's and the receiver's.
     history
         The echo itself; None before it is formed.
     beams
         Of the antennas; None where they are isotropic.
+    sidelink_m
+        (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
+        given back a sidelink's length, and before it is formed.
+    left
+        What is left of errors of position after the tracks were refined; None where they are those of the logs.
     report
         What the echo stage says of itself: its attributes; empty before it is formed.
     """
@@ -61,9 +70,12 @@ class OpenPair:
     weight: NDArray[np.float64]
     path_limit_m: float
     time_s: NDArray[np.float64]
+    began: np.datetime64
     positions: tuple[NodePositions, ...]
     history: PhaseHistory | None = None
     beams: Beams | None = None
+    sidelink_m: NDArray[np.float64] | None = None
+    left: Effect | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -86,8 +98,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     if echo is None:
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
-        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        echo = keep_segments(campaign, flight, pair, read_phase_history(waveform.format, files, pair=pair))
+        echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair, waveform.format))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
@@ -100,9 +111,11 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         history.weight,
         limit_m,
         time_s=_seconds(echo.time.values),
+        began=echo.time.values[0],
         positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
         history=history,
         beams=beams,
+        sidelink_m=echo.sidelink_vector.values if "sidelink_vector" in echo else None,
         report=echo.attrs,
     )
 
@@ -159,6 +172,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
         weight,
         limit_m,
         time_s=_seconds(times),
+        began=times[0],
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
     )

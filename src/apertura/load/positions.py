@@ -1,7 +1,7 @@
 """Which pulses of a pair have positions that can be trusted, and how well they are known."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -85,16 +85,20 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
         std_m: [north, east, up], metres, the median over the pulses of what the log states, else the config's, else
         None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds.
     """
-    std_m: list[float] | None = None
-    stated_by: Literal["log", "config", "nobody"] = "nobody"
     if "position_std" in track:
         epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
         stated = track.position_std.values[epochs]
         stated = stated[(stated > 0).all(axis=1)]
         if len(stated):
-            std_m, stated_by = np.median(stated, axis=0).tolist(), "log"
-    if std_m is None and settings.position_std_m is not None:
-        std_m, stated_by = np.broadcast_to(settings.position_std_m, 3).tolist(), "config"
+            return stated_error(settings) | {"std_m": np.median(stated, axis=0).tolist(), "stated_by": "log"}
+    return stated_error(settings)
+
+
+def stated_error(settings: Node) -> dict[str, Any]:
+    """Return what the config says of the error of a node's positions, as `position_error`."""
+    stated = settings.position_std_m
+    std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
+    stated_by = "nobody" if stated is None else "config"
     return {"std_m": std_m, "correlation_s": settings.position_correlation_s, "stated_by": stated_by}
 
 

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 
 _OF_NODES = {"raw", "track"}
+_OF_FLIGHTS = {"refined_track"}
 _OF_THE_CAMPAIGN = {"cube", "terrain"}
-"""Stages of a node in a flight, and of the whole campaign; the others are of a pair in a flight."""
+"""Stages of a node in a flight, of a flight, and of the whole campaign; the others are of a pair in a flight."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class OpenCampaign:
         name
             A key of `apertura.contracts.STAGES`, such as 'echo'.
         *where
-            Flight and node (raw, track), flight and pair (echo, profile, image), nothing (cube, terrain).
+            Flight and node (raw, track), flight and pair (echo, profile, image), flight (refined_track), nothing
+            (cube, terrain).
 
         Raises
         ------
@@ -61,6 +63,9 @@ class OpenCampaign:
         _check_name(name, "stage", STAGES, where="campaign.stage")
         if name in _OF_THE_CAMPAIGN:
             _check_count(where, 0, name, "the stage alone: it is of the whole campaign")
+        elif name in _OF_FLIGHTS:
+            _check_count(where, 1, name, "a flight")
+            self.campaign.flight(where[0])
         else:
             kind = "node" if name in _OF_NODES else "pair"
             _check_count(where, 2, name, f"a flight and a {kind}")

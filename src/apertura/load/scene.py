@@ -3,6 +3,7 @@
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,27 @@ class OpenScene:
     def spec(self) -> dict[str, Any]:
         """Grid and level as JSON values, for scene.json and for provenance."""
         return {"grid": asdict(self.grid), "height_m": self.level.height_m}
+
+    @cached_property
+    def middle_m(self) -> NDArray[np.float64]:
+        """The ground in the middle, (3,) float64 metres in the frame of the pixels."""
+        return self.grid.positions_at(*self._middle)
+
+    @cached_property
+    def axes(self) -> NDArray[np.float64]:
+        """Unit vectors along easting, northing and height there, the rows of (3, 3) float64."""
+        row, column, height_m = self._middle
+        steps = [
+            self.grid.positions_at(row, column + 1, height_m) - self.middle_m,
+            self.grid.positions_at(row - 1, column, height_m) - self.middle_m,
+            self.grid.positions_at(row, column, height_m + 1) - self.middle_m,
+        ]
+        return np.array([step / np.linalg.norm(step) for step in steps])
+
+    @cached_property
+    def _middle(self) -> tuple[int, int, float]:
+        row, column = (size // 2 for size in self.grid.shape)
+        return row, column, float(self.terrain.heights_at(self.grid, row, column))
 
     @property
     def report(self) -> dict[str, Any]:

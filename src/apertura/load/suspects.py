@@ -83,6 +83,15 @@ def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, w
     return Evidence(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
 
 
+def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> list[Evidence]:
+    """Return the same echoes with antennas, and sidelinks given back, where other logs of their nodes put them."""
+    moved = []
+    for one, history in zip(found, _flown(nodes, found), strict=True):
+        tx, rx = (nodes[name] for name in one.pair.split("-"))
+        moved.append(replace(one, history=history, sidelink_m=_sidelink_m(tx, rx, one.time)))
+    return moved
+
+
 def some_pulses(echo: xr.Dataset) -> slice:
     """Return the pulses of an echo that suspicions are tried on."""
     return aperture_of(echo).sample(MOST_PULSES)

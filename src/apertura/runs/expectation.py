@@ -31,6 +31,7 @@ _COSTS = {
     "ingest": _Cost(1.3, mb=0.01),
     "echo": _Cost(2.8, mb=0.02),
     "profile": _Cost(1.8, mb=0.01),
+    "refine": _Cost(2.5, mb=0.02, mpx=0.5),
     "image": _Cost(3.5, mpx=2.0, mb_mpx=0.06),
     "tiles": _Cost(3.0, mb_mpx=0.06),
     "layers": _Cost(1.4, mpx=0.5),
@@ -191,7 +192,7 @@ class Outlook:
             return [(flight.name, node) for flight in flights for node in flight.participants]
         if rule in {"echo", "profile", "image", "tiles", "export"}:
             return [(flight.name, pair) for flight in flights for pair in flight.pairs]
-        if rule in {"assess", "calibrate", "export_fused"}:
+        if rule in {"assess", "calibrate", "export_fused", "refine"}:
             return [(flight.name,) for flight in flights]
         return [()]
 

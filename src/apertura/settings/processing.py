@@ -24,6 +24,11 @@ class Processing(ImagingChoices):
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
     )
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
+    autofocus: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="tracks refined by the images themselves; auto: where errors of position that are stated cost more "
+        "than they should",
+    )
     scheduler: str = Field(
         "threads",
         description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "
@@ -32,6 +37,11 @@ class Processing(ImagingChoices):
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
+
+    @field_validator("autofocus", mode="before")
+    @classmethod
+    def _yaml_reads_on_and_off_as_truth(cls, word: object) -> object:
+        return {True: "on", False: "off"}[word] if isinstance(word, bool) else word
 
     @field_validator("scheduler")
     @classmethod

@@ -4,7 +4,15 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from apertura.settings.section import Section
+from apertura.settings.section import Metres3, Section, Title
+
+
+class KnownPoint(Section):
+    """A point that shows in the images and whose place is known: refined tracks are tied to it."""
+
+    name: Title = Field(description="what it is called")
+    position_m: Metres3 = Field(description="easting, northing in scene.crs, ellipsoidal height (z in local), m")
+    std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
 
 
 class Scene(Section):
@@ -29,6 +37,21 @@ class Scene(Section):
     geoid: str | None = Field(
         None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
     )
+    reference_points: tuple[KnownPoint, ...] = Field(
+        (),
+        description="bright points whose places are known, which tracks refined are tied to: a list of name, "
+        "position_m [easting, northing, ellipsoidal height] and std_m",
+    )
+
+    @model_validator(mode="after")
+    def _points_are_somewhere(self) -> Self:
+        if self.reference_points and self.crs == "auto":
+            raise ValueError("reference_points are in crs, which is auto: give the CRS")
+        names = [point.name for point in self.reference_points]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"reference_points: two are called {twice[0]!r}")
+        return self
 
     @model_validator(mode="after")
     def _datum_is_stated(self) -> Self:

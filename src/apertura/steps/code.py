@@ -7,6 +7,7 @@ from apertura.provenance import code_sha256
 _MODULES = {
     "raw": "apertura.steps.ingest",
     "track": "apertura.steps.ingest",
+    "refined_track": "apertura.steps.refine",
     "assessment": "apertura.steps.assess",
     "fused": "apertura.steps.export",
     "speed_accuracy": "apertura.study.chart.speed_accuracy",
@@ -23,6 +24,6 @@ def code_of(result: str) -> str:
     >>> code_of("raw") == code_of("track") != code_of("echo")
     True
     """
-    tables = {"image": ENGINES.values(), "export": export_modules("pair")}
+    tables = {"image": ENGINES.values(), "refined_track": ENGINES.values(), "export": export_modules("pair")}
     tables |= {kind: export_modules(kind) for kind in ("fused", "layers")}
     return code_sha256(_MODULES.get(result, f"apertura.steps.{result}"), *tables.get(result, ()))

@@ -6,10 +6,10 @@ from typing import Any
 import xarray as xr
 
 from apertura.campaign import Campaign
-from apertura.ingest import read_phase_history
 from apertura.lineage import result_of
 from apertura.load.acquisition import open_acquisition
 from apertura.load.echo import PairEcho, pair_echo
+from apertura.load.recorded import recorded_echo
 from apertura.load.transmitted import read_codes
 from apertura.provenance import merged
 from apertura.settings import PhaseHistoryWaveform
@@ -26,7 +26,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     calibration = calibrated(campaign, flight, pair)
     if isinstance(waveform, PhaseHistoryWaveform):
         files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        formed = PairEcho.recorded(read_phase_history(waveform.format, files, pair=pair))
+        formed = PairEcho.recorded(recorded_echo(campaign, flight, pair, waveform.format))
     else:
         files = [campaign.codes_file]
         codes = read_codes(files[0], waveform.subcarriers)

@@ -1,6 +1,6 @@
 """Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from apertura.load.antennas import antennas_report, pattern_digests
 from apertura.load.budget import arithmetic_line, budget_of
 from apertura.load.pair import OpenPair, open_pair
 from apertura.load.plan import plan_pair
+from apertura.load.refined import RefinedTrack, open_refined
 from apertura.load.scene import OpenScene, open_scene
 from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
@@ -64,13 +65,15 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
             **work.report,
+            "autofocus": work.track.report(pair),
         }
         lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
         focus = focus_report(work.formation, target)
         quality |= {"focus": focus, "budget": [line.report for line in lines]}
         expected_db = expected(lines).loss_db
         focus["expected_db"] = round(expected_db, 3)
-        quality["flags"] = {**echo.attrs["flags"], **plan.flags, **quality["flags"], **focus_flags(focus, expected_db)}
+        flags = {**echo.attrs["flags"], **work.track.stage.attrs["flags"], **plan.flags, **quality["flags"]}
+        quality["flags"] = {**flags, **focus_flags(focus, expected_db)}
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 
@@ -113,6 +116,7 @@ class _Work:
 
     folder: Path
     echo: xr.Dataset
+    track: RefinedTrack
     pair: OpenPair
     scene: OpenScene
     formation: Formation
@@ -143,12 +147,14 @@ class _Work:
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
-    scene, opened = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
+    scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
+    track = open_refined(campaign, flight)
+    opened, profiles = track.pair(logged), track.profiles(logged, profiles_of(profile, lazy=True))
     if opened.history is None:
         raise TypeError("an open echo stage holds a phase history")
     plan = plan_pair(campaign, opened, scene, threads=threads)
-    side_px = campaign.settings.processing.tile_px
-    formation = Formation(opened.history, profiles_of(profile, lazy=True), scene.grid, plan, side_px)
+    plan = replace(plan, decisions=(*plan.decisions, track.decision))
+    formation = Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px)
     # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(
@@ -159,9 +165,10 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         ),
         "image",
         modules=_MODULES,
-        parents=[echo, profile, *scene.parents],
+        parents=[echo, profile, track.stage, *scene.parents],
         inputs=pattern_digests(campaign, pair),
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
     )
     scheduler = campaign.settings.processing.scheduler
-    return _Work(campaign.stage("image", flight, pair), echo, opened, scene, formation, empty, threads, scheduler)
+    folder = campaign.stage("image", flight, pair)
+    return _Work(folder, echo, track, opened, scene, formation, empty, threads, scheduler)

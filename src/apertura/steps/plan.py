@@ -1,6 +1,7 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
 import shutil
+from dataclasses import replace
 from math import isfinite
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from apertura.errors import CampaignError
 from apertura.load.budget import budget_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import plan_pair
+from apertura.load.refined import expected_track
 from apertura.load.scene import Flown, expected_scene
 from apertura.planning.plan import Plan
 from apertura.quality.budget import BudgetLine, expected
@@ -39,10 +41,13 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     seconds, disk = 0.0, 0
     scene = expected_scene(campaign, lambda: first_flight(campaign))
     for flight in campaign.image_flights:
-        for pair in flight.pairs:
-            opened = open_pair(campaign, flight.name, pair)
+        logged = [open_pair(campaign, flight.name, pair) for pair in flight.pairs]
+        pairs, autofocus = expected_track(campaign, logged, scene)
+        for opened in pairs:
             plan = plan_pair(campaign, opened, scene, threads=threads)
-            console.print(_table(plan, f"{flight.name}/{pair}"), _budget_table(budget_of(campaign, opened, scene)))
+            plan = replace(plan, decisions=(*plan.decisions, autofocus))
+            budget = _budget_table(budget_of(campaign, opened, scene))
+            console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes

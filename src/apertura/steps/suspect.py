@@ -15,8 +15,9 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.imaging.sharpness import gathered
 from apertura.load.acquisition import Acquisition, numerology_of, open_acquisition
 from apertura.load.echo import pair_echo
+from apertura.load.refined import open_refined
 from apertura.load.scene import OpenScene, open_scene
-from apertura.load.suspects import Evidence, Suspicion, evidence_of, some_pulses, suspicions
+from apertura.load.suspects import Evidence, Suspicion, evidence_of, seen_from, some_pulses, suspicions
 from apertura.load.transmitted import read_codes
 from apertura.scene.grid import SceneGrid
 from apertura.settings import OfdmWaveform
@@ -53,12 +54,15 @@ def hypotheses(
     waveform = campaign.settings.waveform
     if not isinstance(waveform, OfdmWaveform):
         return []
-    nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in campaign.flight(flight).nodes}
-    window = campaign.settings.processing.window
+    logged = {node: open_acquisition(campaign, flight, node, waveform) for node in campaign.flight(flight).nodes}
+    window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     found = [
-        _evidence(nodes, pair, open_stage(campaign.stage("echo", flight, pair), "echo"), window)
+        _evidence(logged, pair, open_stage(campaign.stage("echo", flight, pair), "echo"), window)
         for pair in campaign.flight(flight).pairs
     ]
+    nodes = {name: track.node(node) for name, node in logged.items()}
+    if track.correction is not None:
+        found = seen_from(nodes, found)
     scene = open_scene(campaign)
     now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
     named: list[tuple[float, Suspicion]] = []

@@ -19,6 +19,7 @@ from apertura.imaging.stages import profiles_of
 from apertura.lineage import STUDY, result_of
 from apertura.load.pair import open_pair
 from apertura.load.plan import asked_accuracy, job_of, plan_job
+from apertura.load.refined import open_refined
 from apertura.load.scene import OpenScene, open_scene
 from apertura.planning.plan import Plan
 from apertura.planning.search import Search
@@ -84,9 +85,10 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     adds to the planned error is added to that of every setting.
     """
     lineage = result_of(campaign, "speed_accuracy").begin(campaign.root, [__name__])
-    opened = open_pair(campaign, flight, pair)
+    logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
     scene = open_scene(campaign)
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
+    opened, profiles = track.pair(logged), track.profiles(logged, profiles)
     middle = len(profiles) // 2
     block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
     if opened.history is None:

@@ -18,7 +18,7 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.lineage import STUDY, result_of
 from apertura.settings import Flight
-from apertura.steps import assess, calibration, cube, echo, export, image, ingest, profile, scene, terrain
+from apertura.steps import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene, terrain
 from apertura.store import record_files
 from apertura.study.chart.whole_picture import Whole, draw_whole
 from apertura.study.tables import write_table
@@ -121,6 +121,8 @@ def _carried(campaign: Campaign) -> _Run:
             terrain.terrain(campaign)
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
+        refine.refine(campaign, flight.name)
+        for pair in flight.pairs:
             image.image(campaign, flight.name, pair)
         assess.assess(campaign, flight.name)
         cube.cube(replace(campaign, flights=(flight,)))

@@ -1,0 +1,296 @@
+"""Tracks refined by the images: whether it is done, what images are then formed from, and what they say of it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from folders import copy_writable, edit_config, ingest_all, quality_of, run_steps
+from spoiling.logs import read_log, write_log
+from spoiling.of_logs import noisy
+from track_noise import saying
+
+from apertura.campaign import Campaign
+from apertura.check import as_line, problems
+from apertura.check.stale import stale_results
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import ecef_from_geodetic
+from apertura.geometry.track_correction import TrackCorrection
+from apertura.imaging.stages import profiles_of
+from apertura.load.acquisition import open_acquisition
+from apertura.load.pair import open_pair
+from apertura.load.refined import RefinedTrack, clock_s, open_refined
+from apertura.load.results import open_campaign
+from apertura.load.scene import open_scene
+from apertura.load.sightings import Seen, reference_points
+from apertura.load.suspects import evidence_of, seen_from
+from apertura.planning.autofocus import BORNE_DB, decide_autofocus
+from apertura.planning.plan import Decision
+from apertura.refinement.inputs import Sighting
+from apertura.refinement.outcome import Refinement
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.steps import echo, image, profile, refine, scene
+from apertura.steps.plan import print_plan
+from apertura.steps.stamping import stamped
+from apertura.steps.verify import verify
+from apertura.store import open_stage, save_stage
+
+PAIRS = ("uav1-uav1", "uav1-uav2")
+FOUND = Decision("autofocus", "on", "asked for")
+
+
+def state(root, section, **keys):
+    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
+    return Campaign.load(root)
+
+
+def refresh(campaign):
+    """Make what images of the first flight begin with."""
+    ingest_all(campaign)
+    for pair in PAIRS:
+        echo.echo(campaign, "f01", pair)
+    scene.scene(campaign)
+    for pair in PAIRS:
+        profile.profile(campaign, "f01", pair)
+
+
+def image_of(campaign, pair):
+    return open_stage(campaign.stage("image", "f01", pair), "image").image.values
+
+
+@pytest.mark.parametrize(
+    ("asked", "loss_db", "silent", "value"),
+    [
+        ("auto", -BORNE_DB - 0.01, [], "on"),
+        ("auto", -BORNE_DB + 0.01, [], "off"),
+        ("auto", -5.0, ["b"], "off"),
+        ("on", 0.0, ["a", "b"], "on"),
+        ("off", -5.0, [], "off"),
+    ],
+)
+def test_tracks_are_refined_where_that_is_asked_or_errors_that_are_stated_cost_more_than_is_borne(
+    asked, loss_db, silent, value
+):
+    decision = decide_autofocus(asked, {"a-a": 0.0, "a-b": loss_db}, silent)
+    assert decision.value == value
+    assert ("position_std_m" in decision.reason) is (silent == ["b"])
+
+
+def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny):
+    stage = open_campaign(finished_tiny.root).stage("refined_track", "f01")
+    assert dict(stage.sizes) == {"node": 2, "knot": 0, "axis": 3}
+    assert stage.attrs["nodes"] == ["uav1", "uav2"]
+    quality = quality_of(finished_tiny, "uav1-uav2")
+    assert quality["autofocus"] == {
+        "decision": "off: auto: nobody said how well positions of uav1 are known; state nodes.<node>.position_std_m to "
+        "have them refined",
+        "accepted": False,
+        "why": "images are formed from the logs as they are",
+    }
+    assert quality["models"]["autofocus"].startswith("off: auto: nobody said")
+
+
+def test_where_nothing_is_corrected_images_are_formed_from_the_very_same_arrays(finished_tiny):
+    track, pair = open_refined(finished_tiny, "f01"), open_pair(finished_tiny, "f01", "uav1-uav2")
+    profiles = profiles_of(open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile"))
+    assert track.pair(pair) is pair
+    assert track.profiles(pair, profiles) is profiles
+
+
+@pytest.fixture(scope="module")
+def spoilt(finished_tiny, tmp_path_factory):
+    """A campaign whose transmitter's log is wrong by centimetres, profiles made, and what would mend it."""
+    root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("spoilt") / "campaign")
+    path = root / "raw" / "f01" / "uav1.track.csv"
+    log = read_log(path)
+    error_m = 0.03 * np.sin(2 * np.pi * log.time_s[:, None] / np.array([2.1, 1.7, 2.4]) + np.array([0.0, 1.0, 2.0]))
+    moved = log.moved(error_m)
+    write_log(path, moved)
+    campaign = Campaign.load(root)
+    refresh(campaign)
+    back_m = ecef_from_geodetic(*log.geodetic.T) - ecef_from_geodetic(*moved.geodetic.T)
+    return campaign, (log.begun, TrackCorrection(log.time_s, {"uav1": back_m, "uav2": np.zeros_like(back_m)}))
+
+
+def write_track(campaign, began, correction, *, accepted=True, flags=None):
+    """Write the stage that a refinement would, which has found this."""
+    opened = open_scene(campaign)
+    sightings = []
+    for name in PAIRS:
+        pair = open_pair(campaign, "f01", name)
+        profiles = profiles_of(open_stage(campaign.stage("profile", "f01", name), "profile"))
+        sightings.append(Sighting(name, profiles, clock_s(pair, began), pair.sidelink_m))
+    std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
+    report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
+    found = Refinement(correction, std_m, accepted, "as told", report, flags or {})
+    given = Seen(tuple(sightings), {}, (), began)
+    stage = refine.refined_stage(found, FOUND, given, opened)
+    save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
+
+
+def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_tiny):
+    campaign, found = spoilt
+    likeness = {}
+    for accepted in (False, True):
+        write_track(campaign, *found, accepted=accepted, flags={"prior_inconsistent": "told so"})
+        for pair in PAIRS:
+            image.image(campaign, "f01", pair)
+            right, now = (image_of(one, pair) for one in (finished_tiny, campaign))
+            likeness[pair, accepted] = abs(np.vdot(right, now)) / np.linalg.norm(right) / np.linalg.norm(now)
+    for pair in PAIRS:
+        assert likeness[pair, False] < 0.9
+        assert likeness[pair, True] > 0.9999
+        quality = quality_of(campaign, pair)
+        assert quality["autofocus"]["rms_cm"]["uav1"] == pytest.approx(3 * np.sqrt(3 / 2), rel=0.15)
+        assert quality["autofocus"]["gain_held_out_db"] == 3.0
+        assert quality["models"]["autofocus"] == "on: asked for; as told"
+        assert quality["flags"]["prior_inconsistent"] == "told so"
+        assert [line for line in quality["budget"] if line["cause"] == "positions"] == [
+            {
+                "cause": "positions",
+                "stated": "what the refined tracks leave",
+                "loss_db": -0.05,
+                "shift_m": 0.01,
+                "phase_rad": 0.1,
+            }
+        ]
+
+
+def test_hypotheses_begin_where_the_images_do(spoilt):
+    campaign, found = spoilt
+    write_track(campaign, *found)
+    track, waveform = open_refined(campaign, "f01"), campaign.settings.waveform
+    logged = {node: open_acquisition(campaign, "f01", node, waveform) for node in ("uav1", "uav2")}
+    nodes = {name: track.node(node) for name, node in logged.items()}
+    for name in PAIRS:
+        pair = open_pair(campaign, "f01", name)
+        told = evidence_of(logged, name, open_stage(campaign.stage("echo", "f01", name), "echo"), "hann")
+        (moved,) = seen_from(nodes, [told])
+        imaged = track.pair(pair).history
+        assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02
+        np.testing.assert_allclose(moved.history.aperture.tx_m, imaged.aperture.tx_m, atol=1e-3)
+        np.testing.assert_allclose(moved.history.reference_delay_s, imaged.reference_delay_s, atol=1e-3 / 3e8)
+
+
+def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    x, y = np.mean(np.reshape(finished_tiny.settings.scene.bounds_m, (2, 2)), axis=0).tolist()
+    known = [{"name": "corner", "position_m": [x, y, 620.0], "std_m": 0.01}]
+    for section, keys in (("processing", {"autofocus": False}), ("scene", {"reference_points": known})):
+        stale = {name.rsplit("/", 1)[1].split(".")[0] for name in stale_results(state(root, section, **keys))}
+        assert stale == {"refined_track", "image", "assessment", "export", "cube"}
+    (point,) = reference_points(Campaign.load(root))
+    assert np.linalg.norm(np.array(point.place_m) - open_scene(finished_tiny).middle_m) < 0.2
+    assert not problems(root)
+
+
+@pytest.mark.parametrize(
+    ("by_m", "told"),
+    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "whose ground lies at about 620.0 m")],
+)
+def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by_m, told):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    x, y = np.mean(np.reshape(finished_tiny.settings.scene.bounds_m, (2, 2)), axis=0).tolist()
+    place = [x + by_m[0], y + by_m[1], 620.0 + by_m[2]]
+    state(root, "scene", reference_points=[{"name": "corner", "position_m": place, "std_m": 0.01}])
+    (line,) = map(as_line, problems(root))
+    assert line.startswith("config/config.yaml: scene.reference_points[0]: corner")
+    assert told in line
+    with pytest.raises(CampaignError, match="reference_points are in crs, which is auto"):
+        state(root, "scene", crs="auto")
+
+
+def test_on_and_off_are_words_though_yaml_takes_them_for_truth(tiny):
+    for word in ("on", "off", "auto"):
+        path = tiny / "config" / "config.yaml"
+        path.write_text(path.read_text().partition("processing:")[0] + f"processing:\n  autofocus: {word}\n")
+        assert Campaign.load(tiny).settings.processing.autofocus == word
+
+
+def test_the_plan_says_whether_tracks_will_be_refined_and_then_what_became_of_it(tiny, capsys):
+    edit_config(tiny, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
+    print_plan(Campaign.load(tiny))
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert told.count("autofocus on auto: errors of position that are stated cost") == 2
+
+
+def asked_on(folder, *, pulses, half_m, std_m=0.0):
+    """A flight of so many pulses, with errors of its logs, whose tracks are to be refined; profiles made."""
+    plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=half_m, spacing_m=0.1))
+    root = simulate(folder / "campaign", plan, seed=7)
+    if std_m:
+        spoil_logs(root, std_m)
+    campaign = state(root, "processing", autofocus="on")
+    refresh(campaign)
+    return campaign
+
+
+@pytest.mark.parametrize(
+    ("pulses", "half_m", "flags"),
+    [(40, 3.0, {"refinement_too_few_patches"}), (100, 6.0, {"refinement_rejected", "prior_inconsistent"})],
+)
+def test_a_refinement_that_has_too_little_to_go_by_is_flagged_and_moves_nothing(tmp_path, pulses, half_m, flags):
+    campaign = asked_on(tmp_path, pulses=pulses, half_m=half_m)
+    refine.refine(campaign, "f01")
+    image.image(campaign, "f01", "uav1-uav1")
+    quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
+    assert stage.attrs["flags"].keys() == flags
+    assert quality["flags"].items() >= stage.attrs["flags"].items()
+    assert quality["autofocus"]["accepted"] is False
+    assert quality["models"]["autofocus"].startswith("on: asked for; ")
+    assert json.loads(stage.attrs["runspec"]) == {"autofocus": "on", "reference_points": [], "refined": False}
+    pair = open_pair(campaign, "f01", "uav1-uav1")
+    assert open_refined(campaign, "f01").pair(pair) is pair
+
+
+def spoil_logs(root, std_m):
+    """Add noise that lasts a second to both logs, and say how large it is."""
+    for path in sorted((root / "raw" / "f01").glob("*.track.*")):
+        log = noisy(std_m, seed=3)(read_log(path))
+        write_log(path, log if log.attitude_deg is not None else saying(std_m)(log))
+    edit_config(root, lambda document: [node.update(position_std_m=std_m) for node in document["nodes"].values()])
+
+
+@pytest.mark.slow
+def test_errors_of_a_third_of_a_wavelength_may_slip_by_one(tmp_path):
+    campaign = asked_on(tmp_path, pulses=600, half_m=6.0, std_m=0.08)
+    refine.refine(campaign, "f01")
+    assert "cycle_slip_suspected" in open_refined(campaign, "f01").stage.attrs["flags"]
+
+
+@pytest.mark.slow
+def test_a_campaign_whose_logs_err_by_2_cm_refines_itself(tmp_path):
+    right, spoilt = (tmp_path / name for name in ("right", "spoilt"))
+    simulate(right, preset("demo", pulses=600), seed=7)
+    copy_writable(right, spoilt)
+    spoil_logs(spoilt, 0.02)
+    found = {}
+    for name, root in (("off", copy_writable(spoilt, tmp_path / "off")), ("auto", spoilt)):
+        state(root, "processing", autofocus=name)
+        campaign = run_steps(root)
+        found[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
+        worst_m = max(one.error_m for one in verify(campaign))
+    for pair in PAIRS:
+        quality = quality_of(campaign, pair)
+        assert quality["autofocus"]["accepted"]
+        assert quality["focus"]["verdict"] == "focused"
+        assert found["off"][pair] < -1.0
+        assert found["auto"][pair] > -0.3
+        assert quality["focus"]["expected_db"] == pytest.approx(quality["focus"]["loss_db"], abs=0.2)
+    assert worst_m < 0.03
+    report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
+    assert report["autofocus"]["gain_held_out_db"] > 0.3
+    runspec = json.loads(open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").attrs["runspec"])
+    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image stands on the other pair, too
+    assert runspec["refined"] is True
+
+
+def test_a_track_may_be_refined_without_its_sidelink_being_known(spoilt):
+    """Phase histories have none: their paths were given back no length."""
+    campaign, (began, correction) = spoilt
+    write_track(campaign, began, correction)
+    track, pair = open_refined(campaign, "f01"), open_pair(campaign, "f01", "uav1-uav2")
+    alone = track.pair(replace(pair, sidelink_m=None))
+    np.testing.assert_array_equal(alone.history.reference_delay_s, pair.history.reference_delay_s)
+    assert isinstance(track, RefinedTrack)
+    assert not np.array_equal(track.pair(pair).history.reference_delay_s, pair.history.reference_delay_s)
