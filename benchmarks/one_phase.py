@@ -1,0 +1,142 @@
+"""One phase per pulse on near and far scenes: loss, shift and cost of each method and of tracks, beside the rule.
+
+`python -m benchmarks.one_phase [--cases forty/straight,far/mono,bi/2/10/0-2]`: as of `benchmarks.refinement`. Run with
+OPENBLAS_NUM_THREADS=1: seconds are then those of one core.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from statistics import median
+from time import process_time
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.quality.path_errors import PointPaths
+from apertura.refinement.candidates import bright_places
+from apertura.refinement.inputs import Sighting
+from apertura.refinement.one_phase import METHODS
+from apertura.refinement.outcome import Refinement
+from apertura.refinement.patches import Patch, patch_at, spread_out
+from apertura.refinement.path_offsets import OnePhase, refine_one_phase
+from apertura.refinement.refine import LEAST_RATIO, refine
+from apertura.refinement.space_variance import SpaceVariance, space_variance
+from apertura.scene.terrain import FlatGround
+from benchmarks.refinement.__main__ import Key, keys
+from benchmarks.refinement.cases import PROBES_M, Case, case
+from benchmarks.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
+from benchmarks.refinement.scenes import AREA_M, GRID
+
+MIDDLE_M = np.array([0.0, 15.0, 0.0])
+CORNERS_M = np.array([(east, north, 0.0) for east in AREA_M[::2] for north in AREA_M[1::2]])
+HEADINGS = (
+    *("scene", "flight", "pair", "σ, cm", "SNR, dB", "rule", "method"),
+    *("before", "after", "worst", "off", "held out", "accepted", "images"),
+)
+CASES = ("forty/straight,far/mono,bi/2/10/0-4",)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of probes: (pair, probe) dB lost; median distance of their peaks from where true tracks show them, cm."""
+
+    before_db: NDArray[np.float64]
+    after_db: NDArray[np.float64]
+    off_before_cm: float
+    off_after_cm: float
+    gain_db: float
+    accepted: bool
+    images: float
+
+
+def main() -> None:
+    """Run the cases and print a row for each scene, flight, pair, σ, SNR and method."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", nargs="+", default=CASES)
+    asked = [key for cases in parser.parse_args().cases for key in keys(cases)]
+    table = Table()
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right")
+    rows: dict[tuple[str, ...], list[Outcome]] = {}
+    for key in asked:
+        one, rule = _case(key)
+        for method, outcome in _outcomes(one):
+            rows.setdefault((*key[:5], f"{rule.method} {rule.loss_db:.2f}", method), []).append(outcome)
+    for told, drawn in rows.items():
+        table.add_row(*told, *_cells(drawn))
+    Console(width=170).print(table)
+
+
+def _case(key: Key) -> tuple[Case, SpaceVariance]:
+    scene, flight, pair, size_cm, snr_db, seed = key
+    one = case(scene, flight, pair, float(size_cm) / 100, float(snr_db), int(seed))
+    sighting = one.sightings[0]
+    wavelength_m = SPEED_OF_LIGHT_M_S / sighting.profiles.centre_frequency_hz
+    paths = PointPaths.of(
+        sighting.profiles.aperture, sighting.time_s, point_m=MIDDLE_M, axes=np.eye(3), wavelength_m=wavelength_m
+    )
+    return one, space_variance(paths, CORNERS_M, [one.errors[node] for node in dict.fromkeys(sighting.nodes)])
+
+
+def _outcomes(one: Case) -> Iterator[tuple[str, Outcome]]:
+    image_s = image_seconds(one.sightings[0])
+    true, before = (peaks(one.probes, tracks, PROBES_M, one.reach_m) for tracks in (one.truth, UNCORRECTED))
+    for method in (*METHODS, "tracks"):
+        begun = process_time()
+        found = _found(one, method)
+        seconds = process_time() - begun
+        yield method, _outcome(found, true, before, _after(one, found), seconds / image_s)
+
+
+def _found(one: Case, method: str) -> OnePhase | Refinement:
+    """Return what a method makes of a case, from its search for points on."""
+    if method == "tracks":
+        return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
+    return refine_one_phase(one.sightings, _patches(one.sightings), one.errors, method=method)
+
+
+def _patches(sightings: Sequence[Sighting]) -> list[Patch]:
+    places, ratio = bright_places(sightings, GRID, FlatGround(0.0), lasting_s=1.0)
+    points = places[ratio > LEAST_RATIO]
+    chosen = spread_out(points, np.eye(3), apart_m=1.0) if len(points) else points
+    return [patch_at(place, sightings, np.eye(3), correlation_s=1.0) for place in chosen]
+
+
+def _after(one: Case, found: OnePhase | Refinement) -> Peaks:
+    """Return the probes' peaks with what was found, believed or not."""
+    if isinstance(found, Refinement):
+        return peaks(one.probes, found.correction, PROBES_M, one.reach_m)
+    moved = [found.offsets[each.pair].moved(each) if found.offsets else each for each in one.probes]
+    return peaks(moved, UNCORRECTED, PROBES_M, one.reach_m)
+
+
+def _outcome(found: OnePhase | Refinement, true: Peaks, before: Peaks, after: Peaks, images: float) -> Outcome:
+    before_db, after_db = (20 * np.log10(each.height / true.height) for each in (before, after))
+    gain_db = float(found.report.get("gain_held_out_db", np.nan))
+    return Outcome(before_db, after_db, _off_cm(true, before), _off_cm(true, after), gain_db, found.accepted, images)
+
+
+def _off_cm(true: Peaks, now: Peaks) -> float:
+    return 100 * float(np.median(np.linalg.norm(now.place_m - true.place_m, axis=-1)))
+
+
+def _cells(drawn: Sequence[Outcome]) -> list[str]:
+    accepted = [one for one in drawn if one.accepted]
+    harmful = sum(one.after_db.mean() < one.before_db.mean() for one in accepted)
+    return [
+        f"{np.mean([one.before_db for one in drawn]):.2f}",
+        f"{np.mean([one.after_db for one in drawn]):.2f}",
+        f"{np.min([one.after_db for one in drawn]):.2f}",
+        f"{median(one.off_before_cm for one in drawn):.1f} → {median(one.off_after_cm for one in drawn):.1f} cm",
+        f"{np.mean([one.gain_db for one in drawn]):.2f}",
+        f"{len(accepted)} of {len(drawn)}, {harmful} harmful",
+        f"{median(one.images for one in drawn):.1f}",
+    ]
+
+
+if __name__ == "__main__":
+    main()
