@@ -17,13 +17,11 @@ from rich.table import Table
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.quality.path_errors import PointPaths
-from apertura.refinement.candidates import bright_places
-from apertura.refinement.inputs import Sighting
+from apertura.refinement.candidates import Candidates
 from apertura.refinement.one_phase import METHODS
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.patches import Patch, patch_at, spread_out
-from apertura.refinement.path_offsets import OnePhase, refine_one_phase
-from apertura.refinement.refine import LEAST_RATIO, refine
+from apertura.refinement.path_offsets import refine_one_phase
+from apertura.refinement.refine import refine
 from apertura.refinement.space_variance import SpaceVariance, space_variance
 from apertura.scene.terrain import FlatGround
 from benchmarks.refinement.__main__ import Key, keys
@@ -89,32 +87,23 @@ def _outcomes(one: Case) -> Iterator[tuple[str, Outcome]]:
         begun = process_time()
         found = _found(one, method)
         seconds = process_time() - begun
-        yield method, _outcome(found, true, before, _after(one, found), seconds / image_s)
+        yield (
+            method,
+            _outcome(
+                found, true, before, peaks(one.probes, found.correction, PROBES_M, one.reach_m), seconds / image_s
+            ),
+        )
 
 
-def _found(one: Case, method: str) -> OnePhase | Refinement:
+def _found(one: Case, method: str) -> Refinement:
     """Return what a method makes of a case, from its search for points on."""
     if method == "tracks":
         return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
-    return refine_one_phase(one.sightings, _patches(one.sightings), one.errors, method=method)
+    found = Candidates.of(one.sightings, GRID, FlatGround(0.0), one.errors)
+    return refine_one_phase(one.sightings, found, one.errors, method=method)
 
 
-def _patches(sightings: Sequence[Sighting]) -> list[Patch]:
-    places, ratio = bright_places(sightings, GRID, FlatGround(0.0), lasting_s=1.0)
-    points = places[ratio > LEAST_RATIO]
-    chosen = spread_out(points, np.eye(3), apart_m=1.0) if len(points) else points
-    return [patch_at(place, sightings, np.eye(3), correlation_s=1.0) for place in chosen]
-
-
-def _after(one: Case, found: OnePhase | Refinement) -> Peaks:
-    """Return the probes' peaks with what was found, believed or not."""
-    if isinstance(found, Refinement):
-        return peaks(one.probes, found.correction, PROBES_M, one.reach_m)
-    moved = [found.offsets[each.pair].moved(each) if found.offsets else each for each in one.probes]
-    return peaks(moved, UNCORRECTED, PROBES_M, one.reach_m)
-
-
-def _outcome(found: OnePhase | Refinement, true: Peaks, before: Peaks, after: Peaks, images: float) -> Outcome:
+def _outcome(found: Refinement, true: Peaks, before: Peaks, after: Peaks, images: float) -> Outcome:
     before_db, after_db = (20 * np.log10(each.height / true.height) for each in (before, after))
     gain_db = float(found.report.get("gain_held_out_db", np.nan))
     return Outcome(before_db, after_db, _off_cm(true, before), _off_cm(true, after), gain_db, found.accepted, images)

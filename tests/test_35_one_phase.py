@@ -11,6 +11,7 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.range_profiles import range_compress
 from apertura.quality.path_errors import PointPaths
+from apertura.refinement.candidates import Candidates
 from apertura.refinement.inputs import Sighting, TrackErrors
 from apertura.refinement.one_phase import METHODS, entropy
 from apertura.refinement.patches import Patch
@@ -121,7 +122,8 @@ def about(place_m, east_m, north_m, count=13):
 
 
 def patches_at(points_m, east_m, north_m):
-    return [Patch(point, about(point, east_m, north_m)) for point in points_m]
+    patches = [Patch(point, about(point, east_m, north_m)) for point in points_m]
+    return Candidates(patches, len(patches), np.eye(3))
 
 
 def peak(profiles, point_m, east_m, north_m):
@@ -162,7 +164,7 @@ def test_one_phase_mends_a_far_scene_and_leaves_it_in_place(method, pair):
     sighting, true = seen(FAR, np.vstack([FAR_POINTS_M, PROBES_M]), pair=pair, snr_db=10)
     found = refine_one_phase([sighting], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method=method)
     before_db, _ = lost(sighting.profiles, true, PROBES_M, 1.0)
-    after_db, off_m = lost(found.offsets[pair].moved(sighting).profiles, true, PROBES_M, 1.0)
+    after_db, off_m = lost(sighting.moved(found.correction), true, PROBES_M, 1.0)
     assert found.accepted, found.why
     assert before_db.mean() < -2
     assert after_db.min() > -0.2
@@ -172,11 +174,11 @@ def test_one_phase_mends_a_far_scene_and_leaves_it_in_place(method, pair):
 def test_offsets_hold_neither_a_constant_nor_a_shift_along_the_track():
     sighting, _ = seen(FAR, FAR_POINTS_M)
     found = refine_one_phase([sighting], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method="minimum_entropy")
-    offsets = found.offsets["a-a"]
-    along = np.interp(offsets.time_s, FAR[0], sighting.profiles.aperture.path_gradient(np.zeros(3))[:, 0])
-    assert np.std(offsets.further_m) > 0.01
-    assert abs(offsets.further_m.mean()) < 1e-9
-    assert abs(np.corrcoef(along, offsets.further_m)[0, 1]) < 1e-3
+    further_m = found.correction.further_m["a-a"]
+    along = np.interp(found.correction.time_s, FAR[0], sighting.profiles.aperture.path_gradient(np.zeros(3))[:, 0])
+    assert np.std(further_m) > 0.01
+    assert abs(further_m.mean()) < 1e-9
+    assert abs(np.corrcoef(along, further_m)[0, 1]) < 1e-3
 
 
 def test_one_phase_does_not_mend_a_near_scene():
@@ -185,7 +187,7 @@ def test_one_phase_does_not_mend_a_near_scene():
     sighting, true = seen(NEAR, np.vstack([points, corners]))
     found = refine_one_phase([sighting], patches_at(points, 0.6, 0.8), FAR_ERRORS, method="phase_gradient")
     before_db, _ = lost(sighting.profiles, true, corners, 0.1)
-    after_db, _ = lost(found.offsets["a-a"].moved(sighting).profiles, true, corners, 0.1)
+    after_db, _ = lost(sighting.moved(found.correction), true, corners, 0.1)
     assert before_db.mean() < after_db.mean() < -0.5
 
 
@@ -214,4 +216,4 @@ def test_three_patches_are_too_few():
     sighting, _ = seen(FAR, FAR_POINTS_M[:3])
     found = refine_one_phase([sighting], patches_at(FAR_POINTS_M[:3], 5.0, 0.8), FAR_ERRORS, method="phase_gradient")
     assert list(found.flags) == ["refinement_too_few_patches"]
-    assert not found.offsets
+    assert not found.correction.further_m

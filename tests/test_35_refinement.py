@@ -11,13 +11,13 @@ from apertura.focus.engines import reference
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.candidates import bright_places
+from apertura.refinement.candidates import LEAST_RATIO, bright_places
 from apertura.refinement.evidence import range_shifts
 from apertura.refinement.gauge import effects
 from apertura.refinement.inputs import ReferencePoint, TrackErrors
 from apertura.refinement.objective import Sharpness
 from apertura.refinement.prior import NodePrior, Prior
-from apertura.refinement.refine import LEAST_RATIO, Search, refine
+from apertura.refinement.refine import Search, refine
 from apertura.scene.terrain import FlatGround
 from benchmarks.refinement import case, judge
 from benchmarks.refinement.scenes import GRID
@@ -51,7 +51,7 @@ def test_a_corrected_track_focuses_as_the_true_one(pair, ahead_m):
     history = echo(true, logged, sidelink=pair == "a-b")
     assert abs(reference.form(history, TARGET_M)[0]) / 300 < 0.8
     between = logged.tx_m - logged.rx_m
-    further = correction.sidelink_m(between, pair, TIME_S) if pair == "a-b" else np.zeros(300)
+    further = correction.longer_m(pair, TIME_S, between if pair == "a-b" else None)
     mended = history.moved(true, further)
     assert abs(reference.form(mended, TARGET_M)[0] / 300 - 1) < 1e-5
 

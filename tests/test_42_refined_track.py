@@ -36,7 +36,7 @@ from apertura.steps.verify import verify
 from apertura.store import open_stage, save_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
-FOUND = Decision("autofocus", "on", "asked for")
+FOUND = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))
 
 
 def state(root, section, **keys):
@@ -78,7 +78,7 @@ def test_tracks_are_refined_where_that_is_asked_or_errors_that_are_stated_cost_m
 
 def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny):
     stage = open_campaign(finished_tiny.root).stage("refined_track", "f01")
-    assert dict(stage.sizes) == {"node": 2, "knot": 0, "axis": 3}
+    assert dict(stage.sizes) == {"node": 2, "knot": 0, "axis": 3, "pair": 0}
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
     quality = quality_of(finished_tiny, "uav1-uav2")
     assert quality["autofocus"] == {
@@ -238,7 +238,12 @@ def test_a_refinement_that_has_too_little_to_go_by_is_flagged_and_moves_nothing(
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False
     assert quality["models"]["autofocus"].startswith("on: asked for; ")
-    assert json.loads(stage.attrs["runspec"]) == {"autofocus": "on", "reference_points": [], "refined": False}
+    assert json.loads(stage.attrs["runspec"]) == {
+        "autofocus": "on",
+        "autofocus_method": "auto",
+        "reference_points": [],
+        "refined": False,
+    }
     pair = open_pair(campaign, "f01", "uav1-uav1")
     assert open_refined(campaign, "f01").pair(pair) is pair
 

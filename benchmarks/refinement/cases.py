@@ -109,8 +109,7 @@ def _sighting(
     logged = Aperture(flight.logged_m[tx], flight.logged_m[rx])
     between_m = None if tx == rx else logged.tx_m - logged.rx_m
     flown = truth.aperture(logged, pair, flight.time_s)
-    longer_m = None if between_m is None else -truth.sidelink_m(between_m, pair, flight.time_s)
-    echo = transfer(scatterers, flown, FREQUENCY_HZ, further_m=longer_m)
+    echo = transfer(scatterers, flown, FREQUENCY_HZ, further_m=-truth.longer_m(pair, flight.time_s, between_m))
     if snr_db is not None:
         std = np.sqrt(_signal_power(echo, scatterers, flown) * SUBCARRIERS / 10 ** (snr_db / 10) / 2)
         parts = generator.standard_normal((*echo.shape, 2), np.float32)

@@ -155,14 +155,14 @@ class Campaign:
             "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
             "profile": {name: processing[name] for name in ("window", "integration")} | antennas,
             "refined_track": {
-                "autofocus": processing["autofocus"],
+                **{key: processing[key] for key in ("autofocus", "autofocus_method")},
                 "reference_points": settings["scene"]["reference_points"],
             },
             "assess": {"fusion": processing["fusion"]},
             "image": {
                 name: value
                 for name, value in processing.items()
-                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion", "autofocus"}
+                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion", "autofocus", "autofocus_method"}
             }
             | antennas,
             "layers": {"integration": processing["integration"], **antennas},

@@ -127,6 +127,9 @@ STAGES: Mapping[str, Stage] = {
     "refined_track": Stage(
         {
             "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; between knots linear"),
+            "further": Variable(
+                ("pair", "knot"), "float64", "m", "total path by which all echoes of the pair lie further, to be added"
+            ),
             "correction": Variable(_KNOTS, "float64", "m", "to be added to every point of the node, in `frame`"),
             "std": Variable(_KNOTS, "float64", "m", "standard deviation of what is left, along each axis of `frame`"),
             "position": Variable(_KNOTS, "float64", "m", "radar phase centre as the log has it, in `frame`"),
@@ -135,7 +138,8 @@ STAGES: Mapping[str, Stage] = {
             "frame": _FRAME["frame"],
             "flags": "edges crossed by the refinement: flag name → what was measured, in one line",
             "nodes": "names along `node`",
-            "decision": "whether tracks were to be refined, and why",
+            "pairs": "names along `pair`: those that have an offset of their own, or none",
+            "decisions": "autofocus, and autofocus_method where it is on: value and reason",
             "accepted": "whether images are formed with the correction; why: a line; report: what was measured",
             "left": "what is left of errors of position does to an image: loss_db, shift_m, phase_rad",
         },

@@ -1,7 +1,7 @@
-"""What is added to the logged positions of a flight's nodes, and what that does to the paths of its pairs."""
+"""What is added to the logged positions of a flight's nodes, and what paths of its pairs are longer by."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ class TrackCorrection:
         constant.
     moved_m
         Node → (knot, 3) float64, metres to be added to each of its points, in the frame of the phase centres.
+    further_m
+        Pair → (knot,) float64, metres of total path by which all its echoes lie further, wherever its nodes are; a pair
+        that is not named has none.
 
     Examples
     --------
@@ -30,6 +33,7 @@ class TrackCorrection:
 
     time_s: NDArray[np.float64]
     moved_m: Mapping[str, NDArray[np.float64]]
+    further_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, node: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far a node is moved at some times, (pulse, 3) float64, metres."""
@@ -43,27 +47,41 @@ class TrackCorrection:
         tx, rx = pair.split("-")
         return Aperture(logged.tx_m + self.at(tx, time_s), logged.rx_m + self.at(rx, time_s))
 
-    def sidelink_m(self, between_m: NDArray[np.float64], pair: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much the sidelink of a pair is longer than from the logs: so much longer are its echoes' paths.
+    def longer_m(
+        self, pair: str, time_s: NDArray[np.float64], between_m: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return by how much all echoes of a pair lie further than from the logs: ∆ and what is its own.
 
         Parameters
         ----------
-        between_m
-            (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have it.
         pair
             transmitter-receiver.
         time_s
             (pulse,) float64.
+        between_m
+            (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have it;
+            None where echoes were not given back a sidelink's length.
 
         Returns
         -------
         ndarray
-            (pulse,) float64, metres.
+            (pulse,) float64, metres of total path.
 
         Notes
         -----
-        Source: docs/theory/autofocus.md, eq. 2.
+        Source: docs/theory/autofocus.md, eq. 2 and 34.
+
+        Examples
+        --------
+        >>> apart = np.array([[3.0, 0.0, 0.0]])
+        >>> wider = TrackCorrection(np.zeros(1), {"a": np.array([[0.5, 0, 0]])}, {"a-b": np.array([0.1])})
+        >>> wider.longer_m("a-b", np.zeros(1), apart), wider.longer_m("a-a", np.zeros(1), None)
+        (array([0.6]), array([0.]))
         """
+        own = self.further_m.get(pair)
+        further_m = np.zeros(len(time_s)) if own is None else np.interp(time_s, self.time_s, own)
+        if between_m is None:
+            return further_m
         tx, rx = pair.split("-")
         corrected = between_m + self.at(tx, time_s) - self.at(rx, time_s)
-        return np.asarray(np.linalg.norm(corrected, axis=1) - np.linalg.norm(between_m, axis=1))
+        return np.asarray(further_m + np.linalg.norm(corrected, axis=1) - np.linalg.norm(between_m, axis=1))

@@ -29,7 +29,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     -----
     Source: docs/theory/focus.md, "Budget". The effects are those on a point in the middle of the scene.
     """
-    paths = _paths(pair, scene)
+    paths = paths_to_middle(pair, scene)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     lines = [
         *_positions(campaign, pair, paths),
@@ -68,7 +68,18 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
     """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
-    return expected(_positions(campaign, pair, _paths(pair, scene))).loss_db
+    return expected(_positions(campaign, pair, paths_to_middle(pair, scene))).loss_db
+
+
+def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
+    """Return the paths of a pair to the middle of the scene."""
+    return PointPaths.of(
+        pair.aperture,
+        pair.time_s,
+        point_m=scene.middle_m,
+        axes=scene.axes,
+        wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
+    )
 
 
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
@@ -94,16 +105,6 @@ def arithmetic_line(error_db: float) -> BudgetLine:
     """Return what the numerical error measured costs."""
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
-    )
-
-
-def _paths(pair: OpenPair, scene: OpenScene) -> PointPaths:
-    return PointPaths.of(
-        pair.aperture,
-        pair.time_s,
-        point_m=scene.middle_m,
-        axes=scene.axes,
-        wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
     )
 
 

@@ -1,6 +1,6 @@
 """Tracks as refined: where images take the places of their antennas from, and the only place where that is decided."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,12 +13,10 @@ from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.track_correction import TrackCorrection
 from apertura.load.acquisition import Acquisition
-from apertura.load.budget import positions_loss_db
+from apertura.load.autofocus import autofocus_of
 from apertura.load.pair import OpenPair
 from apertura.load.scene import OpenScene
-from apertura.planning.autofocus import decide_autofocus
 from apertura.planning.plan import Decision
-from apertura.quality.budget import NodePositions
 from apertura.quality.path_errors import Effect
 from apertura.store import manifest_of, open_stage
 
@@ -34,7 +32,7 @@ class RefinedTrack:
     stage
         `refined_track`, from which images inherit.
     correction
-        Of the flight's nodes, seconds from `began`; None where images are formed from the logs as they are.
+        Of the flight's nodes and pairs, seconds from `began`; None where images are formed from the logs as they are.
     began
         Zero of the correction's clock, UTC.
     """
@@ -50,25 +48,27 @@ class RefinedTrack:
         if not stage.attrs["accepted"] or not len(time):
             return cls(stage, None, np.datetime64(0, "ns"))
         moved_m = dict(zip(nodes, stage.correction.values, strict=True))
-        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m), time[0])
+        further_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
+        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, further_m), time[0])
 
     @property
-    def decision(self) -> Decision:
-        """Whether tracks were to be refined, why, and what became of it."""
-        made = self.stage.attrs["decision"]
-        return Decision("autofocus", made["value"], f"{made['reason']}; {self.stage.attrs['why']}")
+    def decisions(self) -> tuple[Decision, ...]:
+        """Whether tracks were to be refined, why, and what became of it; if so, how."""
+        became = {"autofocus": f"; {self.stage.attrs['why']}"}
+        made = self.stage.attrs["decisions"].items()
+        return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
 
     def report(self, pair: str) -> dict[str, Any]:
         """Return what image.json says of a pair's tracks."""
         told = self.stage.attrs
-        moved = {} if self.correction is None else self.correction.moved_m
-        rms_cm = {node: _rms_cm(moved[node]) for node in dict.fromkeys(pair.split("-")) if node in moved}
+        made = {name: f"{one['value']}: {one['reason']}" for name, one in told["decisions"].items()}
         return {
-            "decision": f"{told['decision']['value']}: {told['decision']['reason']}",
+            "decision": made["autofocus"],
+            **({"method": made["autofocus_method"]} if "autofocus_method" in made else {}),
             "accepted": told["accepted"],
             "why": told["why"],
             **{name: told["report"][name] for name in _QUOTED if name in told["report"]},
-            **({"rms_cm": rms_cm} if rms_cm else {}),
+            **({} if self.correction is None else _sizes_cm(self.correction, pair)),
         }
 
     def pair(self, logged: OpenPair) -> OpenPair:
@@ -95,9 +95,7 @@ class RefinedTrack:
         """Return the phase centres of a pair, and by how much paths of its echoes are longer than with the logs."""
         time_s = clock_s(logged, self.began)
         aperture = correction.aperture(logged.aperture, logged.name, time_s)
-        if logged.sidelink_m is None:
-            return aperture, np.zeros(len(time_s))
-        return aperture, correction.sidelink_m(logged.sidelink_m, logged.name, time_s)
+        return aperture, correction.longer_m(logged.name, time_s, logged.sidelink_m)
 
 
 def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
@@ -105,36 +103,30 @@ def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
     return RefinedTrack.of(open_stage(campaign.stage("refined_track", flight), "refined_track"))
 
 
-def expected_track(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[list[OpenPair], Decision]:
-    """Return the pairs of a flight as they are or will be imaged, and whether their tracks are refined, and why.
+def expected_track(
+    campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene
+) -> tuple[list[OpenPair], tuple[Decision, ...]]:
+    """Return the pairs of a flight as they are or will be imaged; whether and how their tracks are refined, and why.
 
     Before step `refine` ran, the pairs are those of the logs, whatever was decided.
     """
     if manifest_of(campaign.stage("refined_track", pairs[0].flight)).is_file():
         track = open_refined(campaign, pairs[0].flight)
-        return [track.pair(pair) for pair in pairs], track.decision
+        return [track.pair(pair) for pair in pairs], track.decisions
     return list(pairs), autofocus_of(campaign, pairs, scene)
-
-
-def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> Decision:
-    """Return whether the tracks of a flight, of which these are all pairs, are to be refined, and why."""
-    silent = [node for node, known in positions_of(pairs).items() if known.std_m is None]
-    loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
-    return decide_autofocus(campaign.settings.processing.autofocus, loss_db, silent)
-
-
-def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
-    """Return node → what is known of the errors of its log; it is the same in each pair."""
-    return {
-        node: known
-        for pair in pairs
-        for node, known in zip(dict.fromkeys(pair.name.split("-")), pair.positions, strict=True)
-    }
 
 
 def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
     """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
     return pair.time_s + float(_seconds(pair.began - began))
+
+
+def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
+    """Return how far the nodes of a pair were moved, or by how much its echoes lie further, rms."""
+    if pair in correction.further_m:
+        return {"further_rms_cm": _rms_cm(correction.further_m[pair][:, None])}
+    nodes = dict.fromkeys(pair.split("-"))
+    return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
 
 
 def _rms_cm(moved_m: NDArray[np.float64]) -> float:

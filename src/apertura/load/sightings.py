@@ -8,14 +8,12 @@ import numpy as np
 from apertura.campaign import Campaign
 from apertura.focus.inputs import Profiles
 from apertura.geometry.geodesy import frame_from_map
+from apertura.load.autofocus import errors_of
 from apertura.load.pair import OpenPair
 from apertura.load.plan import weighing
-from apertura.load.refined import clock_s, positions_of
+from apertura.load.refined import clock_s
 from apertura.load.scene import OpenScene
 from apertura.refinement.inputs import ReferencePoint, Sighting, TrackErrors
-
-ASSUMED_STD_M = 0.02
-"""Error of positions in each axis where a refinement is asked for and nobody said: that of a fair RTK solution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +55,7 @@ def seen(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScen
         Sighting(pair.name, profiles, clock_s(pair, began), pair.sidelink_m, weighing(campaign, pair, scene))
         for pair, profiles in pairs.items()
     ]
-    errors = {
-        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s)
-        for node, known in positions_of(list(pairs)).items()
-    }
-    return Seen(tuple(sightings), errors, reference_points(campaign), began)
+    return Seen(tuple(sightings), errors_of(list(pairs)), reference_points(campaign), began)
 
 
 def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:

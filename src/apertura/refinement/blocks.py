@@ -43,6 +43,11 @@ class PatchEcho:
     blocks: slice
     profiles: Profiles
 
+    @property
+    def values(self) -> int:
+        """How many values tell what its blocks add to its pixels."""
+        return len(self.patch.pixels_m) * len(self.profiles)
+
 
 @dataclass(frozen=True, eq=False)
 class Blocks:

@@ -1,6 +1,7 @@
 """Where points may stand: bright places of images of short parts of the aperture, which errors of tracks blur least."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,12 +9,20 @@ from numpy.typing import NDArray
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines import load_engine
 from apertura.geometry.geodesy import ned_axes
-from apertura.refinement.inputs import Sighting
-from apertura.refinement.patches import bandwidth_hz
+from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.inputs import Sighting, TrackErrors
+from apertura.refinement.outcome import Refinement
+from apertura.refinement.patches import LEAST_PATCHES, Patch, bandwidth_hz, patch_at, spread_out
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
 Floats = NDArray[np.float64]
+
+LEAST_RATIO = 5.0
+"""Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
+
+HELPFUL_RATIO = 3.5
+"""Where there are points, places that stand out less help too."""
 
 MOST_LOOKS = 24
 """Parts of the aperture: each as long as an error lasts, or longer."""
@@ -22,6 +31,51 @@ _SIDE_PX = 512
 _ABOUT_CELLS = 12  # of range: how far a place is compared with what lies about it
 _SIDELOBES = 1e-3  # of the brightest: what stands out of nothing may be its sidelobe
 _MOST_PLACES = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What a scene has to refine by.
+
+    Attributes
+    ----------
+    patches
+        About places that stand out and apart, clearest first; none where too few are points.
+    points
+        How many places are points.
+    axes
+        (3, 3) float64, rows are east, north, up at the scene in the frame.
+    """
+
+    patches: Sequence[Patch]
+    points: int
+    axes: Floats
+
+    @classmethod
+    def of(
+        cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
+    ) -> "Candidates":
+        """Return those of a scene as its pairs saw it, with what is known of each node's log."""
+        lasting_s = min(one.correlation_s for one in errors.values())
+        places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
+        axes, points = east_north_up(grid, places_m), int((ratio > LEAST_RATIO).sum())
+        if points < LEAST_PATCHES:
+            return cls([], points, axes)
+        typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
+        apart_m = float(np.ptp((typical.pixels_m - typical.place_m) @ axes[:2].T, axis=0).max()) / 2
+        helpful = ratio > HELPFUL_RATIO
+        chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
+        return cls([patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen], points, axes)
+
+    def refused(self, errors: Mapping[str, TrackErrors]) -> Refinement:
+        """Return that too few points stand out: no node is moved."""
+        line = (
+            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
+            f"{LEAST_PATCHES} are needed"
+        )
+        still = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
+        std_m = {node: one.along(self.axes)[None] for node, one in errors.items()}
+        return Refinement(still, std_m, False, line, {"patches": self.points}, {"refinement_too_few_patches": line})
 
 
 def bright_places(

@@ -44,12 +44,7 @@ class Sighting:
     def moved(self, correction: TrackCorrection) -> Profiles:
         """Return the profiles as seen from corrected tracks (docs/theory/autofocus.md, eq. 3)."""
         aperture = correction.aperture(self.profiles.aperture, self.pair, self.time_s)
-        further_m = (
-            np.zeros(len(self.time_s))
-            if self.sidelink_m is None
-            else correction.sidelink_m(self.sidelink_m, self.pair, self.time_s)
-        )
-        return self.profiles.moved(aperture, further_m)
+        return self.profiles.moved(aperture, correction.longer_m(self.pair, self.time_s, self.sidelink_m))
 
 
 @dataclass(frozen=True)
@@ -69,6 +64,16 @@ class TrackErrors:
     std_m: tuple[float, float, float]
     correlation_s: float = 1.0
     drift_std_m: float = 0.0
+
+    def along(self, axes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (3,) float64, metres, `std_m` along the frame's axes; rows of `axes` are east, north, up in the frame.
+
+        Examples
+        --------
+        >>> TrackErrors((0.01, 0.01, 0.02)).along(np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]))
+        array([0.01, 0.01, 0.02])
+        """
+        return np.asarray(np.sqrt(np.square(self.std_m) @ np.square(axes)))
 
 
 @dataclass(frozen=True)

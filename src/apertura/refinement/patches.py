@@ -15,6 +15,13 @@ Floats = NDArray[np.float64]
 MOST_PATCHES, CLEAR = 32, 20.0
 """Patches are taken until they tell as much as a dozen whose points stand out so many times."""
 
+LEAST_PATCHES = 4
+"""With fewer, none would be left to judge by."""
+
+MOST_BYTES = 2**30
+"""Of what blocks add to patches: with more, fewer patches are looked at."""
+
+_BYTES = 8  # of a complex64
 _ENOUGH = 12 * CLEAR
 _SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are worse held
 _RANGE_CELLS = 1.5  # half of a patch along the line of sight
@@ -112,6 +119,17 @@ def patch_at(place_m: Floats, sightings: Sequence[Sighting], axes: Floats, *, co
     along, aside = np.meshgrid(*sides, indexing="ij")
     level = along[..., None] * across[0] + aside[..., None] * across[1]
     return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2])
+
+
+def affordable(values: Sequence[int]) -> int:
+    """Return how many patches may be kept in memory, of which each has so many complex values: long flights have many.
+
+    Examples
+    --------
+    >>> affordable([2**24] * 32)
+    8
+    """
+    return max(int((_BYTES * np.cumsum(values) <= MOST_BYTES).sum()), min(LEAST_PATCHES, len(values)))
 
 
 def bandwidth_hz(profiles: Profiles) -> float:

@@ -2,20 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.blocks import Blocks, PatchEcho
-from apertura.refinement.candidates import bright_places, east_north_up
+from apertura.refinement.blocks import Blocks
+from apertura.refinement.candidates import Candidates
 from apertura.refinement.evidence import Evidence, gains_db, range_shifts
 from apertura.refinement.gauge import Gauge, find_gauge
 from apertura.refinement.inputs import ReferencePoint, Sighting, TrackErrors
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.patches import Patch, patch_at, spread_out
+from apertura.refinement.patches import LEAST_PATCHES, affordable
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
 from apertura.refinement.solve import Problem, State
@@ -27,17 +25,6 @@ from apertura.scene.terrain import Terrain
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LEAST_PATCHES = 4
-LEAST_RATIO = 5.0
-"""Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
-
-HELPFUL_RATIO = 3.5
-"""Where there are points, places that stand out less help too."""
-
-MOST_BYTES = 2**30
-"""Of what blocks add to patches: with more, fewer patches are looked at."""
-
-_BYTES = 8  # of a complex64
 _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
 _HELD_OUT = 4  # every so many-th patch is not fitted
@@ -72,7 +59,7 @@ def refine(
     """
     search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
-        return search.refused(errors)
+        return search.found.refused(errors)
     held_out = np.arange(len(search.problem.patches)) % _HELD_OUT == 2
     state, evidence = search.judged(held_out)
     if evidence.accepted:
@@ -89,9 +76,8 @@ class Search:
     """The problem, and what its patches show from the logs."""
 
     problem: Problem
-    axes: Floats
+    found: Candidates
     begun: State
-    points: int
     wavelength_m: float
 
     @classmethod
@@ -99,21 +85,24 @@ class Search:
         cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "Search":
         """Return the problem of a flight, as its logs have it."""
-        lasting_s = min(one.correlation_s for one in errors.values())
-        places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
-        axes = east_north_up(grid, places_m)
+        found = Candidates.of(sightings, grid, terrain, errors)
         knots_s = _knots(sightings, errors)
-        prior = Prior({node: NodePrior.of(one, knots_s, axes) for node, one in sorted(errors.items())})
+        prior = Prior({node: NodePrior.of(one, knots_s, found.axes) for node, one in sorted(errors.items())})
         pairs = [Blocks.of(sighting, knots_s) for sighting in sightings]
-        patches = _patches(sightings, places_m, ratio, lasting_s, axes) if _points(ratio) >= LEAST_PATCHES else []
-        echoes = [blocks.echoes(patches) for blocks in pairs]
+        echoes = [blocks.echoes(found.patches) for blocks in pairs]
         problem = Problem(pairs, echoes, knots_s, prior, Gauge.none(prior.size))
-        problem = problem.of(range(_affordable(echoes)))
+        values = [sum(one.values for one in of_pairs) for of_pairs in zip(*echoes, strict=True)]
+        problem = problem.of(range(affordable(values)))
         begun = problem.state(np.zeros(prior.size))
         if len(problem.patches) >= LEAST_PATCHES:
-            problem = replace(problem, gauge=find_gauge(pairs, begun.cached, prior, knots_s, axes))
+            problem = replace(problem, gauge=find_gauge(pairs, begun.cached, prior, knots_s, found.axes))
         wavelength_m = SPEED_OF_LIGHT_M_S / sightings[0].profiles.centre_frequency_hz
-        return cls(problem, axes, begun, _points(ratio), wavelength_m)
+        return cls(problem, found, begun, wavelength_m)
+
+    @property
+    def axes(self) -> Floats:
+        """(3, 3) float64, rows are east, north, up."""
+        return self.found.axes
 
     def judged(self, held_out: Bools) -> tuple[State, Evidence]:
         """Return what the patches that are not held out ask for, and what the others say of it."""
@@ -138,29 +127,6 @@ class Search:
         )
         return state, evidence
 
-    def refused(self, errors: Mapping[str, TrackErrors]) -> Refinement:
-        """Return that too few points stand out."""
-        line = (
-            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
-            f"{LEAST_PATCHES} are needed"
-        )
-        knots_s = self.problem.knots_s
-        nothing = {node: np.zeros((len(knots_s), 3)) for node in errors}
-        std_m = {
-            node: np.tile(np.abs(np.array(one.std_m) @ self.axes), (len(knots_s), 1)) for node, one in errors.items()
-        }
-        report: dict[str, Any] = {"patches": self.points}
-        flags = {"refinement_too_few_patches": line}
-        return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)
-
-
-def _affordable(echoes: Sequence[Sequence[PatchEcho]]) -> int:
-    """Return how many patches may be kept in memory: those of a long flight have many blocks."""
-    bytes_of = np.sum(
-        [[_BYTES * len(one.patch.pixels_m) * len(one.profiles) for one in pair] for pair in echoes], axis=0
-    )
-    return max(int((np.cumsum(bytes_of) <= MOST_BYTES).sum()), min(LEAST_PATCHES, bytes_of.size))
-
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:
     """Return equally spaced times: several to an error's correlation time, none closer than pulses."""
@@ -171,18 +137,3 @@ def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> 
     step_s = max(min(lasting_s / _KNOTS_A_LASTING, (last - first) / _LEAST_KNOTS), pulse_s)
     count = max(2, int(np.ceil((last - first) / step_s)))
     return first + (np.arange(count) + 0.5) * (last - first) / count
-
-
-def _points(ratio: Floats) -> int:
-    """Return how many places are points."""
-    return len(ratio[ratio > LEAST_RATIO])
-
-
-def _patches(
-    sightings: Sequence[Sighting], places_m: Floats, ratio: Floats, lasting_s: float, axes: Floats
-) -> list[Patch]:
-    typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
-    apart_m = float(np.ptp((typical.pixels_m - typical.place_m) @ axes[:2].T, axis=0).max()) / 2
-    helpful = ratio > HELPFUL_RATIO
-    chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
-    return [patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen]

@@ -29,6 +29,11 @@ class Processing(ImagingChoices):
         description="tracks refined by the images themselves; auto: where errors of position that are stated cost more "
         "than they should",
     )
+    autofocus_method: Literal["auto", "tracks", "phase_gradient", "minimum_entropy"] = Field(
+        "auto",
+        description="what is refined: tracks, or one phase per pulse and pair by either method; auto: one phase, by "
+        "minimum_entropy, where all of the scene sees errors of position alike, else tracks",
+    )
     scheduler: str = Field(
         "threads",
         description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "

@@ -153,7 +153,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     if opened.history is None:
         raise TypeError("an open echo stage holds a phase history")
     plan = plan_pair(campaign, opened, scene, threads=threads)
-    plan = replace(plan, decisions=(*plan.decisions, track.decision))
+    plan = replace(plan, decisions=(*plan.decisions, *track.decisions))
     formation = Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px)
     # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}

@@ -45,7 +45,7 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         pairs, autofocus = expected_track(campaign, logged, scene)
         for opened in pairs:
             plan = plan_pair(campaign, opened, scene, threads=threads)
-            plan = replace(plan, decisions=(*plan.decisions, autofocus))
+            plan = replace(plan, decisions=(*plan.decisions, *autofocus))
             budget = _budget_table(budget_of(campaign, opened, scene))
             console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
             for name, line in plan.flags.items():

@@ -1,6 +1,6 @@
 """Rule `refine`: errors of a flight's tracks as its images show them, all pairs together, or why they are left."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,17 @@ from apertura.geometry.track_correction import TrackCorrection
 from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
 from apertura.load.antennas import pattern_digests
+from apertura.load.autofocus import autofocus_of
 from apertura.load.pair import open_pair
-from apertura.load.refined import autofocus_of
 from apertura.load.scene import OpenScene, open_scene
 from apertura.load.sightings import Seen, seen
 from apertura.planning.plan import Decision
 from apertura.provenance import merged
+from apertura.refinement.candidates import Candidates
 from apertura.refinement.inputs import Sighting
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.refine import refine as search
+from apertura.refinement.path_offsets import refine_one_phase
+from apertura.refinement.refine import refine as refine_tracks
 from apertura.steps.stamping import stamped
 from apertura.store import open_stage, save_stage
 
@@ -35,17 +37,17 @@ def refine(campaign: Campaign, flight: str) -> Path:
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
     asked = campaign.settings.processing.autofocus
     pairs = [] if asked == "off" else [open_pair(campaign, flight, pair) for pair in names]
-    decision, folder = autofocus_of(campaign, pairs, scene), campaign.stage("refined_track", flight)
-    if decision.value == "on":
+    decisions, folder = autofocus_of(campaign, pairs, scene), campaign.stage("refined_track", flight)
+    if decisions[0].value == "on":
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
         profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
         given = seen(campaign, profiles, scene)
-        found = search(given.sightings, scene.grid, scene.terrain, given.errors, reference_points=given.points)
-        stage = refined_stage(found, decision, given, scene)
+        found = _searched(given, scene, str(decisions[1].value))
+        stage = refined_stage(found, decisions, given, scene)
     else:
         found = _unrefined(node for pair in names for node in pair.split("-"))
-        stages, stage = {}, refined_stage(found, decision, None, scene)
-    print(f"autofocus {decision.value}: {decision.reason}; {found.why}", flush=True)
+        stages, stage = {}, refined_stage(found, decisions, None, scene)
+    print("; ".join([*(f"{one.name} {one.value}: {one.reason}" for one in decisions), found.why]), flush=True)
     patterns = [pattern_digests(campaign, pair) for pair in names]
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
     settings = {**campaign.relevant("refined_track"), "refined": found.accepted}
@@ -55,6 +57,15 @@ def refine(campaign: Campaign, flight: str) -> Path:
     return folder
 
 
+def _searched(given: Seen, scene: OpenScene, method: str) -> Refinement:
+    """Return what images say of the tracks, or of the phases of pulses."""
+    sightings, errors = given.sightings, given.errors
+    if method == "tracks":
+        return refine_tracks(sightings, scene.grid, scene.terrain, errors, reference_points=given.points)
+    found = Candidates.of(sightings, scene.grid, scene.terrain, errors)
+    return refine_one_phase(sightings, found, errors, method=method)
+
+
 def _unrefined(nodes: Any) -> Refinement:
     """Return that the tracks of some nodes are those of their logs."""
     nothing = {node: np.zeros((0, 3)) for node in dict.fromkeys(nodes)}
@@ -62,19 +73,20 @@ def _unrefined(nodes: Any) -> Refinement:
     return Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
 
 
-def refined_stage(found: Refinement, decision: Decision, given: Seen | None, scene: OpenScene) -> xr.Dataset:
+def refined_stage(found: Refinement, decisions: Sequence[Decision], given: Seen | None, scene: OpenScene) -> xr.Dataset:
     """Return stage `refined_track`, to be stamped.
 
     Parameters
     ----------
-    found, decision
-        What was found of the tracks, and why it was looked for, or not.
+    found, decisions
+        What was found of the tracks; whether it was looked for, and how, and why.
     given
         What it was found from; None where it was not looked for.
     scene
         The campaign's.
     """
     knots_s, nodes = found.correction.time_s, list(found.correction.moved_m)
+    further_m = found.correction.further_m
     began = np.datetime64(0, "ns") if given is None else given.began.astype("datetime64[ns]")
     logged = _logged(() if given is None else given.sightings, knots_s)
     moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
@@ -84,6 +96,7 @@ def refined_stage(found: Refinement, decision: Decision, given: Seen | None, sce
         {
             "time": ("knot", began + np.rint(1e9 * knots_s).astype("timedelta64[ns]")),
             "correction": (by_node, moved_m),
+            "further": (("pair", "knot"), np.reshape([*further_m.values()], (len(further_m), len(knots_s)))),
             "std": (by_node, std_m),
             "position": (by_node, position_m),
         },
@@ -91,7 +104,8 @@ def refined_stage(found: Refinement, decision: Decision, given: Seen | None, sce
             "frame": scene.grid.frame,
             "flags": dict(found.flags),
             "nodes": nodes,
-            "decision": {"value": decision.value, "reason": decision.reason},
+            "pairs": list(further_m),
+            "decisions": {one.name: {"value": one.value, "reason": one.reason} for one in decisions},
             "accepted": found.accepted,
             "why": found.why,
             "report": dict(found.report),
