@@ -175,7 +175,7 @@ def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> 
 
 def _points(ratio: Floats) -> int:
     """Return how many places are points."""
-    return len(ratio[ratio > LEAST_RATIO])
+    return int(np.sum(ratio > LEAST_RATIO))
 
 
 def _patches(
