@@ -12,7 +12,7 @@ from apertura.focus.contributions import block_contributions
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
 from apertura.refinement.inputs import Sighting
-from apertura.refinement.patches import Patch
+from apertura.refinement.patches import Patch, bandwidth_hz
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -177,8 +177,11 @@ class Blocks:
         profiles = echo.profiles.moved(aperture, further_m)
         profiles = replace(profiles, samples=np.asarray(profiles.samples))
         values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))
-        wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        return Contribution(values, echo.blocks, slopes, wavenumber)
+        wavenumber, band = (
+            2 * np.pi * frequency / SPEED_OF_LIGHT_M_S
+            for frequency in (profiles.centre_frequency_hz, bandwidth_hz(profiles) / np.sqrt(12))
+        )
+        return Contribution(values, echo.blocks, slopes, wavenumber, band)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,12 +198,15 @@ class Contribution:
         Node → (block, 3) float64, growth of the path at the patch per metre that the node moves (eq. 2).
     wavenumber
         2πf_mid/c.
+    band
+        The same of the band's standard deviation, taken as flat.
     """
 
     values: NDArray[np.complex64]
     blocks: slice
     slopes: Mapping[str, Floats]
     wavenumber: float
+    band: float
 
 
 def _towards(

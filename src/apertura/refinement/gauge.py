@@ -142,11 +142,24 @@ def _flown(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
 
 
 def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> tuple[Floats, Floats]:
-    """Return what modes do to a patch: blur (block, mode), rad rms in the whole, and shift (2, mode), metres."""
+    """Return what modes do to a patch: blur (row, mode), rad rms in the whole, and shift (2, mode), metres.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band the path itself must be
+    what a shift explains.
+    """
     path = sum(np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items())
-    ground = -np.asarray(sum(patch.slopes.values())) @ axes[:2].T
+    ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
-    weight = np.sqrt(weight / max(weight.sum(), 1e-300))[:, None]
-    known = np.concatenate([np.ones((len(ground), 1)), -ground], axis=1) * weight
-    explained = np.linalg.pinv(known) @ (path * weight)
-    return patch.wavenumber * (path * weight - known @ explained), explained[1:]
+    weight = (weight / max(weight.sum(), 1e-300))[:, None]
+
+    def told(paths: Floats) -> Floats:
+        centred = paths - (weight * paths).sum(axis=0)
+        return np.sqrt(weight) * np.concatenate([patch.wavenumber * centred, patch.band * paths]).reshape(
+            2, *paths.shape
+        )
+
+    known, errors = (told(one).reshape(-1, one.shape[1]) for one in (ground, path))
+    shift = np.linalg.pinv(known) @ errors
+    return errors - known @ shift, shift

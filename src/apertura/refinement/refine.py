@@ -25,9 +25,12 @@ from apertura.scene.terrain import Terrain
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+FOLDS = 4
+"""A quarter of the patches is not fitted, and tells whether the others are to be believed."""
+
 _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
-_HELD_OUT = 4  # every so many-th patch is not fitted
+_FEW = 8  # patches: each quarter of so few is held out once
 _STAGES = 3  # of caching and sharpening
 _STARTS = ("log", "prominent points")
 
@@ -60,10 +63,7 @@ def refine(
     search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
         return search.found.refused(errors)
-    held_out = np.arange(len(search.problem.patches)) % _HELD_OUT == 2
-    state, evidence = search.judged(held_out)
-    if evidence.accepted:
-        state = search.problem.sharper(state, np.ones_like(held_out))
+    state, evidence = search.judged()
     left = remaining(search.problem, state)
     unknowns, ties = tied(search.problem, state.unknowns, reference_points, search.axes)
     report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
@@ -104,28 +104,41 @@ class Search:
         """(3, 3) float64, rows are east, north, up."""
         return self.found.axes
 
-    def judged(self, held_out: Bools) -> tuple[State, Evidence]:
-        """Return what the patches that are not held out ask for, and what the others say of it."""
-        problem, begun, fitted = self.problem, self.begun, ~held_out
-        points = prominent(problem, begun, fitted, self.axes)
-        states = [problem.sharper(start, fitted) for start in (begun, points)]
-        values = [problem.value(state, fitted, begun.seen) for state in states]
-        best = int(np.argmin(values))
-        state = problem.sharper(states[best], fitted, stages=_STAGES - 1)
-        gains = gains_db(begun.seen, state.seen)
+    def judged(self) -> tuple[State, Evidence]:
+        """Return the tracks that all patches ask for, and what those say of them that were not fitted."""
+        problem, begun = self.problem, self.begun
+        held_out_db = np.full((len(problem.pairs), len(problem.patches)), np.nan)
+        fold = np.arange(len(problem.patches)) % FOLDS
+        state, start, values = begun, 0, [0.0]
+        for number in range(FOLDS if len(problem.patches) < _FEW else 1):
+            fitted = fold != (number + 2) % FOLDS
+            if fitted.all():
+                continue
+            state, start, values = self._fitted(fitted)
+            held_out_db[:, ~fitted] = gains_db(begun.seen, state.seen)[:, ~fitted]
+        everything = np.ones(len(problem.patches), bool)
+        state = problem.sharper(state, everything, stages=2 if len(problem.patches) < _FEW else 1)
+        known = 2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
         evidence = Evidence(
-            fitted_db=gains[:, fitted],
-            held_out_db=gains[:, held_out],
-            settled=problem.gauge.settled(
-                state.unknowns, known=2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
-            ),
+            fitted_db=gains_db(begun.seen, state.seen),
+            held_out_db=held_out_db[:, np.isfinite(held_out_db[0])],
+            settled=problem.gauge.settled(state.unknowns, known=known),
             before=range_shifts(problem, begun, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
-            start=_STARTS[best],
+            start=_STARTS[start],
             values=tuple(map(float, values)),
         )
         return state, evidence
+
+    def _fitted(self, used: Bools) -> tuple[State, int, list[float]]:
+        """Return the tracks that some patches ask for, the start that leads there, and the value of each start."""
+        problem, begun = self.problem, self.begun
+        starts = (begun, prominent(problem, begun, used, self.axes))
+        states = [problem.sharper(start, used) for start in starts]
+        values = [problem.value(state, used, begun.seen) for state in states]
+        best = int(np.argmin(values))
+        return problem.sharper(states[best], used, stages=_STAGES - 1), best, values
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:

@@ -1,30 +1,44 @@
-"""The image tied to points whose places are known: what sharpness leaves open is settled by them."""
+"""The image tied down where sharpness leaves it free: pairs to each other, and all to points whose places are known."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.contributions import block_contributions
-from apertura.focus.inputs import Profiles
+from apertura.refinement.blocks import Blocks, PatchEcho, Tracks
 from apertura.refinement.gauge import effects
 from apertura.refinement.inputs import ReferencePoint
-from apertura.refinement.patches import bandwidth_hz, patch_at
+from apertura.refinement.objective import Seen
+from apertura.refinement.patches import Patch, bandwidth_hz, patch_at
 from apertura.refinement.solve import Problem
 
 Floats = NDArray[np.float64]
 
-_LEAST_RATIO = 30.0  # peak power of a reference point against its speckle
+_LEAST_RATIO = 30.0  # peak power of a point against its surroundings
+_LEAST_STD_M = 0.01  # of a point's place in one pair against another: what scatters need not be the same spot
 _ZOOMS, _SIDE = 5, 9
-_ROUNDS = 3
+_ROUNDS = 4
+_LEAST_POINTS, _LEAST_AGREED = 3, 0.7  # whose phases agree between pairs so well that these may be tied
+_LEAST_STD_RAD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a pair shows a point, east and north (m), how surely, and how the gauge's modes move it and its path."""
+
+    place_m: Floats
+    std_m: float
+    shift_m: Floats
+    path_m: Floats
 
 
 def tied(
     problem: Problem, unknowns: Floats, points: Sequence[ReferencePoint], axes: Floats
 ) -> tuple[Floats, dict[str, Any]]:
-    """Return the unknowns with their gauge settled by reference points, and what was found.
+    """Return the unknowns with their gauge settled, and what was found.
 
     Parameters
     ----------
@@ -37,64 +51,129 @@ def tied(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 15: least squares in the gauge alone, with the log's prior.
+    Source: docs/theory/autofocus.md, eq. 15: least squares in the gauge alone, with the log's prior. All pairs see one
+    scene, so that they show a point at one place.
     """
-    if not points or not len(problem.gauge.modes):
+    if not len(problem.gauge.modes) or not (points or len(problem.pairs) > 1):
         return unknowns, {}
+    known = [(point, _patch_of(problem, point, axes)) for point in points]
+    echoes = [[blocks.echoes([patch])[0] for _, patch in known] for blocks in problem.pairs]
     settled: Floats = np.zeros(len(problem.gauge.modes))
-    for _ in range(_ROUNDS):
-        matrix, misses, report = _misses(problem, unknowns + settled @ problem.gauge.modes, points, axes)
-        if not len(misses):
-            return unknowns, {"reference_points": []}
-        # Where the misses are linear in the modes: those of the log itself, from which the prior counts.
+    report: dict[str, Any] = {}
+    for number in range(_ROUNDS):
+        tracks = problem.prior.tracks(unknowns + settled @ problem.gauge.modes)
+        matrix, misses = _between(problem, tracks, axes, phases=number > 0)
+        rows, apart, found = _from_known(problem, points, echoes, tracks, axes)
+        if not number:
+            report = {"pairs_apart_sigma": _rms(misses)} | ({"reference_points": found} if points else {})
+        matrix, misses = np.concatenate([matrix, rows]), np.concatenate([misses, apart])
         normal = matrix.T @ matrix + np.eye(len(settled))
         settled = np.asarray(np.linalg.solve(normal, matrix.T @ (matrix @ settled - misses)), np.float64)
-    return unknowns + settled @ problem.gauge.modes, {"reference_points": report}
+    return unknowns + settled @ problem.gauge.modes, report
 
 
-def _misses(
-    problem: Problem, unknowns: Floats, points: Sequence[ReferencePoint], axes: Floats
+def _between(problem: Problem, tracks: Tracks, axes: Floats, *, phases: bool) -> tuple[Floats, Floats]:
+    """Return rows and misses, in standard deviations, of each pair's points against those of the first."""
+    rows, misses = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)]
+    modes = problem.prior.tracks(problem.gauge.modes)
+    turns: dict[int, list[tuple[complex, Floats]]] = {}
+    for number in range(len(problem.patches)):
+        seen = [
+            _place(blocks, echoes[number], tracks, modes, axes)
+            for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
+        ]
+        first = seen[0]
+        for pair, other in enumerate(seen[1:], start=1):
+            if first is not None and other is not None:
+                std_m = float(np.hypot(first.std_m, other.std_m))
+                rows.append((other.shift_m - first.shift_m) / std_m)
+                misses.append((other.place_m - first.place_m) / std_m)
+                turn = _turned(problem, (0, pair), number, tracks, axes, (first.place_m + other.place_m) / 2)
+                turns.setdefault(pair, []).append((turn, other.path_m - first.path_m))
+    wavenumber = 2 * np.pi * problem.pairs[0].sighting.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    for found in turns.values() if phases else ():
+        together = complex(np.mean([turn / abs(turn) for turn, _ in found]))
+        if len(found) >= _LEAST_POINTS and abs(together) > _LEAST_AGREED:
+            std_rad = max(_LEAST_STD_RAD, float(np.sqrt(-2 * np.log(abs(together)) / len(found))))
+            rows.append(wavenumber * np.mean([path for _, path in found], axis=0)[None] / std_rad)
+            misses.append(np.array([np.angle(together)]) / std_rad)
+    return np.concatenate(rows), np.concatenate(misses)
+
+
+def _turned(
+    problem: Problem, pairs: tuple[int, int], number: int, tracks: Tracks, axes: Floats, level_m: Floats
+) -> complex:
+    """Return the second pair's image times the first's, conjugate, at a place east and north near a patch."""
+    values = []
+    for pair in pairs:
+        blocks, echo = problem.pairs[pair], problem.echoes[pair][number]
+        up_m = axes[2] @ echo.patch.place_m
+        point = Patch(echo.patch.place_m, (np.append(level_m, up_m) @ axes)[None])
+        values.append(complex(blocks.contribution(replace(echo, patch=point), blocks.moves(tracks)).values.sum()))
+    return values[1] * values[0].conjugate() + 1e-300
+
+
+def _from_known(
+    problem: Problem,
+    points: Sequence[ReferencePoint],
+    echoes: Sequence[Sequence[PatchEcho]],
+    tracks: Tracks,
+    axes: Floats,
 ) -> tuple[Floats, Floats, list[dict[str, Any]]]:
-    """Return how far points lie from where they belong, in their standard deviations, and how modes change that."""
-    rows, apart, report = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)], []
-    correction, tracks = problem.correction(unknowns), problem.prior.tracks(problem.gauge.modes)
-    found_tracks = problem.prior.tracks(unknowns)
-    for point in points:
-        place = np.array(point.place_m)
-        patch = patch_at(place, [blocks.sighting for blocks in problem.pairs], axes, correlation_s=_lasting_s(problem))
-        for blocks in problem.pairs:
-            [echo] = blocks.echoes([patch])
-            seen = blocks.contribution(echo, blocks.moves(found_tracks))
-            power = np.abs(seen.values.sum(axis=1)) ** 2
-            if power.max() < _LEAST_RATIO * np.median(power) / np.log(2):
-                continue
-            moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.sighting.nodes)}
-            _, shift = effects(seen, moved, axes)
-            profiles = blocks.sighting.moved(correction)
-            found = _peak(profiles, patch.pixels_m[int(power.argmax())], axes) - place
-            rows.append(shift / point.std_m)
-            apart.append(axes[:2] @ found / point.std_m)
-            report.append({"name": point.name, "pair": blocks.sighting.pair, "apart_m": _rounded(axes[:2] @ found)})
-    return np.concatenate(rows), np.concatenate(apart), report
+    """Return rows and misses of points whose places are known, and where each was found."""
+    rows, misses, report = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)], []
+    modes = problem.prior.tracks(problem.gauge.modes)
+    for blocks, of_pair in zip(problem.pairs, echoes, strict=True):
+        for point, echo in zip(points, of_pair, strict=True):
+            seen = _place(blocks, echo, tracks, modes, axes)
+            if seen is not None:
+                apart_m = seen.place_m - axes[:2] @ np.array(point.place_m)
+                rows.append(seen.shift_m / point.std_m)
+                misses.append(apart_m / point.std_m)
+                rounded = [round(float(one), 4) for one in apart_m]
+                report.append({"name": point.name, "pair": blocks.sighting.pair, "apart_m": rounded})
+    return np.concatenate(rows), np.concatenate(misses), report
 
 
-def _lasting_s(problem: Problem) -> float:
-    """Return how long errors last, seconds."""
-    return min(node.smooth for node in problem.prior.nodes.values()) * float(problem.knots_s[1] - problem.knots_s[0])
-
-
-def _peak(profiles: Profiles, start_m: Floats, axes: Floats) -> Floats:
-    """Return the (3,) place of the brightest point near a place, at its height."""
-    place, reach_m = start_m, SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles) / 4
-    whole = np.array([0, len(profiles)])
+def _place(blocks: Blocks, echo: PatchEcho, tracks: Tracks, modes: Tracks, axes: Floats) -> _Place | None:
+    """Return where a pair shows the point of a patch; None where it shows none."""
+    moved = blocks.moves(tracks)
+    patch = blocks.contribution(echo, moved)
+    image = patch.values.sum(axis=1)
+    ratio = Seen.of(image).ratio
+    if ratio < _LEAST_RATIO:
+        return None
+    modes_of = {node: blocks.average_of(modes[node]) for node in moved}
+    _, shift_m = effects(patch, modes_of, axes)
+    place, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
     for _ in range(_ZOOMS):
         side = np.linspace(-reach_m, reach_m, _SIDE)
         east, north = np.meshgrid(side, side)
         pixels = place + np.stack([east.ravel(), north.ravel()], axis=1) @ axes[:2]
-        place = pixels[int(np.abs(block_contributions(profiles, pixels, edges=whole)[:, 0]).argmax())]
+        near = replace(echo, patch=Patch(echo.patch.place_m, pixels))
+        place = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
         reach_m *= 2 / (_SIDE - 1)
-    return np.asarray(place)
+    std_m = float(np.hypot(_LEAST_STD_M, _cell_m(echo) / (np.pi * np.sqrt(ratio))))
+    paths = np.sum(
+        [np.einsum("bi,mbi->bm", slope, modes_of[node][:, patch.blocks]) for node, slope in patch.slopes.items()],
+        axis=0,
+    )
+    weight = np.linalg.norm(patch.values, axis=0)
+    return _Place(axes[:2] @ place, std_m, shift_m, weight @ paths / max(float(weight.sum()), 1e-300))
 
 
-def _rounded(values: Floats) -> list[float]:
-    return [round(float(value), 4) for value in values]
+def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
+    lasting = min(node.smooth for node in problem.prior.nodes.values())
+    lasting_s = lasting * float(problem.knots_s[1] - problem.knots_s[0])
+    sightings = [blocks.sighting for blocks in problem.pairs]
+    return patch_at(np.array(point.place_m), sightings, axes, correlation_s=lasting_s)
+
+
+def _cell_m(echo: PatchEcho) -> float:
+    """Return the resolution c/2B, metres."""
+    return SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles) / 2
+
+
+def _rms(misses: Floats) -> float | None:
+    """Return the rms of how far pairs are apart, in standard deviations; None where there is nothing to compare."""
+    return round(float(np.sqrt((misses**2).mean())), 3) if misses.size else None
