@@ -170,10 +170,9 @@ class Search:
 
 def _affordable(echoes: Sequence[Sequence[PatchEcho]]) -> int:
     """Return how many patches may be kept in memory: those of a long flight have many blocks."""
-    bytes_of = np.sum(
-        [[_BYTES * len(one.patch.pixels_m) * len(one.profiles) for one in pair] for pair in echoes], axis=0
-    )
-    return max(int((np.cumsum(bytes_of) <= MOST_BYTES).sum()), min(LEAST_PATCHES, bytes_of.size))
+    values = np.sum([[len(one.patch.pixels_m) * len(one.profiles) for one in pair] for pair in echoes], axis=0)
+    affordable = np.flatnonzero(_BYTES * np.cumsum(values) <= MOST_BYTES)
+    return max(len(affordable), min(LEAST_PATCHES, len(values)))
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:
