@@ -20,7 +20,7 @@ from apertura.planning.plan import Decision
 from apertura.quality.path_errors import Effect
 from apertura.store import manifest_of, open_stage
 
-_QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better", "start")
+_QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better")
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ HELPFUL_RATIO = 3.5
 """Where there are points, places that stand out less help too."""
 
 _SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobes
+_APART = 0.6  # of half a patch, at least, lie patches apart
 
 MOST_LOOKS = 24
 """Parts of the aperture: each as long as an error lasts, or longer."""
@@ -64,7 +65,7 @@ class Candidates:
         if points < LEAST_PATCHES:
             return cls([], points, axes)
         typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
-        apart_m = float(np.ptp((typical.pixels_m - typical.place_m) @ axes[:2].T, axis=0).max()) / 2
+        apart_m = _APART * float(np.abs((typical.pixels_m - typical.place_m) @ axes[:2].T).max())
         helpful = ratio > max(HELPFUL_RATIO, _SHARE_OF_CLEAREST * float(ratio.max()))
         chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
         return cls([patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen], points, axes)

@@ -47,8 +47,6 @@ class Evidence:
         Where parts of the aperture see points in range.
     wavelength_m
         Of the band's middle.
-    start, values
-        Which start led lowest, and the value that each led to.
     """
 
     fitted_db: Floats
@@ -57,8 +55,6 @@ class Evidence:
     before: "RangeShifts"
     after: "RangeShifts"
     wavelength_m: float
-    start: str
-    values: tuple[float, ...]
 
     @property
     def gain_db(self) -> float:
@@ -73,7 +69,7 @@ class Evidence:
     @property
     def accepted(self) -> bool:
         """Whether the tracks are believed."""
-        return self.gain_db >= LEAST_GAIN_DB and self.better >= LEAST_BETTER
+        return self.gain_db >= LEAST_GAIN_DB and self.better >= LEAST_BETTER and not self.slip
 
     @property
     def why(self) -> str:
@@ -82,7 +78,23 @@ class Evidence:
             f"{self.held_out_db.size} images of patches that were not fitted gained {self.gain_db:.2f} dB of contrast, "
             f"{self.better:.0%} of them gained"
         )
-        return line if self.accepted else f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are asked for"
+        if self.accepted:
+            return line
+        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are asked for" + (
+            ", and no slip" if self.slip else ""
+        )
+
+    @cached_property
+    def slip(self) -> str:
+        """Which parts of the aperture see the points where a wavelength of path puts them; nothing if none does."""
+        slipped = self.after.slipped(self.wavelength_m)
+        if not slipped.any():
+            return ""
+        off_m = float(np.abs(self.after.shift_m[slipped]).max())
+        return (
+            f"{int(slipped.sum())} of {slipped.size} parts of the apertures see the points up to {off_m:.2f} m of path "
+            f"from where the whole has them; the wavelength is {self.wavelength_m:.2f} m"
+        )
 
     @cached_property
     def inconsistent(self) -> str:
@@ -107,13 +119,8 @@ class Evidence:
         flags = {} if self.accepted else {"refinement_rejected": self.why}
         if self.inconsistent:
             flags["prior_inconsistent"] = self.inconsistent
-        slipped = int(self.after.slipped(self.wavelength_m).sum())
-        if slipped:
-            off = float(np.nanmax(np.abs(np.where(self.after.slipped(self.wavelength_m), self.after.shift_m, np.nan))))
-            flags["cycle_slip_suspected"] = (
-                f"{slipped} of {self.after.shift_m.size} parts of the apertures see the points up to {off:.2f} m of "
-                f"path from where the whole has them; the wavelength is {self.wavelength_m:.2f} m"
-            )
+        if self.slip:
+            flags["cycle_slip_suspected"] = self.slip
         return flags
 
     @property
@@ -127,8 +134,6 @@ class Evidence:
             if len(self.settled)
             else None,
             "range_shift_m": {"before": self.before.rms_m, "after": self.after.rms_m},
-            "start": self.start,
-            "objective": [round(value, 2) for value in self.values],
         }
 
 

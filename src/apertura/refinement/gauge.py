@@ -156,10 +156,9 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
 
     def told(paths: Floats) -> Floats:
         centred = paths - (weight * paths).sum(axis=0)
-        return np.sqrt(weight) * np.concatenate([patch.wavenumber * centred, patch.band * paths]).reshape(
-            2, *paths.shape
-        )
+        parts = [np.sqrt(weight) * one for one in (patch.wavenumber * centred, patch.band * paths)]
+        return np.asarray(np.concatenate(parts), np.float64)
 
-    known, errors = (told(one).reshape(-1, one.shape[1]) for one in (ground, path))
+    known, errors = (told(np.asarray(one)) for one in (ground, path))
     shift = np.linalg.pinv(known) @ errors
     return errors - known @ shift, shift

@@ -17,7 +17,7 @@ from apertura.refinement.patches import LEAST_PATCHES, affordable
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
 from apertura.refinement.solve import Problem, State
-from apertura.refinement.ties import tied
+from apertura.refinement.ties import disagreement, tied
 from apertura.refinement.uncertainty import MOST_RATIO, remaining
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
@@ -32,7 +32,6 @@ _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
 _FEW = 8  # patches: each quarter of so few is held out once
 _STAGES = 3  # of caching and sharpening
-_STARTS = ("log", "prominent points")
 
 
 def refine(
@@ -108,16 +107,14 @@ class Search:
         """Return the tracks that all patches ask for, and what those say of them that were not fitted."""
         problem, begun = self.problem, self.begun
         held_out_db = np.full((len(problem.pairs), len(problem.patches)), np.nan)
-        fold = np.arange(len(problem.patches)) % FOLDS
-        state, start, values = begun, 0, [0.0]
-        for number in range(FOLDS if len(problem.patches) < _FEW else 1):
+        everything, fold = np.ones(len(problem.patches), bool), np.arange(len(problem.patches)) % FOLDS
+        few = len(problem.patches) < _FEW
+        states = [] if not few else [self._fitted(everything)]
+        for number in range(FOLDS if few else 1):
             fitted = fold != (number + 2) % FOLDS
-            if fitted.all():
-                continue
-            state, start, values = self._fitted(fitted)
-            held_out_db[:, ~fitted] = gains_db(begun.seen, state.seen)[:, ~fitted]
-        everything = np.ones(len(problem.patches), bool)
-        state = problem.sharper(state, everything, stages=2 if len(problem.patches) < _FEW else 1)
+            states.append(self._fitted(fitted))
+            held_out_db[:, ~fitted] = gains_db(begun.seen, states[-1].seen)[:, ~fitted]
+        state = problem.sharper(self._lowest(states, everything), everything)
         known = 2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
         evidence = Evidence(
             fitted_db=gains_db(begun.seen, state.seen),
@@ -126,19 +123,24 @@ class Search:
             before=range_shifts(problem, begun, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
-            start=_STARTS[start],
-            values=tuple(map(float, values)),
         )
         return state, evidence
 
-    def _fitted(self, used: Bools) -> tuple[State, int, list[float]]:
-        """Return the tracks that some patches ask for, the start that leads there, and the value of each start."""
+    def _fitted(self, used: Bools) -> State:
+        """Return the tracks that some patches ask for, from the start that leads lowest."""
         problem, begun = self.problem, self.begun
         starts = (begun, prominent(problem, begun, used, self.axes))
-        states = [problem.sharper(start, used) for start in starts]
-        values = [problem.value(state, used, begun.seen) for state in states]
-        best = int(np.argmin(values))
-        return problem.sharper(states[best], used, stages=_STAGES - 1), best, values
+        best = self._lowest([problem.sharper(start, used) for start in starts], used)
+        return problem.sharper(best, used, stages=_STAGES - 1)
+
+    def _lowest(self, states: Sequence[State], used: Bools) -> State:
+        """Return the state whose patches are sharpest and whose pairs agree on where they are."""
+        problem = self.problem
+        values = [
+            problem.value(state, used, self.begun.seen) + disagreement(problem, state.tracks, self.axes)
+            for state in states
+        ]
+        return states[int(np.argmin(values))]
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:

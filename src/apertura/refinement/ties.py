@@ -72,6 +72,13 @@ def tied(
     return unknowns + settled @ problem.gauge.modes, report
 
 
+def disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> float:
+    """Return what is left of eq. 15 where pairs are tied to each other by their places, half of it: as an objective."""
+    matrix, misses = _between(problem, tracks, axes, phases=False)
+    settled = np.linalg.solve(matrix.T @ matrix + np.eye(matrix.shape[1]), -matrix.T @ misses)
+    return 0.5 * float(settled @ settled + ((misses + matrix @ settled) ** 2).sum())
+
+
 def _between(problem: Problem, tracks: Tracks, axes: Floats, *, phases: bool) -> tuple[Floats, Floats]:
     """Return rows and misses, in standard deviations, of each pair's points against those of the first."""
     rows, misses = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)]
