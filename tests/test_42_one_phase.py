@@ -1,0 +1,170 @@
+"""A campaign far from its scene: one phase per pulse is what is refined, and what its images are formed with."""
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+from folders import copy_writable, edit_config, quality_of, run_steps
+from spoiling.logs import read_log, write_log
+from spoiling.of_logs import noisy
+from track_noise import saying
+
+from apertura.campaign import Campaign
+from apertura.check.stale import stale_results
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.imaging.stages import profiles_of
+from apertura.load.autofocus import ONE_PHASE, autofocus_of, decide_method
+from apertura.load.pair import open_pair
+from apertura.load.refined import clock_s, open_refined
+from apertura.load.scene import open_scene
+from apertura.load.sightings import seen
+from apertura.refinement.candidates import Candidates
+from apertura.refinement.one_phase import METHODS
+from apertura.refinement.path_offsets import refine_one_phase
+from apertura.refinement.space_variance import MOST_LOSS_DB, SpaceVariance
+from apertura.settings.processing import Processing
+from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
+from apertura.steps import refine
+from apertura.steps.verify import verify
+from apertura.store import open_stage
+
+PAIRS = ("uav1-uav1", "uav1-uav2")
+ENOUGH, LACKING = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)
+PLACES_M = ((-9, -8.5), (0, -10), (8, -6), (-5, -3), (4, -1), (-10, 2), (10, 4), (-1, 5.5), (5, 9.5), (-8, 10.5))
+
+
+def state(root, section, **keys):
+    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
+    return Campaign.load(root)
+
+
+def far_away():
+    """Ten points on 24 m × 24 m, 300 m away from 60 m of flight in 15 s."""
+    demo, pulses, speed_m_s = preset("demo"), 300, 4.0
+    half_m = speed_m_s * (pulses - 1) / demo.waveform.prf_hz / 2
+    tracks = {
+        name: Straight((ahead_m - half_m, -290.0, 80.0), (speed_m_s, 0.0, 0.0))
+        for name, ahead_m in (("uav1", -2.0), ("uav2", 3.0))
+    }
+    return replace(
+        demo,
+        waveform=replace(demo.waveform, cyclic_prefix_s=2.5e-6),
+        targets=tuple(PointTarget((*place, 0.0)) for place in PLACES_M),
+        flights=(SimulatedFlight("f01", "uav1", tracks, pulses),),
+        scene=ImageGrid("EPSG:32632", half_width_m=12.0, spacing_m=0.1),
+    )
+
+
+@pytest.fixture(scope="module")
+def campaigns(tmp_path_factory):
+    """The far campaign: as it was flown, with logs that err by 2 cm, and with those refined as `auto` does."""
+    folder = tmp_path_factory.mktemp("far")
+    right = simulate(folder / "right", far_away(), seed=7)
+    spoilt = copy_writable(right, folder / "spoilt")
+    for path in sorted((spoilt / "raw" / "f01").glob("*.track.*")):
+        log = noisy(0.02, seed=3)(read_log(path))
+        write_log(path, log if log.attitude_deg is not None else saying(0.02)(log))
+    edit_config(spoilt, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
+    mended = copy_writable(spoilt, folder / "mended")
+    for root in (right, spoilt):
+        state(root, "processing", autofocus="off")
+    return {root.name: run_steps(root, exports=root is mended) for root in (right, spoilt, mended)}
+
+
+def image_of(campaign, pair):
+    return open_stage(campaign.stage("image", "f01", pair), "image").image.values
+
+
+def opened(campaign):
+    """Every pair of the flight with its profiles, and the scene."""
+    pairs = [open_pair(campaign, "f01", name) for name in PAIRS]
+    stages = [open_stage(campaign.stage("profile", "f01", name), "profile") for name in PAIRS]
+    return {pair: profiles_of(stage, lazy=True) for pair, stage in zip(pairs, stages, strict=True)}, open_scene(
+        campaign
+    )
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair):
+    right, spoilt, mended = (np.abs(image_of(one, pair)).max() for one in campaigns.values())
+    quality = quality_of(campaigns["mended"], pair)
+    assert 20 * np.log10(spoilt / right) < -2
+    assert 20 * np.log10(mended / right) > -0.2
+    assert quality["autofocus"]["accepted"]
+    assert quality["autofocus"]["method"].startswith("minimum_entropy: auto: in uav1-uav1 one phase per pulse leaves")
+    assert quality["models"]["autofocus_method"] == quality["autofocus"]["method"]
+    assert 1 < quality["autofocus"]["further_rms_cm"] < 5
+    assert "rms_cm" not in quality["autofocus"]
+    assert quality["focus"]["verdict"] == "focused"
+    assert quality["focus"]["expected_db"] == pytest.approx(20 * np.log10(mended / right), abs=0.2)
+
+
+def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
+    """What it leaves the image to be moved by is what the budget says of the logs, one sigma."""
+    (line,) = [one for one in quality_of(campaigns["mended"], PAIRS[0])["budget"] if one["cause"] == "positions"]
+    assert max(one.error_m for one in verify(campaigns["mended"])) < 2 * line["shift_m"]
+    assert line["shift_m"] == pytest.approx(0.087, rel=0.05)
+
+
+def test_what_was_found_is_what_images_use(campaigns):
+    campaign = campaigns["mended"]
+    pairs, scene = opened(campaign)
+    given, track = seen(campaign, pairs, scene), open_refined(campaign, "f01")
+    candidates = Candidates.of(given.sightings, scene.grid, scene.terrain, given.errors)
+    found = refine_one_phase(given.sightings, candidates, given.errors, method=ONE_PHASE)
+    assert track.stage.attrs["pairs"] == list(PAIRS)
+    assert not track.stage.correction.values.any()
+    for pair, profiles in pairs.items():
+        further_m = found.correction.longer_m(pair.name, clock_s(pair, given.began), pair.sidelink_m)
+        imaged, moved = track.pair(pair), track.profiles(pair, profiles)
+        assert np.std(further_m) > 0.01
+        np.testing.assert_allclose(moved.start_m - profiles.start_m, further_m, atol=1e-8)
+        delayed_s = imaged.history.reference_delay_s - pair.history.reference_delay_s
+        np.testing.assert_allclose(SPEED_OF_LIGHT_M_S * delayed_s, further_m, atol=1e-8)
+        np.testing.assert_array_equal(imaged.aperture.tx_m, pair.aperture.tx_m)
+
+
+def test_a_method_that_is_asked_for_is_taken(campaigns, tmp_path):
+    root = copy_writable(campaigns["mended"].root, tmp_path / "campaign")
+    campaign = state(root, "processing", autofocus_method="phase_gradient")
+    refine.refine(campaign, "f01")
+    told = open_refined(campaign, "f01").stage.attrs
+    assert told["decisions"]["autofocus_method"] == {"value": "phase_gradient", "reason": "asked for"}
+    assert told["report"]["method"] == "phase_gradient"
+    assert told["accepted"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "second", "known_points", "value"),
+    [
+        ("auto", ENOUGH, False, "minimum_entropy"),
+        ("auto", LACKING, False, "tracks"),
+        ("auto", ENOUGH, True, "tracks"),
+        ("tracks", ENOUGH, False, "tracks"),
+        ("phase_gradient", LACKING, True, "phase_gradient"),
+    ],
+)
+def test_one_phase_is_taken_where_it_suffices_for_every_pair(asked, second, known_points, value):
+    variances = {"a-a": SpaceVariance(0.1, -0.01), "a-b": second}
+    decision = decide_method(asked, variances, known_points=known_points)
+    assert decision.value == value
+    assert ("in a-b one phase per pulse leaves" in decision.reason) is (asked == "auto" and not known_points)
+
+
+def test_near_scenes_need_tracks_and_far_ones_one_phase(campaigns, finished_tiny, tmp_path):
+    near = state(copy_writable(finished_tiny.root, tmp_path / "near"), "processing", autofocus="on")
+    for campaign, value in ((near, "tracks"), (campaigns["mended"], ONE_PHASE)):
+        pairs, scene = opened(campaign)
+        autofocus, method = autofocus_of(campaign, list(pairs), scene)
+        assert (autofocus.value, method.name, method.value) == ("on", "autofocus_method", value)
+    pairs, scene = opened(campaigns["right"])
+    assert len(autofocus_of(campaigns["right"], list(pairs), scene)) == 1
+
+
+def test_every_method_may_be_asked_for_and_makes_again_what_stands_on_it(finished_tiny, tmp_path):
+    assert get_args(Processing.model_fields["autofocus_method"].annotation) == ("auto", "tracks", *METHODS)
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    campaign = state(root, "processing", autofocus_method="tracks")
+    stale = {name.rsplit("/", 1)[1].split(".")[0] for name in stale_results(campaign)}
+    assert stale == {"refined_track", "image", "assessment", "export", "cube"}
