@@ -58,7 +58,7 @@ def seen(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScen
         for pair, profiles in pairs.items()
     ]
     errors = {
-        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s)
+        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s, known.drift_m)
         for node, known in positions_of(list(pairs)).items()
     }
     return Seen(tuple(sightings), errors, reference_points(campaign), began)
