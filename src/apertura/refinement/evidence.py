@@ -96,8 +96,8 @@ class Evidence:
         """Which parts of the aperture see the points where a wavelength of path puts them; nothing if none does."""
         if self.apart_sigma > MOST_APART:
             return (
-                f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks are "
-                "wrong by more than their logs' errors"
+                f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks "
+                "are wrong by more than their logs' errors"
             )
         slipped = self.after.slipped(self.wavelength_m)
         if not slipped.any():
