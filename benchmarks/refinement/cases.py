@@ -82,11 +82,11 @@ def case(
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
     return Case(
         (scene, geometry, pairs, sigma_m, snr_db, seed),
-        tuple(_sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
         dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
         truth,
         scatterers.places_m[scatterers.targets],
-        tuple(_sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
         flight.reach_m,
     )
 
@@ -96,7 +96,7 @@ def _probes(generator: np.random.Generator) -> Scatterers:
     return Scatterers(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
 
 
-def _sighting(
+def sighting(
     pair: str,
     flight: Flight,
     truth: TrackCorrection,

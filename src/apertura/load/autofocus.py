@@ -74,7 +74,7 @@ def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
 def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
     """Return node → the errors that its log is taken to have."""
     return {
-        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s)
+        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s, known.drift_m)
         for node, known in positions_of(pairs).items()
     }
 

@@ -203,7 +203,12 @@ def _positions(stated: Mapping[str, Any]) -> NodePositions:
     """Return what an echo stage says of a node's positions; its deviations are north, east, up."""
     std = stated.get("std_m")
     axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
-    return NodePositions(axes, float(stated.get("correlation_s", 1.0)), str(stated.get("stated_by", "nobody")))
+    return NodePositions(
+        axes,
+        float(stated.get("correlation_s", 1.0)),
+        str(stated.get("stated_by", "nobody")),
+        float(stated.get("drift_m", 0.0)),
+    )
 
 
 def _seconds(times: NDArray[np.datetime64]) -> NDArray[np.float64]:

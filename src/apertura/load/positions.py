@@ -83,7 +83,8 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
     -------
     dict
         std_m: [north, east, up], metres, the median over the pulses of what the log states, else the config's, else
-        None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds.
+        None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds; drift_m: of
+        a slow error.
     """
     if "position_std" in track:
         epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
@@ -99,7 +100,12 @@ def stated_error(settings: Node) -> dict[str, Any]:
     stated = settings.position_std_m
     std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
     stated_by = "nobody" if stated is None else "config"
-    return {"std_m": std_m, "correlation_s": settings.position_correlation_s, "stated_by": stated_by}
+    return {
+        "std_m": std_m,
+        "correlation_s": settings.position_correlation_s,
+        "drift_m": settings.position_drift_m,
+        "stated_by": stated_by,
+    }
 
 
 def _flags(node: Acquisition, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:

@@ -61,11 +61,14 @@ class NodePositions:
         How long an error lasts.
     stated_by
         Who said so.
+    drift_m
+        Of a slow error over the whole flight, in each axis.
     """
 
     std_m: tuple[float, float, float] | None
     correlation_s: float = 1.0
     stated_by: str = "nobody"
+    drift_m: float = 0.0
 
 
 def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:

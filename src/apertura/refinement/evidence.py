@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 LEAST_GAIN_DB, LEAST_BETTER = 0.3, 0.75
 """Contrast that patches gain which were not fitted, and the share of them that gains: less is not believed."""
 
+MOST_APART = 4.0
+"""Standard deviations of their places that pairs may show points apart: more are tracks that have slipped."""
+
 PARTS = 8
 """Of the aperture, whose images of a point are compared in range."""
 
@@ -47,6 +50,9 @@ class Evidence:
         Where parts of the aperture see points in range.
     wavelength_m
         Of the band's middle.
+    apart_sigma
+        How far pairs show points apart that tracks within the log's errors do not bring together, rms, in standard
+        deviations of their places.
     """
 
     fitted_db: Floats
@@ -55,6 +61,7 @@ class Evidence:
     before: "RangeShifts"
     after: "RangeShifts"
     wavelength_m: float
+    apart_sigma: float
 
     @property
     def gain_db(self) -> float:
@@ -87,6 +94,11 @@ class Evidence:
     @cached_property
     def slip(self) -> str:
         """Which parts of the aperture see the points where a wavelength of path puts them; nothing if none does."""
+        if self.apart_sigma > MOST_APART:
+            return (
+                f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks "
+                "are wrong by more than their logs' errors"
+            )
         slipped = self.after.slipped(self.wavelength_m)
         if not slipped.any():
             return ""
@@ -133,6 +145,7 @@ class Evidence:
             "settled": {"modes": len(self.settled), "power": round(float((self.settled**2).mean()), 3)}
             if len(self.settled)
             else None,
+            "apart_sigma": self.apart_sigma,
             "range_shift_m": {"before": self.before.rms_m, "after": self.after.rms_m},
         }
 

@@ -114,7 +114,8 @@ class Search:
             fitted = fold != (number + 2) % FOLDS
             states.append(self._fitted(fitted))
             held_out_db[:, ~fitted] = gains_db(begun.seen, states[-1].seen)[:, ~fitted]
-        state = problem.sharper(self._lowest(states, everything), everything)
+        lowest = self._lowest(states, everything)
+        state = self._lowest([lowest, problem.sharper(lowest, everything)], everything)
         known = 2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
         evidence = Evidence(
             fitted_db=gains_db(begun.seen, state.seen),
@@ -123,6 +124,7 @@ class Search:
             before=range_shifts(problem, begun, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
+            apart_sigma=disagreement(problem, state.tracks, self.axes)[1],
         )
         return state, evidence
 
@@ -137,7 +139,7 @@ class Search:
         """Return the state whose patches are sharpest and whose pairs agree on where they are."""
         problem = self.problem
         values = [
-            problem.value(state, used, self.begun.seen) + disagreement(problem, state.tracks, self.axes)
+            problem.value(state, used, self.begun.seen) + disagreement(problem, state.tracks, self.axes)[0]
             for state in states
         ]
         return states[int(np.argmin(values))]

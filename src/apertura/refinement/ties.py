@@ -20,19 +20,16 @@ Floats = NDArray[np.float64]
 _LEAST_RATIO = 30.0  # peak power of a point against its surroundings
 _LEAST_STD_M = 0.01  # of a point's place in one pair against another: what scatters need not be the same spot
 _ZOOMS, _SIDE = 5, 9
-_ROUNDS = 4
-_LEAST_POINTS, _LEAST_AGREED = 3, 0.7  # whose phases agree between pairs so well that these may be tied
-_LEAST_STD_RAD = 0.1
+_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where a pair shows a point, east and north (m), how surely, and how the gauge's modes move it and its path."""
+    """Where a pair shows a point, east and north (m), how surely, and how the gauge's modes move it."""
 
     place_m: Floats
     std_m: float
     shift_m: Floats
-    path_m: Floats
 
 
 def tied(
@@ -62,7 +59,7 @@ def tied(
     report: dict[str, Any] = {}
     for number in range(_ROUNDS):
         tracks = problem.prior.tracks(unknowns + settled @ problem.gauge.modes)
-        matrix, misses = _between(problem, tracks, axes, phases=number > 0)
+        matrix, misses = _between(problem, tracks, axes)
         rows, apart, found = _from_known(problem, points, echoes, tracks, axes)
         if not number:
             report = {"pairs_apart_sigma": _rms(misses)} | ({"reference_points": found} if points else {})
@@ -72,52 +69,36 @@ def tied(
     return unknowns + settled @ problem.gauge.modes, report
 
 
-def disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> float:
-    """Return what is left of eq. 15 where pairs are tied to each other by their places, half of it: as an objective."""
-    matrix, misses = _between(problem, tracks, axes, phases=False)
+def disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[float, float]:
+    """Return what is left of eq. 15 where pairs are tied to each other.
+
+    Returns
+    -------
+    tuple
+        Half of it, as an objective; and the rms of what pairs are still apart, in standard deviations.
+    """
+    matrix, misses = _between(problem, tracks, axes)
     settled = np.linalg.solve(matrix.T @ matrix + np.eye(matrix.shape[1]), -matrix.T @ misses)
-    return 0.5 * float(settled @ settled + ((misses + matrix @ settled) ** 2).sum())
+    left = misses + matrix @ settled
+    return 0.5 * float(settled @ settled + left @ left), _rms(left)
 
 
-def _between(problem: Problem, tracks: Tracks, axes: Floats, *, phases: bool) -> tuple[Floats, Floats]:
+def _between(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
     """Return rows and misses, in standard deviations, of each pair's points against those of the first."""
     rows, misses = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
-    turns: dict[int, list[tuple[complex, Floats]]] = {}
     for number in range(len(problem.patches)):
         seen = [
             _place(blocks, echoes[number], tracks, modes, axes)
             for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
         ]
         first = seen[0]
-        for pair, other in enumerate(seen[1:], start=1):
+        for other in seen[1:]:
             if first is not None and other is not None:
                 std_m = float(np.hypot(first.std_m, other.std_m))
                 rows.append((other.shift_m - first.shift_m) / std_m)
                 misses.append((other.place_m - first.place_m) / std_m)
-                turn = _turned(problem, (0, pair), number, tracks, axes, (first.place_m + other.place_m) / 2)
-                turns.setdefault(pair, []).append((turn, other.path_m - first.path_m))
-    wavenumber = 2 * np.pi * problem.pairs[0].sighting.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-    for found in turns.values() if phases else ():
-        together = complex(np.mean([turn / abs(turn) for turn, _ in found]))
-        if len(found) >= _LEAST_POINTS and abs(together) > _LEAST_AGREED:
-            std_rad = max(_LEAST_STD_RAD, float(np.sqrt(-2 * np.log(abs(together)) / len(found))))
-            rows.append(wavenumber * np.mean([path for _, path in found], axis=0)[None] / std_rad)
-            misses.append(np.array([np.angle(together)]) / std_rad)
     return np.concatenate(rows), np.concatenate(misses)
-
-
-def _turned(
-    problem: Problem, pairs: tuple[int, int], number: int, tracks: Tracks, axes: Floats, level_m: Floats
-) -> complex:
-    """Return the second pair's image times the first's, conjugate, at a place east and north near a patch."""
-    values = []
-    for pair in pairs:
-        blocks, echo = problem.pairs[pair], problem.echoes[pair][number]
-        up_m = axes[2] @ echo.patch.place_m
-        point = Patch(echo.patch.place_m, (np.append(level_m, up_m) @ axes)[None])
-        values.append(complex(blocks.contribution(replace(echo, patch=point), blocks.moves(tracks)).values.sum()))
-    return values[1] * values[0].conjugate() + 1e-300
 
 
 def _from_known(
@@ -161,12 +142,7 @@ def _place(blocks: Blocks, echo: PatchEcho, tracks: Tracks, modes: Tracks, axes:
         place = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
         reach_m *= 2 / (_SIDE - 1)
     std_m = float(np.hypot(_LEAST_STD_M, _cell_m(echo) / (np.pi * np.sqrt(ratio))))
-    paths = np.sum(
-        [np.einsum("bi,mbi->bm", slope, modes_of[node][:, patch.blocks]) for node, slope in patch.slopes.items()],
-        axis=0,
-    )
-    weight = np.linalg.norm(patch.values, axis=0)
-    return _Place(axes[:2] @ place, std_m, shift_m, weight @ paths / max(float(weight.sum()), 1e-300))
+    return _Place(axes[:2] @ place, std_m, shift_m)
 
 
 def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
@@ -181,6 +157,6 @@ def _cell_m(echo: PatchEcho) -> float:
     return SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles) / 2
 
 
-def _rms(misses: Floats) -> float | None:
-    """Return the rms of how far pairs are apart, in standard deviations; None where there is nothing to compare."""
-    return round(float(np.sqrt((misses**2).mean())), 3) if misses.size else None
+def _rms(misses: Floats) -> float:
+    """Return the rms of how far pairs are apart, in standard deviations; 0 where there is nothing to compare."""
+    return round(float(np.sqrt((misses**2).sum() / max(misses.size, 1))), 3)

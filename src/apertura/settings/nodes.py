@@ -91,6 +91,12 @@ class Node(Section):
     position_correlation_s: float = Field(
         1.0, gt=0, description="how long an error of position lasts: where its autocorrelation has fallen to 1/e, s"
     )
+    position_drift_m: float = Field(
+        0.0,
+        ge=0,
+        description="slow error of position over a flight, offset, slope and bow, standard deviation in each axis, m: "
+        "what a refinement of tracks may correct beside what position_std_m allows",
+    )
     time_tag_std_s: float = Field(
         3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
     )

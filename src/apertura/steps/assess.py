@@ -11,13 +11,15 @@ from apertura.campaign import Campaign
 from apertura.fusion.choice import choose_fusion
 from apertura.lineage import result_of
 from apertura.load.agreement import agreement_of, agreement_report, comparable, shows_points_of
+from apertura.load.refined import open_refined
 from apertura.load.scene import settled_scene
 from apertura.provenance import chained_sha256, code_sha256
 from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage, save_document
 
-_LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", "pairs_out_of_phase", "pair_unconfirmed"})
+_PHASE = "pairs_out_of_phase"
+_LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
 """Flags that a wrong geometry raises, and for which a remedy is looked for."""
 
 _SURE_SNR_DB = 20.0
@@ -32,6 +34,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
     reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
     found = {pair: agreement_of(images[reference], images[pair], grid) for pair in pairs if pair != reference}
+    refined = open_refined(campaign, flight).correction is not None
     unconfirmed = {
         pair
         for pair, one in found.items()
@@ -47,9 +50,13 @@ def assess(campaign: Campaign, flight: str) -> Path:
         reference,
         found,
         unfit=_unfit(found, unconfirmed, reference),
-        align=campaign.settings.processing.fusion.align_phase,
+        align=refined or campaign.settings.processing.fusion.align_phase,
     )
     flags = _flags(found, reference, unconfirmed)
+    if refined:  # a path that is constant for a pair is what the images do not tell: it was taken off
+        flags = {
+            pair: {name: line for name, line in raised.items() if name != _PHASE} for pair, raised in flags.items()
+        }
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
     named = _suspected(campaign, flight, images, flags, reference)
@@ -132,7 +139,7 @@ def _disagreement(one: Agreement | None, pairs: tuple[str, str], *, sure: bool) 
             "north: positions, lever arms, path offsets or heights of one are wrong"
         )
     if one.out_of_phase:
-        raised["pairs_out_of_phase"] = (
+        raised[_PHASE] = (
             f"{pair} is {one.phase_rad:+.2f} ± {one.phase_std_rad:.2f} rad from {reference} at {one.points} bright "
             "points: path offsets or positions of one are wrong by a fraction of the wavelength"
         )

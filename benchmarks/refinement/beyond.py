@@ -1,0 +1,89 @@
+"""What a refinement makes of errors that are not those of positions: attitude, lever arm, heights of the ground.
+
+`python -m benchmarks.refinement.beyond`: forty points, tracks as the logs have them but for 1 cm, five draws each; mended,
+refused, or what is left.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.inputs import TrackErrors
+from apertura.refinement.refine import refine
+from apertura.scene.terrain import FlatGround
+from benchmarks.refinement.cases import PAIRS, PROBES_M, Case, sighting
+from benchmarks.refinement.flights import FLIGHTS, NODES, drawn_errors
+from benchmarks.refinement.measures import judge
+from benchmarks.refinement.scenes import GRID, SCENES, Scatterers
+
+SIGMA_M = 0.01
+OTHERS = {
+    "nothing else": (0.0, 0.0, 0.0),
+    "attitude 2 deg, arm 25 cm": (0.25 * np.radians(2.0), 0.0, 0.0),
+    "lever arm 5 cm": (0.05, 0.0, 0.0),
+    "lever arm 5 cm, drift stated": (0.05, 0.0, 0.05),
+    "ground 20 cm higher": (0.0, 0.2, 0.0),
+}
+"""What else is wrong → arm of the first node, metres to the right of its course; height, metres; drift stated."""
+
+
+def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> Case:
+    """Return a case whose first node's antenna is off to its right, and whose ground lies higher than it is taken to."""
+    of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
+    flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
+    errors = TrackErrors((SIGMA_M,) * 3)
+    moved = {
+        node: drawn_errors(flight.time_s, errors, one) for node, one in zip(NODES, of_tracks.spawn(2), strict=True)
+    }
+    course = np.gradient(flight.logged_m[NODES[0]], axis=0)[:, :2]
+    course /= np.linalg.norm(course, axis=1, keepdims=True)
+    arm = np.concatenate([course[:, 1:], -course[:, :1], np.zeros((len(course), 1))], axis=1) * arm_m
+    truth = TrackCorrection(flight.time_s, {**moved, NODES[0]: moved[NODES[0]] + arm})
+    lifted = dataclasses.replace(scatterers, places_m=scatterers.places_m + [0, 0, height_m])
+    probes = Scatterers(PROBES_M + [0, 0, height_m], np.ones(len(PROBES_M), complex), np.arange(len(PROBES_M)))
+    noises = of_noise.spawn(2)
+    return Case(
+        ("forty", flight_name, "joint", SIGMA_M, 10.0, seed),
+        tuple(
+            sighting(pair, flight, truth, lifted, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)
+        ),
+        dict.fromkeys(NODES, TrackErrors((SIGMA_M,) * 3, drift_std_m=drift_m)),
+        truth,
+        lifted.places_m[lifted.targets] * [1, 1, 0],
+        tuple(
+            sighting(pair, flight, truth, probes, None, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)
+        ),
+        flight.reach_m,
+    )
+
+
+def main() -> None:
+    for flight_name in ("straight", "wobble", "circle"):
+        for name, (arm_m, height_m, drift_m) in OTHERS.items():
+            rows = []
+            for seed in range(300, 302 if flight_name == "circle" else 305):
+                one = spoilt(flight_name, arm_m, height_m, drift_m, seed)
+                found = refine(one.sightings, GRID, FlatGround(0.0), one.errors)
+                before, after = judge(one), judge(one, found.correction)
+                rows.append(
+                    (
+                        before.probe_loss_db,
+                        after.probe_loss_db,
+                        before.probe_shift_cm,
+                        after.probe_shift_cm,
+                        found.accepted,
+                        " ".join(found.flags),
+                    )
+                )
+            loss, left, shift, moved, accepted, flags = zip(*rows, strict=True)
+            print(
+                f"{flight_name}, {name}: loss {np.mean(loss):.2f} → {np.mean(left):.2f} dB, "
+                f"shift against the true tracks {np.median(shift):.1f} → {np.median(moved):.1f} cm, "
+                f"accepted {sum(accepted)} of {len(rows)}; flags: {sorted(set(' '.join(flags).split())) or 'none'}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
