@@ -1,7 +1,7 @@
 """What a refinement makes of errors that are not those of positions: attitude, lever arm, heights of the ground.
 
-`python -m benchmarks.refinement.beyond`: forty points, tracks as the logs have them but for 1 cm, five draws each; mended,
-refused, or what is left.
+`python -m benchmarks.refinement.beyond`: forty points, tracks as the logs have them but for 1 cm, five draws each;
+mended, refused, or what is left.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ OTHERS = {
 
 
 def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> Case:
-    """Return a case whose first node's antenna is off to its right, and whose ground lies higher than it is taken to."""
+    """Return a case whose first node's antenna is off to its right, and whose ground lies higher than is taken."""
     of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
     flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
     errors = TrackErrors((SIGMA_M,) * 3)
