@@ -1,5 +1,6 @@
 """What two pairs of one transmitter see alike of ground without points, and what that tells of the tracks."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -16,6 +17,7 @@ from apertura.refinement.gauge import Gauge
 from apertura.refinement.inputs import Sighting, TrackErrors
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.solve import minimal
+from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.tiles import tiles
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround
@@ -120,4 +122,19 @@ def blur_m(moved_m):
 
 def test_one_pair_has_nothing_to_agree_with():
     sightings, unknowns = seen(1)
-    assert ground_of(sightings[:1]).agreements(PRIOR.tracks(unknowns)) == []
+    ground = ground_of(sightings[:1])
+    assert ground.agreements(PRIOR.tracks(unknowns)) == []
+    found = refined_by_speckle(ground, PRIOR, KNOTS_S)
+    assert not found.accepted
+    assert "one pair" in found.flags["refinement_too_few_patches"]
+
+
+def test_speckle_is_believed_by_the_coherence_of_tiles_that_were_not_fitted():
+    sightings, _ = seen(1)
+    found = refined_by_speckle(ground_of(sightings), PRIOR, KNOTS_S)
+    assert found.accepted, found.why
+    unlike = [sightings[0], replace(sightings[1], profiles=seen(2)[0][1].profiles)]
+    refused = refined_by_speckle(ground_of(unlike), PRIOR, KNOTS_S)
+    assert not refused.accepted
+    assert not np.any(refused.correction.moved_m["a"])
+    assert "not fitted" in refused.flags["refinement_rejected"]

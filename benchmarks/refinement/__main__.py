@@ -15,8 +15,11 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
+from apertura.refinement.agreement import Ground
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.refine import refine
+from apertura.refinement.refine import Search, refine
+from apertura.refinement.speckle import refined_by_speckle
+from apertura.refinement.tiles import tiles
 from apertura.scene.terrain import FlatGround
 from benchmarks.refinement.cases import Case, case
 from benchmarks.refinement.measures import UNCORRECTED, image_seconds, judge
@@ -31,6 +34,15 @@ def refined(one: Case) -> Refinement:
     return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
 
 
+def by_speckle(one: Case) -> Refinement:
+    """Return what ground without points tells."""
+    search = Search.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
+    lasting_s = min(errors.correlation_s for errors in one.errors.values())
+    found = tiles(one.sightings, GRID, FlatGround(0.0), lasting_s=lasting_s)
+    problem = search.problem
+    return refined_by_speckle(Ground.of(problem.pairs, found), problem.prior, problem.knots_s)
+
+
 def left(_: Case) -> Refinement:
     """Return the logs as they are."""
     return Refinement(UNCORRECTED, {}, accepted=False, why="left as it is")
@@ -41,7 +53,12 @@ def told(one: Case) -> Refinement:
     return Refinement(one.truth, {}, accepted=True, why="the truth")
 
 
-ATTEMPTS: Mapping[str, Callable[[Case], Refinement]] = {"refine": refined, "none": left, "truth": told}
+ATTEMPTS: Mapping[str, Callable[[Case], Refinement]] = {
+    "refine": refined,
+    "speckle": by_speckle,
+    "none": left,
+    "truth": told,
+}
 
 
 def keys(asked: str) -> Iterator[Key]:

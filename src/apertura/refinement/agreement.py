@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.refinement.blocks import Blocks, Contribution, PatchEcho
-from apertura.refinement.objective import turns
+from apertura.refinement.objective import phases
 from apertura.refinement.tiles import SAMPLING, Tile
 
 Floats = NDArray[np.float64]
@@ -53,9 +53,15 @@ class Alike:
         cells = SAMPLING**2 * min(pixels, float(even.min()))
         return cls(product, cells, between / pixels, (replace(first, values=nothing), replace(second, values=nothing)))
 
-    def coherence(self, turns: Sequence[NDArray[np.complex64]]) -> tuple[complex, list[NDArray[np.complex64]]]:
-        """Return Σ conj(I)·I' by the images' energies, and the part of each block of both pairs in it."""
-        first, second = turns[0].conj(), turns[1]
+    def coherence(self, moved: Sequence[Tracks]) -> tuple[complex, list[NDArray[np.complex64]]]:
+        """Return Σ conj(I)·I' by the images' energies, and the part of each block of both pairs in it.
+
+        Where the nodes of each pair's blocks have moved, node → (block, 3), metres.
+        """
+        first, second = (
+            np.exp(sign * 1j * phases(seen, one)).astype(np.complex64)
+            for sign, seen, one in zip((-1, 1), self.seen, moved, strict=True)
+        )
         by_first = first * (self.product @ second)
         return complex(by_first.sum()), [by_first, second * (first @ self.product)]
 
@@ -119,9 +125,7 @@ class Agreement:
             blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
             for blocks in self.pairs
         ]
-        return moved, [
-            tile.coherence([turns(*one) for one in zip(tile.seen, moved, strict=True)]) for tile in self.tiles
-        ]
+        return moved, [tile.coherence(moved) for tile in self.tiles]
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from apertura.refinement.solve import minimal
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LEAST_COHERENCE = 0.6
+LEAST_COHERENCE = 0.65
 """Of tiles that were not fitted: less is left by tracks that are cycles wrong."""
 
 LEAST_GAIN = 0.1
@@ -82,8 +82,8 @@ def refined_by_speckle(ground: Ground, prior: Prior, knots_s: Floats) -> Refinem
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "Speckle". The standard deviations are the log's: (23) makes them smaller by no more
-    than a half.
+    Source: docs/theory/autofocus.md, "Speckle". The standard deviations are the log's: eq. 23 makes them smaller by no
+    more than a half.
     """
     nothing, count = np.zeros(prior.size), len(ground.tiles)
     std_m = {
