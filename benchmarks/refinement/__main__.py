@@ -15,9 +15,13 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
+import numpy as np
+
 from apertura.refinement.agreement import Ground
+from apertura.refinement.blocks import Blocks
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.refine import Search, refine
+from apertura.refinement.prior import NodePrior, Prior
+from apertura.refinement.refine import refine
 from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.tiles import tiles
 from apertura.scene.terrain import FlatGround
@@ -36,11 +40,13 @@ def refined(one: Case) -> Refinement:
 
 def by_speckle(one: Case) -> Refinement:
     """Return what ground without points tells."""
-    search = Search.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
     lasting_s = min(errors.correlation_s for errors in one.errors.values())
+    time_s = one.sightings[0].time_s
+    knots_s = np.arange(time_s[0] + lasting_s / 20, time_s[-1], lasting_s / 10)
+    prior = Prior({node: NodePrior.of(errors, knots_s, np.eye(3)) for node, errors in one.errors.items()})
+    pairs = [Blocks.of(sighting, knots_s) for sighting in one.sightings]
     found = tiles(one.sightings, GRID, FlatGround(0.0), lasting_s=lasting_s)
-    problem = search.problem
-    return refined_by_speckle(Ground.of(problem.pairs, found), problem.prior, problem.knots_s)
+    return refined_by_speckle(Ground.of(pairs, found), prior, knots_s)
 
 
 def left(_: Case) -> Refinement:

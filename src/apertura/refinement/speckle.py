@@ -14,18 +14,19 @@ from apertura.refinement.gauge import Gauge
 from apertura.refinement.outcome import Refinement
 from apertura.refinement.prior import Prior
 from apertura.refinement.solve import minimal
+from apertura.refinement.tiles import SAMPLING
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-LEAST_COHERENCE = 0.65
+LEAST_COHERENCE = 0.75
 """Of tiles that were not fitted: less is left by tracks that are cycles wrong."""
 
 LEAST_GAIN = 0.1
 """By which the coherence of those tiles must have grown."""
 
-LEAST_CELLS = 100.0
-"""Resolution cells of even ground that all tiles must hold: what a few points throw about agrees by chance."""
+LEAST_EVEN = 0.25
+"""Share of the ground that must be even: what a few points throw about agrees by chance."""
 
 LEAST_TILES = 8
 
@@ -43,19 +44,19 @@ class Agreed:
         Mean coherence of two pairs' images of a tile.
     tiles
         How many there are.
-    cells
-        Resolution cells of even ground in all of them.
+    even
+        Share of the ground's resolution cells that count.
     """
 
     before: float
     after: float
     tiles: int
-    cells: float
+    even: float
 
     @property
     def accepted(self) -> bool:
         """Whether the tracks are to be believed."""
-        return self.after >= max(LEAST_COHERENCE, self.before + LEAST_GAIN) and self.cells >= LEAST_CELLS
+        return self.after >= max(LEAST_COHERENCE, self.before + LEAST_GAIN) and self.even >= LEAST_EVEN
 
     @property
     def why(self) -> str:
@@ -63,8 +64,8 @@ class Agreed:
         grown = f"coherence of two pairs went from {self.before:.2f} to {self.after:.2f} on ground that was not fitted"
         if self.accepted:
             return grown
-        if self.cells < LEAST_CELLS:
-            return f"only {self.cells:.0f} resolution cells are even ground, {LEAST_CELLS:.0f} are needed"
+        if self.even < LEAST_EVEN:
+            return f"only {self.even:.0%} of the ground is even, {LEAST_EVEN:.0%} are needed: points stand out"
         return f"{grown}: {LEAST_COHERENCE} and {LEAST_GAIN} more than before are needed"
 
 
@@ -100,8 +101,8 @@ def refined_by_speckle(ground: Ground, prior: Prior, knots_s: Floats) -> Refinem
     told = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
     agreed = Agreed(begun[0], told[0], count, _coherence(ground, prior, nothing, np.ones_like(held_out))[1])
     found = _solved(ground, prior, np.ones_like(held_out)) if agreed.accepted else nothing
-    report: dict[str, Any] = {"tiles": count, "coherence": [round(agreed.before, 3), round(agreed.after, 3)]}
-    report["cells"] = round(agreed.cells)
+    coherence = [round(agreed.before, 3), round(agreed.after, 3)]
+    report: dict[str, Any] = {"tiles": count, "even": round(agreed.even, 3), "coherence": coherence}
     flags = {} if agreed.accepted else {"refinement_rejected": agreed.why}
     correction = TrackCorrection(knots_s, prior.tracks(found))
     return Refinement(correction, std_m, agreed.accepted, agreed.why, report, flags)
@@ -124,9 +125,11 @@ def _solved(ground: Ground, prior: Prior, used: Bools) -> Floats:
 
 
 def _coherence(ground: Ground, prior: Prior, unknowns: Floats, used: Bools) -> tuple[float, float]:
-    """Return the mean coherence of the tiles used, and how many cells they hold."""
+    """Return the mean coherence of the tiles used, and the share of their cells that counts."""
     tracks = prior.tracks(unknowns)
     agreements = ground.agreements(tracks, used)
     weights = np.concatenate([[tile.cells for tile in one.tiles] for one in agreements])
     values = np.concatenate([np.abs(one.coherence(tracks)) for one in agreements])
-    return float(weights @ values / max(float(weights.sum()), 1e-300)), float(weights.sum() / len(agreements))
+    cells = SAMPLING**2 * sum(len(tile.patch.pixels_m) for tile, one in zip(ground.tiles, used, strict=True) if one)
+    total = float(weights.sum())
+    return float(weights @ values / max(total, 1e-300)), total / (cells * len(agreements))
