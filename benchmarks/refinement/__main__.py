@@ -15,8 +15,15 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
+import numpy as np
+
+from apertura.refinement.agreement import Ground
+from apertura.refinement.blocks import Blocks
 from apertura.refinement.outcome import Refinement
+from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.refine import refine
+from apertura.refinement.speckle import refined_by_speckle
+from apertura.refinement.tiles import tiles
 from apertura.scene.terrain import FlatGround
 from benchmarks.refinement.cases import Case, case
 from benchmarks.refinement.measures import UNCORRECTED, image_seconds, judge
@@ -31,6 +38,17 @@ def refined(one: Case) -> Refinement:
     return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
 
 
+def by_speckle(one: Case) -> Refinement:
+    """Return what ground without points tells."""
+    lasting_s = min(errors.correlation_s for errors in one.errors.values())
+    time_s = one.sightings[0].time_s
+    knots_s = np.arange(time_s[0] + lasting_s / 20, time_s[-1], lasting_s / 10)
+    prior = Prior({node: NodePrior.of(errors, knots_s, np.eye(3)) for node, errors in one.errors.items()})
+    pairs = [Blocks.of(sighting, knots_s) for sighting in one.sightings]
+    found = tiles(one.sightings, GRID, FlatGround(0.0), lasting_s=lasting_s)
+    return refined_by_speckle(Ground.of(pairs, found), prior, knots_s)
+
+
 def left(_: Case) -> Refinement:
     """Return the logs as they are."""
     return Refinement(UNCORRECTED, {}, accepted=False, why="left as it is")
@@ -41,7 +59,12 @@ def told(one: Case) -> Refinement:
     return Refinement(one.truth, {}, accepted=True, why="the truth")
 
 
-ATTEMPTS: Mapping[str, Callable[[Case], Refinement]] = {"refine": refined, "none": left, "truth": told}
+ATTEMPTS: Mapping[str, Callable[[Case], Refinement]] = {
+    "refine": refined,
+    "speckle": by_speckle,
+    "none": left,
+    "truth": told,
+}
 
 
 def keys(asked: str) -> Iterator[Key]:

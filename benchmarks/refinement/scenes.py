@@ -75,6 +75,11 @@ def _points_over_clutter(above_db: float) -> Callable[[np.random.Generator], Sca
     return scene
 
 
+def _field(generator: np.random.Generator) -> Scatterers:
+    """Speckle that goes on beyond the scene on all sides: no edge of it is seen."""
+    return _clutter(60_000, generator, (-18.0, 1.0, 18.0, 37.0))
+
+
 def _dense(generator: np.random.Generator) -> Scatterers:
     """Fully developed speckle: three scatterers in a cell, no point."""
     return _clutter(40_000, generator)
@@ -87,16 +92,19 @@ SCENES: Mapping[str, Callable[[np.random.Generator], Scatterers]] = {
     "clutter+10": _points_over_clutter(10.0),
     "clutter+20": _points_over_clutter(20.0),
     "dense": _dense,
+    "field": _field,
 }
 
 
-def _clutter(count: int, generator: np.random.Generator) -> Scatterers:
+def _clutter(
+    count: int, generator: np.random.Generator, area_m: tuple[float, float, float, float] = AREA_M
+) -> Scatterers:
     parts = generator.standard_normal((2, count)) / np.sqrt(2)
-    return Scatterers(_spread(count, generator), parts[0] + 1j * parts[1], np.zeros(0, np.int64))
+    return Scatterers(_spread(count, generator, area_m), parts[0] + 1j * parts[1], np.zeros(0, np.int64))
 
 
-def _spread(count: int, generator: np.random.Generator) -> Floats:
-    east, north, far_east, far_north = AREA_M
+def _spread(count: int, generator: np.random.Generator, area_m: tuple[float, float, float, float] = AREA_M) -> Floats:
+    east, north, far_east, far_north = area_m
     places = generator.uniform((east, north), (far_east, far_north), (count, 2))
     return np.concatenate([places, np.zeros((count, 1))], axis=1)
 

@@ -1,7 +1,7 @@
 """What every result is made from: files, other results, settings. Rules, steps and checks ask here.
 
 A result is what one rule writes. Its manifest, written last, names its files and what they were made from; another
-file, another setting or other code (`apertura.steps.code`) makes it stale, whatever the times of files say.
+file, setting or code (`apertura.steps.code`) makes it stale, whatever the times of files say.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -164,13 +164,13 @@ def _layers(campaign: Campaign, flight: str, pair: str) -> Result:
 def _coverage(campaign: Campaign) -> Result:
     pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
     made = [campaign.manifest(stage, *pair) for pair in pairs for stage in ("echo", "layers")]
-    sources = (*made, campaign.manifest("scene"))
-    return Result(campaign.manifest("coverage"), sources, {"campaign": campaign.settings.campaign})
+    named = {"campaign": campaign.settings.campaign}
+    return Result(campaign.manifest("coverage"), (*made, campaign.manifest("scene")), named)
 
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:
-    sources = _seen(campaign, flight, [pair], "echo")
-    return Result(campaign.manifest("profile", flight, pair), sources, campaign.relevant("profile", pair))
+    seen = _seen(campaign, flight, [pair], "echo")
+    return Result(campaign.manifest("profile", flight, pair), seen, campaign.relevant("profile", pair))
 
 
 def _refined_track(campaign: Campaign, flight: str) -> Result:
@@ -200,8 +200,7 @@ def _assessment(campaign: Campaign, flight: str) -> Result:
 def _cube(campaign: Campaign) -> Result:
     flights = campaign.image_flights
     images = [campaign.manifest("image", flight.name, pair) for flight in flights for pair in flight.pairs]
-    assessed = [campaign.manifest("assessment", flight.name) for flight in flights]
-    sources = (*images, *assessed, campaign.manifest("scene"))
+    sources = (*images, *(campaign.manifest("assessment", one.name) for one in flights), campaign.manifest("scene"))
     return Result(campaign.manifest("cube"), sources, {"tile_px": campaign.settings.processing.tile_px})
 
 
@@ -238,7 +237,6 @@ def _heights(campaign: Campaign) -> list[str]:
 
 
 def _ground(campaign: Campaign) -> list[str]:
-    """Return the grid and, where there is a DEM, its heights."""
     return [campaign.manifest("scene"), *([campaign.manifest("terrain")] if campaign.settings.scene.dem else [])]
 
 

@@ -1,0 +1,140 @@
+"""What two pairs of one transmitter see alike of ground without points, and what that tells of the tracks."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from apertura.echo.compression import window_weights
+from apertura.focus.inputs import PhaseHistory
+from apertura.geometry.aperture import Aperture
+from apertura.geometry.track_correction import TrackCorrection
+from apertura.imaging.range_profiles import range_compress
+from apertura.refinement.agreement import Ground
+from apertura.refinement.blocks import Blocks
+from apertura.refinement.gauge import Gauge
+from apertura.refinement.inputs import Sighting, TrackErrors
+from apertura.refinement.prior import NodePrior, Prior
+from apertura.refinement.solve import minimal
+from apertura.refinement.speckle import refined_by_speckle
+from apertura.refinement.tiles import tiles
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround
+from benchmarks.refinement.echoes import transfer
+from benchmarks.refinement.scenes import Scatterers
+
+FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
+TIME_S = 0.05 * np.arange(600)
+KNOTS_S = 0.05 + 0.1 * np.arange(300)
+GRID, GROUND = SceneGrid("local", -9.0, 25.0, 0.1, (200, 180)), FlatGround(0.0)
+ERRORS = TrackErrors((0.01, 0.01, 0.01))
+PRIOR = Prior({node: NodePrior.of(ERRORS, KNOTS_S, np.eye(3)) for node in ("a", "b")})
+
+
+def flown(ahead_m):
+    return np.stack([TIME_S - 15 + ahead_m, 0 * TIME_S, np.full(600, 10.0)], -1)
+
+
+def speckle(generator):
+    """A scatterer to a resolution cell, beyond the grid on all sides."""
+    places = np.concatenate([generator.uniform((-14, 2), (14, 32), (30_000, 2)), np.zeros((30_000, 1))], axis=1)
+    amplitude = generator.standard_normal((2, 30_000)).T @ [1, 1j]
+    return Scatterers(places, amplitude, np.zeros(0, int))
+
+
+@cache
+def seen(seed, ahead_m=4.7):
+    """Pairs a-a and a-b over speckle, 1 cm wrong in each axis, and the unknowns of the truth."""
+    of_tracks, of_scene = np.random.default_rng(seed).spawn(2)
+    unknowns = of_tracks.standard_normal(PRIOR.size)
+    truth, ground = TrackCorrection(KNOTS_S, PRIOR.tracks(unknowns)), speckle(of_scene)
+    sightings = []
+    for pair in ("a-a", "a-b"):
+        logged = Aperture(flown(0.0), flown(ahead_m if pair == "a-b" else 0.0))
+        between_m = logged.tx_m - logged.rx_m if pair == "a-b" else None
+        longer_m = None if between_m is None else -truth.sidelink_m(between_m, pair, TIME_S)
+        echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, further_m=longer_m)
+        history = PhaseHistory(echo, FREQUENCY_HZ, window_weights("hann", 128), np.zeros(600), logged)
+        sightings.append(Sighting(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
+    return sightings, unknowns
+
+
+def ground_of(sightings):
+    return Ground.of([Blocks.of(one, KNOTS_S) for one in sightings], tiles(sightings, GRID, GROUND, lasting_s=1.0))
+
+
+def test_tiles_share_out_the_scene():
+    sightings, _ = seen(1)
+    found = tiles(sightings, GRID, GROUND, lasting_s=1.0)
+    area = sum(np.linalg.norm(np.cross(*tile.sides_m)) for tile in found)
+    assert area == pytest.approx(360.0)
+    pixels = np.concatenate([tile.patch.pixels_m for tile in found])
+    assert (np.abs(pixels[:, :2] - (0, 15)) < (9, 10)).all()
+    assert len(np.unique(pixels.round(6), axis=0)) == len(pixels)
+
+
+def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
+    sightings, unknowns = seen(1)
+    ground = ground_of(sightings)
+    coherence = [
+        np.abs(ground.agreements(tracks)[0].coherence(tracks)).mean()
+        for tracks in (PRIOR.tracks(0 * unknowns), PRIOR.tracks(unknowns))
+    ]
+    assert coherence[0] < 0.75 * coherence[1]
+    assert coherence[1] > 0.75
+
+
+def test_the_gradient_is_that_of_the_value():
+    sightings, unknowns = seen(1)
+    tracks = PRIOR.tracks(0.3 * unknowns)
+    [agreement] = ground_of(sightings).agreements(PRIOR.tracks(0 * unknowns))
+    _, gradient = agreement(tracks)
+    generator = np.random.default_rng(3)
+    for way in (PRIOR.tracks(unknowns), PRIOR.tracks(generator.standard_normal(PRIOR.size))):
+        values = [agreement({n: tracks[n] + step * way[n] for n in way})[0] for step in (-0.01, 0.01)]
+        slope = sum(float((gradient[node] * way[node]).sum()) for node in way)
+        assert (values[1] - values[0]) / 0.02 == pytest.approx(slope, rel=3e-3)
+
+
+def test_agreement_mends_what_blurs_speckle():
+    """Path errors of the pair that sends and receives, less what only moves the image, fall as eq. 23 says."""
+    left = []
+    for seed in (1, 2):
+        sightings, unknowns = seen(seed)
+        ground, found = ground_of(sightings), np.zeros(PRIOR.size)
+        for _ in range(2):
+            [agreement] = ground.agreements(PRIOR.tracks(found))
+            found = minimal(agreement, PRIOR, Gauge.none(PRIOR.size), found, iterations=15)
+        left.append(blur_m(PRIOR.tracks(found - unknowns)["a"]) / blur_m(PRIOR.tracks(unknowns)["a"]))
+    assert max(left) < 0.75, left
+
+
+def blur_m(moved_m):
+    """RMS of the path error at the middle of the scene that is no shift of it."""
+    place = np.array([0.0, 15, 0])
+    along = np.stack([np.interp(KNOTS_S, TIME_S, axis) for axis in flown(0.0).T], -1) - place
+    unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+    path = 2 * np.einsum("ki,ki->k", unit, moved_m)
+    shift = np.concatenate([np.ones((len(unit), 1)), unit[:, :2]], axis=1)
+    return float(np.std(path - shift @ np.linalg.lstsq(shift, path)[0]))
+
+
+def test_one_pair_has_nothing_to_agree_with():
+    sightings, unknowns = seen(1)
+    ground = ground_of(sightings[:1])
+    assert ground.agreements(PRIOR.tracks(unknowns)) == []
+    found = refined_by_speckle(ground, PRIOR, KNOTS_S)
+    assert not found.accepted
+    assert "one pair" in found.flags["refinement_too_few_patches"]
+
+
+def test_speckle_is_believed_by_the_coherence_of_tiles_that_were_not_fitted():
+    sightings, _ = seen(1)
+    found = refined_by_speckle(ground_of(sightings), PRIOR, KNOTS_S)
+    assert found.accepted, found.why
+    unlike = [sightings[0], replace(sightings[1], profiles=seen(2)[0][1].profiles)]
+    refused = refined_by_speckle(ground_of(unlike), PRIOR, KNOTS_S)
+    assert not refused.accepted
+    assert not np.any(refused.correction.moved_m["a"])
+    assert "not fitted" in refused.flags["refinement_rejected"]
