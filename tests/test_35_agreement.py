@@ -53,7 +53,7 @@ def seen(seed, ahead_m=4.7):
     for pair in ("a-a", "a-b"):
         logged = Aperture(flown(0.0), flown(ahead_m if pair == "a-b" else 0.0))
         between_m = logged.tx_m - logged.rx_m if pair == "a-b" else None
-        longer_m = None if between_m is None else -truth.sidelink_m(between_m, pair, TIME_S)
+        longer_m = -truth.longer_m(pair, TIME_S, between_m)
         echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, further_m=longer_m)
         history = PhaseHistory(echo, FREQUENCY_HZ, window_weights("hann", 128), np.zeros(600), logged)
         sightings.append(Sighting(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
