@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.agreement import Ground
 from apertura.refinement.blocks import Blocks, PatchEcho
 from apertura.refinement.candidates import bright_places, east_north_up
 from apertura.refinement.evidence import Evidence, gains_db, range_shifts
@@ -19,7 +20,9 @@ from apertura.refinement.patches import Patch, patch_at, spread_out
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
 from apertura.refinement.solve import Problem, State
+from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.ties import disagreement, tied
+from apertura.refinement.tiles import tiles
 from apertura.refinement.uncertainty import MOST_RATIO, remaining
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
@@ -76,7 +79,8 @@ def refine(
     """
     search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
-        return search.refused(errors)
+        found = search.by_speckle(grid, terrain, errors)
+        return found if found is not None and found.accepted else search.refused(errors, found)
     state, evidence = search.judged()
     left = remaining(search.problem, state)
     unknowns, ties = tied(search.problem, state.unknowns, reference_points, search.axes)
@@ -157,8 +161,19 @@ class Search:
         ]
         return states[int(np.argmin(values))]
 
-    def refused(self, errors: Mapping[str, TrackErrors]) -> Refinement:
-        """Return that too few points stand out."""
+    def by_speckle(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Refinement | None:
+        """Return what the ground between points asks for; None where one pair alone saw it."""
+        problem = self.problem
+        if len(problem.pairs) < 2:
+            return None
+        lasting_s = min(one.correlation_s for one in errors.values())
+        found = tiles([blocks.sighting for blocks in problem.pairs], grid, terrain, lasting_s=lasting_s)
+        pixels = sum(len(tile.patch.pixels_m) for tile in found)
+        every = 1 + _BYTES * pixels * len(problem.knots_s) * len(problem.pairs) // MOST_BYTES
+        return refined_by_speckle(Ground.of(problem.pairs, found[::every]), problem.prior, problem.knots_s)
+
+    def refused(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None) -> Refinement:
+        """Return that too few points stand out, and that the ground between them does not help either."""
         line = (
             f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
             f"{LEAST_PATCHES} are needed"
@@ -169,6 +184,8 @@ class Search:
             node: np.tile(np.abs(np.array(one.std_m) @ self.axes), (len(knots_s), 1)) for node, one in errors.items()
         }
         report: dict[str, Any] = {"patches": self.points}
+        if by_speckle is not None:
+            line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}
         flags = {"refinement_too_few_patches": line}
         return Refinement(TrackCorrection(knots_s, nothing), std_m, False, line, report, flags)
 
