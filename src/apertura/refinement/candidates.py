@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,15 +71,18 @@ class Candidates:
         chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
         return cls([patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen], points, axes)
 
-    def refused(self, errors: Mapping[str, TrackErrors]) -> Refinement:
-        """Return that too few points stand out: no node is moved."""
+    def refused(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
+        """Return that too few points stand out, and what else was tried in vain: no node is moved."""
         line = (
             f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
             f"{LEAST_PATCHES} are needed"
         )
+        report: dict[str, Any] = {"patches": self.points}
+        if by_speckle is not None:
+            line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}
         still = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
         std_m = {node: one.along(self.axes)[None] for node, one in errors.items()}
-        return Refinement(still, std_m, False, line, {"patches": self.points}, {"refinement_too_few_patches": line})
+        return Refinement(still, std_m, False, line, report, {"refinement_too_few_patches": line})
 
 
 def bright_places(

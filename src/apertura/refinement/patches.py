@@ -18,10 +18,9 @@ MOST_PATCHES, CLEAR = 32, 20.0
 LEAST_PATCHES = 4
 """With fewer, none would be left to judge by."""
 
-MOST_BYTES = 2**30
-"""Of what blocks add to patches: with more, fewer patches are looked at."""
+MOST_VALUES = 2**27
+"""Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are looked at."""
 
-_BYTES = 8  # of a complex64
 _ENOUGH = 12 * CLEAR
 _SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are worse held
 _RANGE_CELLS = 1.5  # half of a patch along the line of sight
@@ -129,7 +128,7 @@ def affordable(values: Sequence[int]) -> int:
     >>> affordable([2**24] * 32)
     8
     """
-    return max(int((_BYTES * np.cumsum(values) <= MOST_BYTES).sum()), min(LEAST_PATCHES, len(values)))
+    return max(int((np.cumsum(values) <= MOST_VALUES).sum()), min(LEAST_PATCHES, len(values)))
 
 
 def bandwidth_hz(profiles: Profiles) -> float:

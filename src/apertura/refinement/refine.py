@@ -7,17 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.refinement.agreement import Ground
 from apertura.refinement.blocks import Blocks
 from apertura.refinement.candidates import Candidates
 from apertura.refinement.evidence import Evidence, gains_db, range_shifts
 from apertura.refinement.gauge import Gauge, find_gauge
 from apertura.refinement.inputs import ReferencePoint, Sighting, TrackErrors
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.patches import LEAST_PATCHES, affordable
+from apertura.refinement.patches import LEAST_PATCHES, MOST_VALUES, affordable
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.prominent import prominent
 from apertura.refinement.solve import Problem, State
+from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.ties import disagreement, tied
+from apertura.refinement.tiles import tiles
 from apertura.refinement.uncertainty import MOST_RATIO, remaining
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
@@ -61,7 +64,8 @@ def refine(
     """
     search = Search.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
-        return search.found.refused(errors)
+        found = search.by_speckle(grid, terrain, errors)
+        return found if found is not None and found.accepted else search.found.refused(errors, found)
     state, evidence = search.judged()
     left = remaining(search.problem, state)
     unknowns, ties = tied(search.problem, state.unknowns, reference_points, search.axes)
@@ -143,6 +147,17 @@ class Search:
             for state in states
         ]
         return states[int(np.argmin(values))]
+
+    def by_speckle(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Refinement | None:
+        """Return what the ground between points asks for; None where one pair alone saw it."""
+        problem = self.problem
+        if len(problem.pairs) < 2:
+            return None
+        lasting_s = min(one.correlation_s for one in errors.values())
+        found = tiles([blocks.sighting for blocks in problem.pairs], grid, terrain, lasting_s=lasting_s)
+        pixels = sum(len(tile.patch.pixels_m) for tile in found)
+        every = 1 + pixels * len(problem.knots_s) * len(problem.pairs) // MOST_VALUES
+        return refined_by_speckle(Ground.of(problem.pairs, found[::every]), problem.prior, problem.knots_s)
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:
