@@ -19,8 +19,9 @@ from apertura.refinement.objective import Sharpness
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.refine import Search, refine
 from apertura.scene.terrain import FlatGround
-from benchmarks.refinement import case, judge
-from benchmarks.refinement.scenes import GRID
+from apertura.study.refinement.cases import case
+from apertura.study.refinement.measures import judge
+from apertura.study.refinement.scenes import GRID
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = np.linspace(0, 30, 300)

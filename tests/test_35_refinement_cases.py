@@ -7,11 +7,11 @@ from scenes import compiled
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
 from apertura.refinement.inputs import TrackErrors
-from benchmarks.refinement import PROBES_M, case, judge
-from benchmarks.refinement.echoes import transfer
-from benchmarks.refinement.flights import drawn_errors
-from benchmarks.refinement.measures import peaks
-from benchmarks.refinement.scenes import Scatterers
+from apertura.study.refinement.cases import PROBES_M, case
+from apertura.study.refinement.echoes import transfer
+from apertura.study.refinement.flights import drawn_errors
+from apertura.study.refinement.measures import judge, peaks
+from apertura.study.refinement.scenes import Scatterers
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 

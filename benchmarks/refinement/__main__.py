@@ -25,9 +25,9 @@ from apertura.refinement.refine import refine
 from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.tiles import tiles
 from apertura.scene.terrain import FlatGround
-from benchmarks.refinement.cases import Case, case
-from benchmarks.refinement.measures import UNCORRECTED, image_seconds, judge
-from benchmarks.refinement.scenes import GRID
+from apertura.study.refinement.cases import Case, case
+from apertura.study.refinement.measures import UNCORRECTED, image_seconds, judge
+from apertura.study.refinement.scenes import GRID
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")

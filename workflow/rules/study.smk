@@ -2,6 +2,7 @@
 from apertura.provenance import code_sha256
 from apertura.atlas.causes import CAUSES
 from apertura.study.commands import PAPER_FIGURES, PAPER_PARTS, PAPER_READS
+from apertura.study.refinement.outcomes import KINDS
 from apertura.study.stability.sweeps import CHOICES, SWEEPS
 
 CAMPAIGN = "results/study/paper/campaigns/{experiment}"
@@ -14,6 +15,7 @@ wildcard_constraints:
     impairment="|".join(SWEEPS),
     method="|".join(CHOICES),
     cause="|".join(CAUSES),
+    scene="|".join(KINDS),
 
 
 localrules:
@@ -33,6 +35,8 @@ rule stability:
         expand("results/study/stability/{impairment}.png", impairment=SWEEPS),
         "results/study/atlas/summary.csv",
         expand("results/study/atlas/{cause}.png", cause=CAUSES),
+        "results/study/refinement/losses.png",
+        expand("results/study/refinement/{scene}.png", scene=KINDS),
 
 
 rule paper_campaign:
@@ -255,3 +259,66 @@ rule atlas_summary:
         "which mistakes are seen"
     shell:
         "apertura study atlas-summary > {log} 2>&1"
+
+
+rule refinement_sweep:
+    output:
+        "results/study/refinement/parts/{scene}.csv",
+    log:
+        "results/logs/study/refinement.{scene}.log",
+    benchmark:
+        "results/benchmarks/study/refinement.{scene}.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.refinement.outcomes"),
+    message:
+        "refining tracks over {wildcards.scene}"
+    shell:
+        "apertura study refinement-sweep {wildcards.scene} > {log} 2>&1"
+
+
+rule refinement_chart:
+    input:
+        expand("results/study/refinement/parts/{scene}.csv", scene=KINDS),
+    output:
+        "results/study/refinement/losses.csv",
+        "results/study/refinement/losses.png",
+    log:
+        "results/logs/study/refinement.chart.log",
+    benchmark:
+        "results/benchmarks/study/refinement.chart.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+    params:
+        code=code_sha256("apertura.study.refinement.charts"),
+    message:
+        "charting what refinement leaves"
+    shell:
+        "apertura study refinement-chart > {log} 2>&1"
+
+
+rule refinement_picture:
+    output:
+        "results/study/refinement/{scene}.png",
+    log:
+        "results/logs/study/refinement.{scene}.png.log",
+    benchmark:
+        "results/benchmarks/study/refinement.{scene}.png.tsv"
+    conda:
+        "../../environment.yml"
+    threads: 1
+    resources:
+        mem_mb=lambda wildcards, attempt: 1500 * attempt,
+    params:
+        code=code_sha256("apertura.study.refinement.pictures"),
+    message:
+        "images of {wildcards.scene} before and after"
+    shell:
+        "apertura study refinement-picture {wildcards.scene} > {log} 2>&1"

@@ -10,11 +10,13 @@ import typer
 from apertura.errors import CampaignError
 
 app = typer.Typer(
-    no_args_is_help=True, help="The paper's claims, the stability of every correction, and what spoils an image."
+    no_args_is_help=True,
+    help="The paper's claims, the stability of every correction, tracks refined by images, and what spoils an image.",
 )
 
 PAPER = Path("results/study/paper")
 STABILITY = Path("results/study/stability")
+REFINEMENT = Path("results/study/refinement")
 _LOSS = "losses:loss_claims"
 PAPER_PARTS = {
     "parameters": "parameters:parameter_claims",
@@ -130,3 +132,39 @@ def stability_summary(folder: Folder = STABILITY) -> None:
 
     draw_summary(write_summary(folder), folder / "summary.png")
     typer.echo(write_sidelink_tables(folder))
+
+
+@app.command()
+def refinement_sweep(scene: str, folder: Folder = REFINEMENT) -> None:
+    """Refine tracks with ever larger errors over one kind of scene, parts/SCENE.csv."""
+    from apertura.study.refinement.outcomes import KINDS, run_kind
+    from apertura.study.tables import write_table
+
+    require("scene", scene, KINDS)
+    path = folder / "parts" / f"{scene}.csv"
+    write_table(path, run_kind(scene))
+    typer.echo(path)
+
+
+@app.command()
+def refinement_chart(folder: Folder = REFINEMENT) -> None:
+    """Put the scenes together, loss against sigma with and without refinement: losses.csv and .png."""
+    from apertura.study.refinement.charts import draw_losses
+    from apertura.study.refinement.outcomes import KINDS, Outcome
+    from apertura.study.tables import read_table, write_table
+
+    rows = [row for scene in KINDS for row in read_table(folder / "parts" / f"{scene}.csv", Outcome)]
+    write_table(folder / "losses.csv", rows)
+    draw_losses(rows, folder / "losses.png")
+    typer.echo(folder / "losses.png")
+
+
+@app.command()
+def refinement_picture(scene: str, folder: Folder = REFINEMENT) -> None:
+    """Draw one case of a scene before and after, with the errors of its tracks, SCENE.png."""
+    from apertura.study.refinement.outcomes import KINDS
+    from apertura.study.refinement.pictures import draw_case
+
+    require("scene", scene, KINDS)
+    draw_case(scene, folder / f"{scene}.png")
+    typer.echo(folder / f"{scene}.png")

@@ -14,12 +14,12 @@ from apertura.geometry.track_correction import TrackCorrection
 from apertura.imaging.range_profiles import range_compress
 from apertura.refinement.inputs import Sighting, TrackErrors
 from apertura.scene.terrain import FlatGround
-from benchmarks.refinement.echoes import transfer
-from benchmarks.refinement.flights import FLIGHTS, NODES, Flight, drawn_errors
-from benchmarks.refinement.scenes import GRID, SCENES, Scatterers
+from apertura.study.refinement.echoes import transfer
+from apertura.study.refinement.flights import FLIGHTS, NODES, Flight, drawn_errors
+from apertura.study.refinement.scenes import GRID, SCENES, Scatterers
 
 BANDWIDTH_HZ, SUBCARRIERS = 409.6e6, 128
-FREQUENCY_HZ = 1.2e9 + BANDWIDTH_HZ / SUBCARRIERS * np.arange(SUBCARRIERS)
+FREQUENCY_HZ: NDArray[np.float64] = 1.2e9 + BANDWIDTH_HZ / SUBCARRIERS * np.arange(SUBCARRIERS, dtype=np.float64)
 PAIRS = {"mono": ("uav1-uav1",), "bi": ("uav1-uav2",), "joint": ("uav1-uav1", "uav1-uav2")}
 PROBES_M = np.array([(east, north, 0.0) for east in (-6.0, 0.0, 6.0) for north in (6.0, 10.0, 15.0, 20.0, 24.0)])
 PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)

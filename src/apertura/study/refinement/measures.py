@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.focus.engines import native
+from apertura.focus.engines.native_tables import Tables
 from apertura.geometry.track_correction import TrackCorrection
 from apertura.refinement.inputs import Sighting
-from benchmarks.refinement.cases import PROBES_M, Case
-from benchmarks.refinement.scenes import GRID
+from apertura.study.refinement.cases import PROBES_M, Case
+from apertura.study.refinement.scenes import GRID
 
 UNCORRECTED = TrackCorrection(np.zeros(1), {})
 _LOOKS = ((33, 25), (9, 9), (9, 9))  # places east and north of an ever closer look for a peak
@@ -48,7 +49,7 @@ def peaks(
     return Peaks(height, place)
 
 
-def _peak(tables: native.Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tuple[float, Floats]:
+def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tuple[float, Floats]:
     east, north = reach_m
     for columns, rows in _LOOKS:
         places = np.stack(np.meshgrid(np.linspace(-east, east, columns), np.linspace(-north, north, rows)), -1)

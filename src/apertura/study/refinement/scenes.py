@@ -110,7 +110,7 @@ def _spread(count: int, generator: np.random.Generator, area_m: tuple[float, flo
 
 
 def _phases(count: int, generator: np.random.Generator) -> NDArray[np.complex128]:
-    return np.exp(2j * np.pi * generator.random(count))
+    return np.asarray(np.exp(2j * np.pi * generator.random(count)))
 
 
 def _area_m2() -> float:

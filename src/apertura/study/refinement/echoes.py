@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
 from apertura.interpolation import kaiser_window
-from benchmarks.refinement.scenes import Scatterers
+from apertura.study.refinement.scenes import Scatterers
 
 _TAPS = 8
 _ROOM = 2
@@ -79,7 +79,7 @@ def _response(count: int) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _add(ranges, scatterers, legs, further, per_m, tables):
+def _add(ranges, scatterers, legs, further, per_m, tables):  # type: ignore[no-untyped-def]
     """Add the echoes of all scatterers to the ranges (pulse, sample), of which the last taps are the first again."""
     places, amplitude = scatterers
     tx, rx = legs
