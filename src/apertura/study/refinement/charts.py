@@ -31,7 +31,7 @@ def draw_losses(outcomes: Sequence[Outcome], path: Path) -> None:
         rows = [one for one in outcomes if one.scene == scene]
         _draw_scene(axes, rows)
         _mark_said(axes, rows)
-        axes.set_title(f"{KINDS[scene]}\n{_tally(rows)}", fontsize=10)
+        axes.set_title(f"{KINDS[scene]}\n{tally(rows)}", fontsize=10)
         axes.set_xlabel("σ of each log per axis, over 1 s, cm")
     _scale(panels[0], outcomes)
     seeds = len({one.seed for one in outcomes})
@@ -72,7 +72,14 @@ def _mark_said(axes: Axes, rows: Sequence[Outcome]) -> None:
     )  # fmt: skip
 
 
-def _tally(rows: Sequence[Outcome]) -> str:
+def tally(rows: Sequence[Outcome]) -> str:
+    """Return how many refinements were accepted, and how many of those did harm.
+
+    Examples
+    --------
+    >>> tally([Outcome("five", 1.0, seed, 1.2, 0.1, 0.1, ACCEPTED, "", "") for seed in (1, 2)])
+    '2 of 2 accepted, 0 of them worse than the logs'
+    """
     accepted = [one for one in rows if one.said in (ACCEPTED, FLAGGED)]
     worse = [one for one in accepted if one.product_loss_db > one.loss_db]
     return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of them worse than the logs"
