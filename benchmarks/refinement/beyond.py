@@ -12,10 +12,10 @@ from apertura.geometry.track_correction import TrackCorrection
 from apertura.refinement.inputs import TrackErrors
 from apertura.refinement.refine import refine
 from apertura.scene.terrain import FlatGround
-from benchmarks.refinement.cases import PAIRS, PROBES_M, Case, sighting
-from benchmarks.refinement.flights import FLIGHTS, NODES, drawn_errors
-from benchmarks.refinement.measures import judge
-from benchmarks.refinement.scenes import GRID, SCENES, Scatterers
+from apertura.study.refinement.cases import PAIRS, PROBES_M, Case, sighting
+from apertura.study.refinement.flights import FLIGHTS, NODES, drawn_errors
+from apertura.study.refinement.measures import judge
+from apertura.study.refinement.scenes import GRID, SCENES, Scatterers
 
 SIGMA_M = 0.01
 OTHERS = {

@@ -104,7 +104,23 @@ def sighting(
     snr_db: float | None,
     generator: np.random.Generator,
 ) -> Sighting:
-    """Return what a pair saw of some scatterers, given back the sidelink's length that the logs have."""
+    """Return what a pair saw of some scatterers, given back the sidelink's length that the logs have.
+
+    Parameters
+    ----------
+    pair
+        transmitter-receiver, one of `NODES` each.
+    flight
+        Where the logs have the nodes.
+    truth
+        What must be added to the logs.
+    scatterers
+        What echoes.
+    snr_db
+        As of `case`; None is without noise.
+    generator
+        Of the noise.
+    """
     tx, rx = pair.split("-")
     logged = Aperture(flight.logged_m[tx], flight.logged_m[rx])
     between_m = None if tx == rx else logged.tx_m - logged.rx_m

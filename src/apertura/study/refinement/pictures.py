@@ -1,8 +1,9 @@
 """One case of a scene before and after: images from logs, refined and true tracks, and the tracks' errors."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 
 from apertura.focus.engines import native
 from apertura.geometry.track_correction import TrackCorrection
+from apertura.refinement.inputs import Sighting
 from apertura.refinement.outcome import Refinement
 from apertura.scene.grid import SceneGrid
 from apertura.study.png import save_png
 from apertura.study.refinement.cases import Case
+from apertura.study.refinement.flights import NODES
 from apertura.study.refinement.measures import UNCORRECTED
 from apertura.study.refinement.outcomes import KINDS, drawn, outcome_of, refined
 from apertura.study.refinement.scenes import GRID
@@ -26,7 +29,14 @@ DEPTH_DB = 35.0
 _MIDDLE_M, _WITHIN_M = (0.0, 15.0), 4.0  # what is looked at closely is the brightest of the scene's middle
 _CLOSE_M, _FINE_M = 3.0, 0.015
 _AXES = ("east", "north", "up")
-_LINES = {"uav1": "#0072b2", "uav2": "#d55e00"}
+_PANELS: list[Any] = [
+    ["whole 0", "whole 1", "whole 2"],
+    ["close 0", "close 1", "close 2"],
+    [*_AXES],
+    ["path"] * 3,
+]
+_COLOURS = ("#0072b2", "#d55e00")
+_LETTERS = 110  # of a line of the title
 
 Floats = NDArray[np.float64]
 
@@ -45,43 +55,49 @@ def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int =
     """
     one = drawn(scene, sigma_cm, seed)
     found = refined(one)
+    used = found.correction if found.accepted else UNCORRECTED
     figure = Figure(figsize=(12.5, 16), layout="constrained")
-    rows = figure.subplots(3, 3, height_ratios=(1.15, 1.0, 0.75))
-    _draw_images(figure, rows[:2], one, found)
-    for number, (axes, name) in enumerate(zip(rows[2], _AXES, strict=True)):
-        _draw_errors(axes, one, found, number)
-        axes.set_title(name)
-    rows[2][0].set_ylabel("Error of the tracks, cm")
-    rows[2][-1].legend(fontsize=8, ncols=2)
+    panels = figure.subplot_mosaic(_PANELS, height_ratios=(1.2, 1.1, 0.6, 0.6))
+    place_m = _draw_images(figure, panels, one, {"logs": UNCORRECTED, _named(found): used, "true tracks": one.truth})
+    for number, name in enumerate(_AXES):
+        _draw_errors(panels[name], one, used, number)
+        panels[name].set_title(name, fontsize=10)
+    panels[_AXES[0]].set_ylabel("Error of the tracks, cm")
+    _draw_paths(panels["path"], one, used, place_m)
     figure.suptitle(_title(one, found), fontsize=12)
     save_png(figure, path)
+
+
+def _named(found: Refinement) -> str:
+    return "refined tracks" if found.accepted else "refused: the logs stay"
 
 
 def _title(one: Case, found: Refinement) -> str:
     row = outcome_of(one, found)
     flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flag"
     head = (
-        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm per axis: loss at 15 places that were not fitted "
-        f"{row.loss_db:.2f} dB from the logs, {row.product_loss_db:.2f} dB as the product leaves it"
+        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at places that were not fitted {row.loss_db:.2f} dB from "
+        f"the logs, {row.product_loss_db:.2f} dB as the product leaves it"
     )
-    return f"{fill(head, 120)}\n{fill(f'{row.said}: {row.why}; {flags}', 120)}"
+    return f"{fill(head, _LETTERS)}\n{fill(f'{row.said}: {row.why}; {flags}', _LETTERS)}"
 
 
-def _draw_images(figure: Figure, rows: Sequence[Sequence[Axes]], one: Case, found: Refinement) -> None:
-    """Draw the monostatic pair's images, all in dB against the brightest of those from the true tracks."""
-    after = "refined tracks" if found.accepted else "refused: the logs stay"
-    used = found.correction if found.accepted else UNCORRECTED
-    tracks = {"logs": UNCORRECTED, after: used, "true tracks": one.truth}
-    whole = {name: image(one, correction, GRID) for name, correction in tracks.items()}
-    close = _about(_brightest(whole["true tracks"]))
-    near = {name: image(one, correction, close) for name, correction in tracks.items()}
-    for axes_row, grid, images in ((rows[0], GRID, whole), (rows[1], close, near)):
+def _draw_images(
+    figure: Figure, panels: Mapping[str, Axes], one: Case, tracks: Mapping[str, TrackCorrection]
+) -> Floats:
+    """Draw the first pair's images from each of some tracks, the last the true ones, and return what is looked at."""
+    true = image(one, one.truth, GRID)
+    place_m = _brightest(true)
+    for view, grid in (("whole", GRID), ("close", _about(place_m))):
+        images = {name: image(one, correction, grid) for name, correction in tracks.items()}
         peak = images["true tracks"].max()
-        for axes, (name, values) in zip(axes_row, images.items(), strict=True):
-            drawn_image = _draw_image(axes, values / peak, grid)
+        row = [panels[f"{view} {number}"] for number in range(len(images))]
+        for axes, (name, values) in zip(row, images.items(), strict=True):
+            shown = _draw_image(axes, values / peak, grid)
             axes.set_title(f"{name}\npeak {20 * np.log10(values.max() / peak):+.1f} dB", fontsize=10)
-        axes_row[0].set_ylabel("North, m")
-        figure.colorbar(drawn_image, ax=list(axes_row), label="dB against the true tracks' peak", pad=0.01)
+        row[0].set_ylabel("North, m")
+        figure.colorbar(shown, ax=row, label="dB against the true tracks' peak", pad=0.01, shrink=0.8)
+    return place_m
 
 
 def image(one: Case, correction: TrackCorrection, grid: SceneGrid) -> Floats:
@@ -108,14 +124,38 @@ def _draw_image(axes: Axes, magnitude: Floats, grid: SceneGrid) -> AxesImage:
     return axes.imshow(levels, cmap="magma", vmin=-DEPTH_DB, vmax=0, extent=(west, east, south, north))
 
 
-def _draw_errors(axes: Axes, one: Case, found: Refinement, number: int) -> None:
+def _draw_errors(axes: Axes, one: Case, used: TrackCorrection, number: int) -> None:
     """Draw what logs are wrong by along one axis, and what is left of it as images are formed."""
     time_s = one.truth.time_s
-    for node, colour in _LINES.items():
+    for node, colour in zip(NODES, _COLOURS, strict=True):
         wrong = one.truth.at(node, time_s)[:, number]
-        mended = found.correction.at(node, time_s)[:, number] if found.accepted else 0.0
-        axes.plot(time_s, 100 * wrong, color=colour, alpha=0.35, linewidth=1, label=f"{node}, log")
-        axes.plot(time_s, 100 * (wrong - mended), color=colour, linewidth=1.3, label=f"{node}, left")
+        _draw_pair(axes, time_s, (wrong, wrong - used.at(node, time_s)[:, number]), (node, colour))
+
+
+def _draw_paths(axes: Axes, one: Case, used: TrackCorrection, place_m: Floats) -> None:
+    """Draw by how much paths to a place are wrong, but for their mean: this is what blurs it."""
+    for sighting, colour in zip(one.sightings, _COLOURS, strict=False):
+        true, logged, now = (_path(sighting, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
+        errors = tuple(error - error.mean() for error in (true - logged, true - now))
+        _draw_pair(axes, sighting.time_s, errors, (sighting.pair, colour))
+    axes.set_title(f"path to the place looked at closely ({place_m[0]:.1f} m, {place_m[1]:.1f} m)", fontsize=10)
+    axes.set_ylabel("Error less its mean, cm")
+
+
+def _path(sighting: Sighting, tracks: TrackCorrection, place_m: Floats) -> Floats:
+    """Return (pulse,) metres: the path that tracks expect of a place's echo (docs/theory/autofocus.md, eq. 1)."""
+    aperture = tracks.aperture(sighting.profiles.aperture, sighting.pair, sighting.time_s)
+    path = aperture.path(place_m[None])[:, 0]
+    if sighting.sidelink_m is None:
+        return np.asarray(path)
+    return np.asarray(path - tracks.sidelink_m(sighting.sidelink_m, sighting.pair, sighting.time_s))
+
+
+def _draw_pair(axes: Axes, time_s: Floats, errors: tuple[Floats, Floats], named: tuple[str, str]) -> None:
+    (log, left), (name, colour) = errors, named
+    axes.plot(time_s, 100 * log, color=colour, alpha=0.35, linewidth=1, label=f"{name}, log")
+    axes.plot(time_s, 100 * left, color=colour, linewidth=1.2, label=f"{name}, left")
     axes.axhline(0, color="0.3", linewidth=0.6)
     axes.set_xlabel("Time, s")
     axes.grid(alpha=0.3)
+    axes.legend(fontsize=7, ncols=2)
