@@ -36,7 +36,7 @@ _PANELS: list[Any] = [
     ["path"] * 3,
 ]
 _COLOURS = ("#0072b2", "#d55e00")
-_LETTERS = 110  # of a line of the title
+_LETTERS = 125  # of a line of the title
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int =
         panels[name].set_title(name, fontsize=10)
     panels[_AXES[0]].set_ylabel("Error of the tracks, cm")
     _draw_paths(panels["path"], one, used, place_m)
-    figure.suptitle(_title(one, found), fontsize=12)
+    figure.suptitle(_title(one, found), fontsize=11)
     save_png(figure, path)
 
 
@@ -76,8 +76,8 @@ def _title(one: Case, found: Refinement) -> str:
     row = outcome_of(one, found)
     flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flag"
     head = (
-        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at places that were not fitted {row.loss_db:.2f} dB from "
-        f"the logs, {row.product_loss_db:.2f} dB as the product leaves it"
+        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at probes {row.loss_db:.2f} dB from the logs, "
+        f"{row.product_loss_db:.2f} dB as the product leaves it"
     )
     return f"{fill(head, _LETTERS)}\n{fill(f'{row.said}: {row.why}; {flags}', _LETTERS)}"
 
@@ -94,7 +94,8 @@ def _draw_images(
         row = [panels[f"{view} {number}"] for number in range(len(images))]
         for axes, (name, values) in zip(row, images.items(), strict=True):
             shown = _draw_image(axes, values / peak, grid)
-            axes.set_title(f"{name}\npeak {20 * np.log10(values.max() / peak):+.1f} dB", fontsize=10)
+            higher = f", peak {20 * np.log10(values.max() / peak):+.1f} dB" if view == "close" else ""
+            axes.set_title(name + higher, fontsize=10)  # pixels of the whole scene miss peaks by tenths of a decibel
         row[0].set_ylabel("North, m")
         figure.colorbar(shown, ax=row, label="dB against the true tracks' peak", pad=0.01, shrink=0.8)
     return place_m
@@ -108,7 +109,7 @@ def image(one: Case, correction: TrackCorrection, grid: SceneGrid) -> Floats:
 def _brightest(magnitude: Floats) -> Floats:
     places = GRID.positions(0.0)
     near = np.linalg.norm(places[..., :2] - _MIDDLE_M, axis=-1) < _WITHIN_M
-    return np.asarray(places[near][magnitude[near].argmax()])
+    return np.asarray(places[near][magnitude[near].argmax()].round(3) + 0.0)
 
 
 def _about(place_m: Floats) -> SceneGrid:
@@ -138,7 +139,9 @@ def _draw_paths(axes: Axes, one: Case, used: TrackCorrection, place_m: Floats) -
         true, logged, now = (_path(sighting, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
         errors = tuple(error - error.mean() for error in (true - logged, true - now))
         _draw_pair(axes, sighting.time_s, errors, (sighting.pair, colour))
-    axes.set_title(f"path to the place looked at closely ({place_m[0]:.1f} m, {place_m[1]:.1f} m)", fontsize=10)
+    axes.set_title(
+        f"path to the place looked at closely, {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10
+    )
     axes.set_ylabel("Error less its mean, cm")
 
 
