@@ -142,6 +142,17 @@ def test_a_scene_that_is_not_tried_is_told_those_that_are(command):
     assert "texture" in str(error)
 
 
+def linear_path_error(one, place_m):
+    """Of the bistatic pair, docs/theory/autofocus.md, eq. 2: the errors of both nodes along u_t - s and u_r + s."""
+    bistatic = one.sightings[1]
+    to_tx, to_rx, sidelink = (
+        leg / np.linalg.norm(leg, axis=1)[:, None]
+        for leg in (*(phase - place_m for phase in bistatic.profiles.aperture.legs), bistatic.sidelink_m)
+    )
+    tx, rx = (one.truth.at(node, bistatic.time_s) for node in ("uav1", "uav2"))
+    return ((to_tx - sidelink) * tx).sum(axis=1) + ((to_rx + sidelink) * rx).sum(axis=1)
+
+
 @compiled
 def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_takes_away(monkeypatch, tmp_path):
     one = drawn("five", 2.0, 1)
@@ -160,8 +171,10 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
         log, left = axes.lines[0].get_ydata(), axes.lines[1].get_ydata()
         np.testing.assert_allclose(log, 100 * one.truth.moved_m["uav1"][:, number])
         np.testing.assert_allclose(left, log / 2, atol=1e-9)
-    paths = [line.get_ydata() for line in figures[0].axes[9].lines[:2]]
-    assert 0.45 < np.std(paths[1]) / np.std(paths[0]) < 0.55
+    log, left = (line.get_ydata() for line in figures[0].axes[9].lines[2:])
+    expected = 100 * linear_path_error(one, np.array([0.0, 15.0, 0.0]))
+    assert np.std(log - (expected - expected.mean())) < 0.02 * np.std(log)
+    assert np.std(left - log / 2) < 0.02 * np.std(log)
     assert "accepted: because; no flag" in figures[0].get_suptitle()
 
 
