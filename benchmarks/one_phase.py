@@ -24,10 +24,10 @@ from apertura.refinement.path_offsets import refine_one_phase
 from apertura.refinement.refine import refine
 from apertura.refinement.space_variance import SpaceVariance, space_variance
 from apertura.scene.terrain import FlatGround
+from apertura.study.refinement.cases import PROBES_M, Case, case
+from apertura.study.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
+from apertura.study.refinement.scenes import AREA_M, GRID
 from benchmarks.refinement.__main__ import Key, keys
-from benchmarks.refinement.cases import PROBES_M, Case, case
-from benchmarks.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
-from benchmarks.refinement.scenes import AREA_M, GRID
 
 MIDDLE_M = np.array([0.0, 15.0, 0.0])
 CORNERS_M = np.array([(east, north, 0.0) for east in AREA_M[::2] for north in AREA_M[1::2]])

@@ -21,8 +21,8 @@ from apertura.refinement.speckle import refined_by_speckle
 from apertura.refinement.tiles import tiles
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround
-from benchmarks.refinement.echoes import transfer
-from benchmarks.refinement.scenes import Scatterers
+from apertura.study.refinement.echoes import transfer
+from apertura.study.refinement.scenes import Scatterers
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)

@@ -171,7 +171,7 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
         log, left = axes.lines[0].get_ydata(), axes.lines[1].get_ydata()
         np.testing.assert_allclose(log, 100 * one.truth.moved_m["uav1"][:, number])
         np.testing.assert_allclose(left, log / 2, atol=1e-9)
-    log, left = (line.get_ydata() for line in figures[0].axes[9].lines[2:])
+    log, left = (line.get_ydata() for line in figures[0].axes[9].lines[3:5])
     expected = 100 * linear_path_error(one, np.array([0.0, 15.0, 0.0]))
     assert np.std(log - (expected - expected.mean())) < 0.02 * np.std(log)
     assert np.std(left - log / 2) < 0.02 * np.std(log)
