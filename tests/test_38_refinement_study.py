@@ -83,10 +83,10 @@ def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(mon
 
 @compiled
 @pytest.mark.slow
-def test_speckle_is_refused_and_its_loss_stays():
+def test_speckle_is_not_made_worse():
     (one,) = run_kind("dense", sigmas_cm=(2.0,), seeds=(1,))
-    assert (one.said, one.flags) == (TOO_FEW, "refinement_too_few_patches")
-    assert one.product_loss_db == one.loss_db > 3
+    assert one.loss_db > 3
+    assert one.product_loss_db <= one.loss_db
 
 
 @compiled
