@@ -148,10 +148,8 @@ def _draw_paths(axes: Axes, one: Case, used: TrackCorrection, place_m: Floats) -
 def _path(sighting: Sighting, tracks: TrackCorrection, place_m: Floats) -> Floats:
     """Return (pulse,) metres: the path that tracks expect of a place's echo (docs/theory/autofocus.md, eq. 1)."""
     aperture = tracks.aperture(sighting.profiles.aperture, sighting.pair, sighting.time_s)
-    path = aperture.path(place_m[None])[:, 0]
-    if sighting.sidelink_m is None:
-        return np.asarray(path)
-    return np.asarray(path - tracks.sidelink_m(sighting.sidelink_m, sighting.pair, sighting.time_s))
+    longer_m = tracks.longer_m(sighting.pair, sighting.time_s, sighting.sidelink_m)
+    return np.asarray(aperture.path(place_m[None])[:, 0] - longer_m)
 
 
 def _draw_pair(axes: Axes, time_s: Floats, errors: tuple[Floats, Floats], named: tuple[str, str]) -> None:
