@@ -10,7 +10,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.refinement.agreement import Ground
 from apertura.refinement.blocks import Blocks
 from apertura.refinement.candidates import Candidates
-from apertura.refinement.evidence import Evidence, gains_db, range_shifts
+from apertura.refinement.evidence import MOST_APART, Evidence, gains_db, range_shifts
 from apertura.refinement.gauge import Gauge, find_gauge
 from apertura.refinement.inputs import ReferencePoint, Sighting, TrackErrors
 from apertura.refinement.outcome import Refinement
@@ -119,7 +119,9 @@ class Search:
             states.append(self._fitted(fitted))
             held_out_db[:, ~fitted] = gains_db(begun.seen, states[-1].seen)[:, ~fitted]
         lowest = self._lowest(states, everything)
-        state = self._lowest([lowest, problem.sharper(lowest, everything)], everything)
+        state = problem.sharper(lowest, everything)
+        if disagreement(problem, state.tracks, self.axes)[1] > MOST_APART:
+            state = lowest
         known = 2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
         evidence = Evidence(
             fitted_db=gains_db(begun.seen, state.seen),

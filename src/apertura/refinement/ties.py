@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 _LEAST_RATIO = 30.0  # peak power of a point against its surroundings
 _LEAST_STD_M = 0.01  # of a point's place in one pair against another: what scatters need not be the same spot
-_ZOOMS, _SIDE = 5, 9
+_ZOOMS, _SIDE = 3, 9
 _ROUNDS = 3
 
 
