@@ -77,7 +77,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `RESULTS`.
     *where
         Flight and node (raw, track), flight and pair (echo, profile, image, layers, export), flight (calibration,
-        refined_track, assessment, fused), nothing (scene, terrain, cube, coverage, speed_accuracy, whole).
+        refined_track, assessment, fused), nothing (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -130,9 +130,8 @@ def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
             sources.append(campaign.manifest("calibration", calibration.flight))
     else:
         sources = [campaign.relative(path) for path in campaign.raw_files(flight, pair.split("-")[1]).values()]
-    return Result(
-        campaign.manifest("echo", flight, pair), tuple(sources), campaign.relevant("echo", pair, flight=flight)
-    )
+    asked = campaign.relevant("echo", pair, flight=flight)
+    return Result(campaign.manifest("echo", flight, pair), tuple(sources), asked)
 
 
 def _calibration(campaign: Campaign, flight: str) -> Result:
@@ -163,9 +162,10 @@ def _layers(campaign: Campaign, flight: str, pair: str) -> Result:
 
 def _coverage(campaign: Campaign) -> Result:
     pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
-    made = [campaign.manifest(stage, *pair) for pair in pairs for stage in ("echo", "layers")]
-    named = {"campaign": campaign.settings.campaign}
-    return Result(campaign.manifest("coverage"), (*made, campaign.manifest("scene")), named)
+    made = [campaign.manifest(stage, *pair) for pair in pairs for stage in ("echo", "layers")] + [
+        campaign.manifest("scene")
+    ]
+    return Result(campaign.manifest("coverage"), tuple(made), {"campaign": campaign.settings.campaign})
 
 
 def _profile(campaign: Campaign, flight: str, pair: str) -> Result:

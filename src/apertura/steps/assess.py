@@ -52,11 +52,8 @@ def assess(campaign: Campaign, flight: str) -> Path:
         unfit=_unfit(found, unconfirmed, reference),
         align=refined or campaign.settings.processing.fusion.align_phase,
     )
-    flags = _flags(found, reference, unconfirmed)
-    if refined:  # a path that is constant for a pair is what the images do not tell: it was taken off
-        flags = {
-            pair: {name: line for name, line in raised.items() if name != _PHASE} for pair, raised in flags.items()
-        }
+    # A path that is constant for a pair is what images do not tell of refined tracks: its phase was taken off.
+    flags = _flags(found, reference, unconfirmed, taken_off={_PHASE} if refined else set())
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
     named = _suspected(campaign, flight, images, flags, reference)
@@ -74,13 +71,18 @@ def assess(campaign: Campaign, flight: str) -> Path:
 
 
 def _flags(
-    found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str]
+    found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str], *, taken_off: Collection[str]
 ) -> dict[str, dict[str, str]]:
-    """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell."""
+    """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell.
+
+    What is `taken_off` before pairs are added, as the phase of tracks that were refined, is none.
+    """
     lines: dict[str, dict[str, list[str]]] = {pair: {} for pair in (reference, *found)}
     for pair, one in found.items():
         raised = _disagreement(one, (reference, pair), sure=pair in unconfirmed)
         for side, (name, line) in product((pair, reference), raised.items()):
+            if name in taken_off:
+                continue
             lines[side].setdefault(name, []).append(line)
     return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
 
