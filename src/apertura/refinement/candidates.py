@@ -13,7 +13,7 @@ from apertura.geometry.geodesy import ned_axes
 from apertura.geometry.track_correction import TrackCorrection
 from apertura.refinement.inputs import Sighting, TrackErrors
 from apertura.refinement.outcome import Refinement
-from apertura.refinement.patches import LEAST_PATCHES, Patch, bandwidth_hz, patch_at, spread_out
+from apertura.refinement.patches import CLEAR, LEAST_PATCHES, Patch, bandwidth_hz, patch_at, spread_out
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import Terrain
 
@@ -25,6 +25,7 @@ LEAST_RATIO = 5.0
 HELPFUL_RATIO = 3.5
 """Where there are points, places that stand out less help too."""
 
+_LEAST_TOLD = 40.0  # by all points together, as patches are counted: a few faint ones may be speckle
 _SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobes
 _APART = 0.6  # of half a patch, at least, lie patches apart
 
@@ -63,7 +64,8 @@ class Candidates:
         lasting_s = min(one.correlation_s for one in errors.values())
         places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
         axes, points = east_north_up(grid, places_m), int((ratio > LEAST_RATIO).sum())
-        if points < LEAST_PATCHES:
+        told = float(np.minimum(ratio[ratio > LEAST_RATIO], CLEAR).sum())
+        if points < LEAST_PATCHES or told < _LEAST_TOLD:
             return cls([], points, axes)
         typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
         apart_m = _APART * float(np.abs((typical.pixels_m - typical.place_m) @ axes[:2].T).max())
@@ -74,8 +76,8 @@ class Candidates:
     def refused(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
         """Return that too few points stand out, and what else was tried in vain: no node is moved."""
         line = (
-            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them, "
-            f"{LEAST_PATCHES} are needed"
+            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them; "
+            f"{LEAST_PATCHES} are needed, twice as many where none stands out more"
         )
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ FOLDS = 4
 _KNOTS_A_LASTING = 10  # to an error's correlation time
 _LEAST_KNOTS = 64
 _FEW = 8  # patches: each quarter of so few is held out once
+_LOST_TO_TIES_DB = 0.1
 _STAGES = 3  # of caching and sharpening
 
 
@@ -68,7 +70,7 @@ def refine(
         return found if found is not None and found.accepted else search.found.refused(errors, found)
     state, evidence = search.judged()
     left = remaining(search.problem, state)
-    unknowns, ties = tied(search.problem, state.unknowns, reference_points, search.axes)
+    unknowns, ties = search.tied(state, reference_points)
     report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
     correction = search.problem.correction(unknowns)
     return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
@@ -133,6 +135,16 @@ class Search:
             apart_sigma=disagreement(problem, state.tracks, self.axes)[1],
         )
         return state, evidence
+
+    def tied(self, state: State, points: Sequence[ReferencePoint]) -> tuple[Floats, dict[str, Any]]:
+        """Return the unknowns tied down where sharpness leaves them free, unless ties blur or part the pairs."""
+        unknowns, report = tied(self.problem, state.unknowns, points, self.axes)
+        after = self.problem.state(unknowns)
+        apart = [disagreement(self.problem, one.tracks, self.axes)[1] for one in (state, after)]
+        lost_db = -float(gains_db(state.seen, after.seen).mean())
+        if apart[1] > max(apart[0], 1.0) or lost_db > _LOST_TO_TIES_DB:
+            return state.unknowns, {**report, "ties": "left out: they blurred points or parted pairs"}
+        return unknowns, report
 
     def _fitted(self, used: Bools) -> State:
         """Return the tracks that some patches ask for, from the start that leads lowest."""
