@@ -17,6 +17,9 @@ from apertura.refinement.space_variance import SpaceVariance, space_variance
 ASSUMED_STD_M = 0.02
 """Error of positions in each axis where a refinement is asked for and nobody said: that of a fair RTK solution."""
 
+LEAST_STD_M = 1e-3
+"""Of what a log or config states as exact."""
+
 ONE_PHASE = "minimum_entropy"
 """What auto takes where one phase suffices: at the cost of the phase gradient it is believed at least as often."""
 
@@ -74,7 +77,7 @@ def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
 def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
     """Return node → the errors that its log is taken to have."""
     return {
-        node: TrackErrors(known.std_m or (ASSUMED_STD_M,) * 3, known.correlation_s, known.drift_m)
+        node: TrackErrors(_stated(known), known.correlation_s, known.drift_m)
         for node, known in positions_of(pairs).items()
     }
 
@@ -86,3 +89,9 @@ def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors
     corners_m = scene.terrain.positions_at(scene.grid, rows, columns)
     of_nodes = [errors[node] for node in dict.fromkeys(pair.name.split("-"))]
     return space_variance(paths_to_middle(pair, scene), corners_m, of_nodes)
+
+
+def _stated(known: NodePositions) -> tuple[float, float, float]:
+    """Return the errors of a node's log, east, north, up."""
+    east, north, up = (max(one, LEAST_STD_M) for one in known.std_m or (ASSUMED_STD_M,) * 3)
+    return east, north, up
