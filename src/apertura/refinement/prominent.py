@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.refinement.blocks import Blocks, Contribution
-from apertura.refinement.objective import Tracks
+from apertura.refinement.objective import Tracks, phases
 from apertura.refinement.solve import Problem, State, minimal
 
 Floats = NDArray[np.float64]
@@ -70,10 +70,7 @@ class _Fit:
                 if not counts:
                     continue
                 patch = one.patch
-                path = sum(
-                    np.einsum("bi,bi->b", slope, moved[node][patch.blocks]) for node, slope in patch.slopes.items()
-                )
-                left = one.weight * (patch.wavenumber * np.asarray(path) + one.phase)
+                left = one.weight * (phases(patch, moved) + one.phase)
                 left -= one.known @ (one.known.T @ left)
                 total += 0.5 * float(left @ left)
                 for node, slope in patch.slopes.items():

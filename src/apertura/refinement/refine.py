@@ -70,7 +70,7 @@ def refine(
         return found if found is not None and found.accepted else search.found.refused(errors, found)
     state, evidence = search.judged()
     left = remaining(search.problem, state)
-    unknowns, ties = search.tied(state, reference_points)
+    unknowns, ties = search.tied(state, reference_points, apart_sigma=evidence.apart_sigma)
     report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
     correction = search.problem.correction(unknowns)
     return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
@@ -122,8 +122,9 @@ class Search:
             held_out_db[:, ~fitted] = gains_db(begun.seen, states[-1].seen)[:, ~fitted]
         lowest = self._lowest(states, everything)
         state = problem.sharper(lowest, everything)
-        if disagreement(problem, state.tracks, self.axes)[1] > MOST_APART:
-            state = lowest
+        apart_sigma = self._apart_sigma(state)
+        if apart_sigma > MOST_APART:
+            state, apart_sigma = lowest, self._apart_sigma(lowest)
         known = 2 * sum(min(one.ratio, MOST_RATIO) for seen in state.seen for one in seen)
         evidence = Evidence(
             fitted_db=gains_db(begun.seen, state.seen),
@@ -132,19 +133,26 @@ class Search:
             before=range_shifts(problem, begun, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
-            apart_sigma=disagreement(problem, state.tracks, self.axes)[1],
+            apart_sigma=apart_sigma,
         )
         return state, evidence
 
-    def tied(self, state: State, points: Sequence[ReferencePoint]) -> tuple[Floats, dict[str, Any]]:
+    def tied(
+        self, state: State, points: Sequence[ReferencePoint], *, apart_sigma: float
+    ) -> tuple[Floats, dict[str, Any]]:
         """Return the unknowns tied down where sharpness leaves them free, unless ties blur or part the pairs."""
         unknowns, report = tied(self.problem, state.unknowns, points, self.axes)
+        if unknowns is state.unknowns:
+            return unknowns, report
         after = self.problem.state(unknowns)
-        apart = [disagreement(self.problem, one.tracks, self.axes)[1] for one in (state, after)]
         lost_db = -float(gains_db(state.seen, after.seen).mean())
-        if apart[1] > max(apart[0], 1.0) or lost_db > _LOST_TO_TIES_DB:
+        if self._apart_sigma(after) > max(apart_sigma, 1.0) or lost_db > _LOST_TO_TIES_DB:
             return state.unknowns, {**report, "ties": "left out: they blurred points or parted pairs"}
         return unknowns, report
+
+    def _apart_sigma(self, state: State) -> float:
+        """Return how far pairs show points apart, in standard deviations of their places."""
+        return disagreement(self.problem, state.tracks, self.axes)[1]
 
     def _fitted(self, used: Bools) -> State:
         """Return the tracks that some patches ask for, from the start that leads lowest."""

@@ -53,8 +53,8 @@ def tied(
     """
     if not len(problem.gauge.modes) or not (points or len(problem.pairs) > 1):
         return unknowns, {}
-    known = [(point, _patch_of(problem, point, axes)) for point in points]
-    echoes = [[blocks.echoes([patch])[0] for _, patch in known] for blocks in problem.pairs]
+    known = [_patch_of(problem, point, axes) for point in points]
+    echoes = [blocks.echoes(known) if known else [] for blocks in problem.pairs]
     settled: Floats = np.zeros(len(problem.gauge.modes))
     report: dict[str, Any] = {}
     for number in range(_ROUNDS):
