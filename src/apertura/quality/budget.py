@@ -1,5 +1,6 @@
 """The error budget of an image: what is known to spoil it, and what each cause is expected to cost."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -147,7 +148,7 @@ def expected(lines: Iterable[BudgetLine]) -> Effect:
 
 def noise_loss(variance_rad2: float) -> Effect:
     """Return what phase noise that forgets itself from pulse to pulse does: exp(-σ²) of the peak's power."""
-    return Effect(-10 * float(np.log10(np.e)) * variance_rad2, 0.0, 0.0)
+    return Effect(-10 * math.log10(math.e) * variance_rad2, 0.0, 0.0)
 
 
 def accuracy_for(lines: Iterable[BudgetLine]) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.quality.budget import noise_loss
 from apertura.refinement.solve import Problem, State
 
 Floats = NDArray[np.float64]
@@ -38,7 +39,7 @@ class Remaining:
         """As JSON values."""
         return {
             "left_rad": round(self.phase_rad, 4),
-            "left_db": round(-10 * float(np.log10(np.e)) * self.phase_rad**2, 3),
+            "left_db": round(noise_loss(self.phase_rad**2).loss_db, 3),
             "gauge_shift_m": round(self.shift_m, 4),
         }
 
