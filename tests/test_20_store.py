@@ -42,7 +42,7 @@ def track():
             "position": (("epoch", "axis"), np.zeros((2, 3))),
             "attitude": (("epoch", "axis"), np.full((2, 3), np.nan)),
         },
-        attrs={"node": "a"},
+        attrs={"node": "a", "frame": "ecef", "dropped": {}},
     )
     return stamp(dataset, "track", **NOTHING)
 

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS
+from apertura.ingest import PHASE_HISTORIES, RECORDERS, log_suffixes, read_track
 from apertura.paths import inside
 from apertura.settings import (
     CONFIG,
@@ -21,6 +21,9 @@ from apertura.settings import (
     read_segments,
     read_settings,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -169,6 +172,11 @@ class Campaign:
         }
         return chosen.get(stage, {})
 
+    def log_settings(self, node: str) -> dict[str, Any]:
+        """Return the settings that a node's log is read by, as JSON values."""
+        stated: dict[str, Any] = self.values["nodes"][node]["log"]
+        return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
+
     def flight(self, name: str) -> Flight:
         """Return the flight called `name`; raise CampaignError with the names there are if it is none of them."""
         if name not in self._flights:
@@ -216,6 +224,10 @@ class Campaign:
         row = next(begun, next(iter(RECORDERS)))
         return tuple(self._raw_file(flight, node, suffix) for suffix in row)
 
+    def read_log(self, flight: str, node: str) -> "xr.Dataset":
+        """Return the `track` stage of a node's flight log."""
+        return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
+
     def track_file(self, flight: str, node: str) -> Path:
         """Return the one raw/<flight>/<node>.track.* file."""
         logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
@@ -225,7 +237,7 @@ class Campaign:
             f"{len(logs)} track files {[path.name for path in logs]}",
             where=self.root / "raw" / flight / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
-            remedy=f"Copy the log there, named <node>.track.<{'|'.join(suffix[1:] for suffix in TRACKS)}>.",
+            remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
         )
 
     def _history_files(self, flight: str, node: str, suffix: str) -> list[Path]:

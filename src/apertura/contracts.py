@@ -71,12 +71,16 @@ STAGES: Mapping[str, Stage] = {
     "track": Stage(
         {
             "time": Variable(("epoch",), "datetime64[ns]", "", "UTC"),
-            "position": Variable(("epoch", "axis"), "float64", "m", "logged point, ECEF (EPSG:4978)"),
+            "position": Variable(("epoch", "axis"), "float64", "m", "logged point, in `frame`"),
             "attitude": Variable(
                 ("epoch", "axis"), "float64", "rad", "roll, pitch, yaw of forward-right-down axes; NaN where not logged"
             ),
         },
-        {"node": "node name"},
+        {
+            "node": "node name",
+            "frame": _FRAME["frame"],
+            "dropped": "epochs of the log that were left out: reason → how many",
+        },
         {
             "position_std": Variable(
                 ("epoch", "axis"), "float64", "m", "what the log states of its error: north, east, up; NaN where none"

@@ -116,7 +116,8 @@ def _raw(campaign: Campaign, flight: str, node: str) -> Result:
 
 
 def _track(campaign: Campaign, flight: str, node: str) -> Result:
-    return Result(campaign.manifest("track", flight, node), (campaign.relative(campaign.track_file(flight, node)),), {})
+    log = campaign.relative(campaign.track_file(flight, node))
+    return Result(campaign.manifest("track", flight, node), (log,), campaign.log_settings(node))
 
 
 def _echo(campaign: Campaign, flight: str, pair: str) -> Result:

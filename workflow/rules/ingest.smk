@@ -19,7 +19,7 @@ rule ingest:
         mem_mb=asked["ingest"].mem_mb,
         runtime=asked["ingest"].runtime,
     params:
-        settings=campaign.relevant("raw"),
+        settings=lambda wildcards: campaign.relevant("raw") | campaign.log_settings(wildcards.node),
         code=code_of("raw"),
     message:
         "{wildcards.flight}: reading the recording and flight log of {wildcards.node}"

@@ -81,7 +81,8 @@ class Inspected:
         def files(flight: str, node: str) -> tuple[Path, ...]:
             return (self.campaign.track_file(flight, node),)
 
-        return self._each(files, lambda logs, node: read_track(logs[0], node=node))
+        options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
+        return self._each(files, lambda logs, node: read_track(logs[0], node=node, options=options[node]))
 
     def _each(
         self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], str], T]

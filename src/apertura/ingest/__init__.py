@@ -6,9 +6,11 @@ Rows name their readers and do not import them: a step pays for the formats that
 import pkgutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from apertura.errors import CampaignError
+from apertura.atomic import naming
+from apertura.errors import CampaignError, quoted
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -18,11 +20,25 @@ if TYPE_CHECKING:
 RECORDERS: Mapping[tuple[str, ...], str] = {(".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf:open_sigmf"}
 """Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
-TRACKS: Mapping[str, str] = {
-    ".csv": "apertura.ingest.csv_track:read_csv_track",
-    ".pos": "apertura.ingest.rtklib:read_rtklib_pos",
+
+class LogFormat(NamedTuple):
+    """How a flight log is recognised, and read."""
+
+    suffixes: tuple[str, ...]
+    """Of <node>.track.*"""
+    reader: str
+    """reader(path, node=, options=) → `track`."""
+    heading: str = ""
+    """What its first 8 KiB hold, where others have the same suffix; none: any."""
+
+
+TRACKS: Mapping[str, LogFormat] = {
+    "csv": LogFormat((".csv",), "apertura.ingest.csv_track:read_csv_track"),
+    "rtklib": LogFormat((".pos",), "apertura.ingest.rtklib:read_rtklib_pos"),
 }
-"""Suffix of <node>.track.* → reader(path, node=) → `track`."""
+"""Name of a format → how it is recognised and read; of those that fit a file the first is taken."""
+
+_HEADING_BYTES = 8192
 
 PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura.ingest.afrl:read_afrl_mat")}
 """waveform.format → suffix of <node>.*, reader(paths, pair=) → `echo`."""
@@ -42,23 +58,53 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     return opened
 
 
-def read_track(path: Path, *, node: str) -> "xr.Dataset":
+def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "xr.Dataset":
     """Return the `track` stage of a flight log.
 
     Raises
     ------
     CampaignError
-        If there is no reader for the file's suffix, or the log is not what its format promises.
+        If no reader knows the file, or the log is not what its format promises.
     """
-    if path.suffix not in TRACKS:
-        raise CampaignError(
-            f"a flight log of kind {path.suffix!r}",
-            where=path,
-            expected=f"one of {sorted(TRACKS)}",
-            remedy="Convert the log, or write a reader for it.",
-        )
-    track: xr.Dataset = pkgutil.resolve_name(TRACKS[path.suffix])(path, node=node)
+    track: xr.Dataset = pkgutil.resolve_name(TRACKS[log_format(path, options)].reader)(path, node=node, options=options)
     return track
+
+
+def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
+    """Return which row of `TRACKS` reads a log: the one asked for, else by suffix and heading.
+
+    Raises
+    ------
+    CampaignError
+        If none does.
+    """
+    if options.format in TRACKS:
+        return str(options.format)
+    suffix = path.suffix.lower()
+    known = {name: row for name, row in TRACKS.items() if suffix in row.suffixes}
+    if any(row.heading for row in known.values()):
+        with naming(path), path.open("rb") as stream:
+            begins = stream.read(_HEADING_BYTES).decode("utf-8", errors="replace")
+        known = {name: row for name, row in known.items() if row.heading in begins}
+    if options.format is None and known:
+        return next(iter(known))
+    raise CampaignError(
+        f"a flight log of kind {path.suffix!r}" if options.format is None else f"format {quoted(options.format)}",
+        where=path,
+        expected=f"<node>.track.<{'|'.join(log_suffixes())}>; formats {', '.join(TRACKS)}",
+        remedy="Convert the log, or write a reader for it.",
+    )
+
+
+def log_suffixes() -> list[str]:
+    """Return what <node>.track.* may end in, without the dot.
+
+    Examples
+    --------
+    >>> "csv" in log_suffixes()
+    True
+    """
+    return sorted({suffix[1:] for row in TRACKS.values() for suffix in row.suffixes})
 
 
 def read_phase_history(kind: str, paths: Sequence[Path], *, pair: str) -> "xr.Dataset":

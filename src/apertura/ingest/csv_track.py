@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.errors import CampaignError, quoted
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.tables import numbers, read_table
 from apertura.ingest.track import FIXES, make_track
 
@@ -16,7 +17,7 @@ _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 _STD = ["std_north_m", "std_east_m", "std_up_m"]
 
 
-def read_csv_track(path: Path, *, node: str) -> xr.Dataset:
+def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a CSV log.
 
     Its columns are time_utc (ISO 8601), latitude_deg, longitude_deg, height_m (ellipsoidal, WGS 84) and, where

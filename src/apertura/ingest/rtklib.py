@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.documents import read_text
 from apertura.errors import CampaignError, quoted
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.tables import LARGEST_LOG, number
 from apertura.ingest.times import utc_times
 from apertura.ingest.track import make_track
@@ -21,7 +22,7 @@ _REMEDY = "Export the solution with these output settings."
 _LEAP_SINCE = np.datetime64("2017-01-01", "ns")
 
 
-def read_rtklib_pos(path: Path, *, node: str) -> xr.Dataset:
+def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of an RTKLIB solution.
 
     It holds latitude, longitude (decimal degrees) and ellipsoidal height; its header says whether times are GPST

@@ -1,6 +1,8 @@
 """What every flight log becomes: times in UTC, positions in ECEF, attitude in radians."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -16,17 +18,24 @@ FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
 LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 """Heights above the ellipsoid that an aircraft or a balloon logs."""
 
+FARTHEST_M = 1e5
+"""From the origin of a local frame."""
+
+_EARTH_M = 6.37e6
+_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; within a centimetre of there nobody flies
 _WIDEST_DEG = 1080.0
 _WORST_STD_M = 1e7
 
 
 def make_track(
     time_utc: NDArray[np.datetime64],
-    geodetic: NDArray[np.float64],
+    position: NDArray[np.float64],
     *,
+    frame: Literal["geodetic", "ecef", "local"] = "geodetic",
     attitude_deg: NDArray[np.float64] | None = None,
     position_std_m: NDArray[np.float64] | None = None,
     fix: NDArray[np.int8] | None = None,
+    dropped: Mapping[str, int] | None = None,
     node: str,
     where: Path,
 ) -> xr.Dataset:
@@ -36,14 +45,19 @@ def make_track(
     ----------
     time_utc
         (epoch,) datetime64[ns], UTC, strictly increasing.
-    geodetic
-        (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
+    position
+        (epoch, 3) float64 in `frame`.
+    frame
+        geodetic: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); epochs at latitude 0, longitude 0 have
+        no fix, and are dropped. ecef: metres. local: metres to east, north and up in axes of the campaign's own.
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None where not logged.
     position_std_m
         (epoch, 3) float64: standard deviations to north, east and up, metres, NaN where not logged; None: nowhere.
     fix
         (epoch,) int8: kind of solution, a value of `FIXES`, 0 where not logged; None: nowhere.
+    dropped
+        Reason → how many epochs of the log the reader left out.
 
     Raises
     ------
@@ -53,25 +67,22 @@ def make_track(
     Examples
     --------
     >>> times = np.array(["2025-05-14T09:30", "2025-05-14T09:31"], "datetime64[ns]")
-    >>> track = make_track(times, np.array([[0, 0, 0], [0, 0, 1.0]]), node="uav1", where=Path("x.csv"))
-    >>> track.position.values[1]
-    array([6378138.,       0.,       0.])
+    >>> track = make_track(times, np.array([[0, 90, 0], [0, 90, 1.0]]), node="uav1", where=Path("x.csv"))
+    >>> track.position.values[1].round(6)
+    array([      0., 6378138.,       0.])
     """
+    fixed = (np.abs(position[:, :2]) >= _NOWHERE_DEG).any(axis=1) | (frame != "geodetic")
+    left_out = {**(dropped or {}), **({"no fix": int((~fixed).sum())} if not fixed.all() else {})}
+    time_utc, position = time_utc[fixed], position[fixed]
+    attitude_deg, position_std_m = (None if one is None else one[fixed] for one in (attitude_deg, position_std_m))
+    fix = None if fix is None else fix[fixed]
     if len(time_utc) < 2:
-        raise CampaignError(f"{len(time_utc)} epochs", where, "at least two", "Export the whole log.")
+        without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
+        raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
     _check_times(time_utc, where)
-    latitude, longitude, height = geodetic.T
-    bad = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (height >= LOWEST_M) & (height <= HIGHEST_M))
-    if bad.any():
-        first = int(np.flatnonzero(bad)[0])
-        raise CampaignError(
-            f"{int(bad.sum())} epochs without a position, first epoch {first}: {geodetic[first].tolist()}",
-            where,
-            f"finite latitude, longitude and ellipsoidal height, the height between {LOWEST_M:g} and {HIGHEST_M:g} m",
-            "Drop those lines or export again.",
-        )
+    _check_positions(position, frame, where)
     _check_stated(attitude_deg, position_std_m, fix, where)
-    attitude = np.full_like(geodetic, np.nan) if attitude_deg is None else np.radians(attitude_deg)
+    attitude = np.full_like(position, np.nan) if attitude_deg is None else np.radians(attitude_deg)
     quality = {
         name: (dims, values)
         for name, dims, values in (("position_std", ("epoch", "axis"), position_std_m), ("fix", ("epoch",), fix))
@@ -80,14 +91,37 @@ def make_track(
     variables = {
         **quality,
         "time": (("epoch",), time_utc.astype("datetime64[ns]")),
-        "position": (("epoch", "axis"), ecef_from_geodetic(*geodetic.T)),
+        "position": (("epoch", "axis"), ecef_from_geodetic(*position.T) if frame == "geodetic" else position),
         "attitude": (("epoch", "axis"), attitude),
     }
     # Arrays that need no look into: xarray would import dask and scipy to see whether they are theirs.
     return xr.Dataset(
         {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
-        attrs={"node": node},
+        attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
     )
+
+
+def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> None:
+    """Raise CampaignError where an epoch is nowhere that a node flies."""
+    if frame == "geodetic":
+        latitude, longitude, height = position.T
+        good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (height >= LOWEST_M) & (height <= HIGHEST_M)
+        expected = "finite latitude, longitude and ellipsoidal height, the height between "
+        expected += f"{LOWEST_M:g} and {HIGHEST_M:g} m"
+    elif frame == "ecef":
+        above_m = np.linalg.norm(position, axis=1) - _EARTH_M
+        good, expected = np.abs(above_m) <= HIGHEST_M, "finite ECEF coordinates in metres, near the Earth's surface"
+    else:
+        good = (np.abs(position) <= FARTHEST_M).all(axis=1)
+        expected = f"finite local coordinates within {FARTHEST_M:g} m"
+    if not good.all():
+        first = int(np.flatnonzero(~good)[0])
+        raise CampaignError(
+            f"{int((~good).sum())} epochs without a position, first epoch {first}: {position[first].tolist()}",
+            where,
+            expected,
+            "Drop those lines or export again.",
+        )
 
 
 def _check_stated(

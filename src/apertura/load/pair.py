@@ -18,7 +18,7 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
-from apertura.ingest import open_recording, read_track
+from apertura.ingest import open_recording
 from apertura.load.antennas import beams_of, body_axes
 from apertura.load.positions import position_error
 from apertura.load.recorded import recorded_echo
@@ -180,7 +180,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
 
 def _log(campaign: Campaign, flight: str, node: str) -> _Log:
     file = campaign.track_file(flight, node)
-    return _Log(read_track(file, node=node), campaign.settings.nodes[node], file)
+    return _Log(campaign.read_log(flight, node), campaign.settings.nodes[node], file)
 
 
 def _pulse_times(

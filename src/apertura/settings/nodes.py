@@ -4,6 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from apertura.settings.log import Log
 from apertura.settings.section import Metres3, Section
 
 StandardDeviation = Annotated[float, Field(gt=0)]
@@ -78,6 +79,7 @@ class Node(Section):
     attitude: Literal["log", "course", "none"] = Field(
         "none", description="where attitude comes from: the log, the course over ground, or none"
     )
+    log: Log = Field(default_factory=Log, description="how the flight log is read, where it leaves that open")
     worst_fix: Literal["fix", "float", "any"] = Field(
         "fix",
         description="poorest solution to image with where the log says and has RTK: fix, float, or any; "

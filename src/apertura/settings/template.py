@@ -69,6 +69,8 @@ def _value(field: FieldInfo) -> Any:
         return field.examples[0]
     if field.default is not PydanticUndefined:
         return field.default
+    if field.default_factory is dict:
+        return {}
     return get_args(field.annotation)[0]  # a Literal without default: its first choice
 
 

@@ -7,7 +7,7 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
-from apertura.ingest import open_recording, read_track
+from apertura.ingest import open_recording
 from apertura.ingest.recording import Recording
 from apertura.lineage import result_of
 from apertura.load.transmitted import read_framing, symbol_samples
@@ -26,8 +26,9 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
         If a file is missing, damaged, or not what its format promises.
     """
     logged = result_of(campaign, "track", flight, node).begin(campaign.root, [__name__])
-    log = read_track(campaign.track_file(flight, node), node=node)
-    track = stamped(log, "track", modules=[__name__], inputs=logged.sources.digests)
+    log = campaign.read_log(flight, node)
+    read_by = campaign.log_settings(node)
+    track = stamped(log, "track", modules=[__name__], settings=read_by, inputs=logged.sources.digests)
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
     preamble = () if recording.framing is None else (_preamble(recording, campaign),)
