@@ -171,3 +171,12 @@ def test_the_error_of_the_spline_between_epochs_is_estimated_from_the_epochs():
         between_s = np.linspace(5, 35, 4001)
         true_m = np.std(position_spline(time_s, wave)(between_s)[:, 0] - np.sin(2 * np.pi * between_s)) / np.sqrt(3)
         assert 0.9 < checked(time_s, wave).interpolation_m / true_m < most
+
+
+def test_a_gap_longer_than_asked_is_a_hole_however_well_a_spline_bridges_it():
+    time_s = np.delete(np.arange(200) * 0.1, [100, 101, 102])
+    straight = np.stack([5 * time_s, 0 * time_s, 0 * time_s], -1)
+    sound = np.zeros(len(time_s), bool)
+    for longest_s, holes in ((np.inf, 0), (0.5, 0), (0.3, 1)):
+        checked = check_track(time_s, straight, poor_fix=sound, tolerated_m=0.01, longest_gap_s=longest_s)
+        assert len(checked.holes) == holes

@@ -10,6 +10,7 @@ import rasterio
 from folders import edit_config, edit_track
 from rasterio.transform import from_origin
 
+from apertura.campaign import Campaign
 from apertura.check import as_line, problems, resources
 from apertura.check.clocks import likely_cause
 from apertura.check.dem import needles
@@ -114,9 +115,12 @@ def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
     assert "the same time as the epoch before" in only(tiny)
 
 
-def test_epochs_at_no_place_are_told_while_pulses_are_sent(tiny):
+def test_an_epoch_at_no_place_is_left_out_of_the_log(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:30], zero(lines[30]), *lines[31:]])
-    assert "1 of 61 epochs at latitude 0, longitude 0: the receiver had no fix" in only(tiny)
+    assert told(tiny) == []
+    track = Campaign.load(tiny).read_log("f01", "uav1")
+    assert track.sizes["epoch"] == 60
+    assert track.attrs["dropped"] == {"no fix": 1}
 
 
 @pytest.mark.parametrize(("epoch", "time"), [(1, "09:29:30"), (-1, "09:30:30")])
@@ -228,7 +232,7 @@ def test_a_scene_is_far_where_no_echo_of_it_arrives_inside_the_prefix(tiny):
         ("EPSG:2225", "counts in US survey foot"),
         ("EPSG:4978", "EPSG:4978 (WGS 84) is not projected"),
         ("EPSG:99999", "'EPSG:99999' is unknown to PROJ"),
-        ("local", "local for recordings whose logs hold latitude and longitude"),
+        ("local", "local for positions on Earth, in latitude and longitude"),
     ],
 )
 def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
@@ -276,7 +280,7 @@ def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tradar\tradar\n")
     assert told(tmp_path) == []
     state(tmp_path, "scene", crs="EPSG:32616")
-    assert "EPSG:32616 for phase history in metres of its own frame; expected local" in only(tmp_path)
+    assert "EPSG:32616 for positions in metres of a frame of their own; expected local" in only(tmp_path)
 
 
 def test_a_track_must_be_above_the_ground(tiny):

@@ -207,7 +207,10 @@ def replaced_keeping_times(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("road", ["snakemake", "apertura"])
 def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_no_more(finished_tiny, tmp_path, road):
-    """From results that came without Snakefile's own records: what they were made from is told by hashes alone."""
+    """From results that came without Snakefile's own records: what they were made from is told by hashes alone.
+
+    Images of a flight hang together, as whether its tracks are refined rests on all its pairs; profiles do not.
+    """
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
 
     def run(*options):
@@ -217,11 +220,11 @@ def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_n
     assert code == 0
     assert "Nothing to be done" in output
     replaced_keeping_times(root / "raw/f01/uav2.track.pos")
-    untouched = (root / "results/f01/uav1-uav1/image.zarr/zarr.json").stat().st_mtime_ns
+    untouched = (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns
     code, output = run()
     assert code == 0, output
     assert "results/f01/uav2/track.manifest.json: stale, raw/f01/uav2.track.pos has changed" in output
-    assert (root / "results/f01/uav1-uav1/image.zarr/zarr.json").stat().st_mtime_ns == untouched
+    assert (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns == untouched
     assert stale_results(Campaign.load(root)) == {}
     assert "Nothing to be done" in run("-n")[1]
 

@@ -1,33 +1,31 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, log_suffixes, read_track
 from apertura.paths import inside
+from apertura.raw_folder import RawFolder
 from apertura.settings import (
+    CLOCKS,
     CONFIG,
     FLIGHTS,
     SEGMENTS,
     Antenna,
+    Clock,
     Flight,
-    OfdmWaveform,
     Segment,
-    Settings,
+    read_clocks,
     read_flights,
     read_segments,
     read_settings,
 )
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 @dataclass(frozen=True)
-class Campaign:
+class Campaign(RawFolder):
     """A validated campaign folder.
 
     Examples
@@ -38,19 +36,21 @@ class Campaign:
     apertura.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
     """
 
-    root: Path
-    settings: Settings
     flights: tuple[Flight, ...]
     segments: tuple[Segment, ...] = ()
+    clocks: tuple[Clock, ...] = ()
 
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
         root = Path(root)
-        config, table, segments = (inside(root, path.as_posix(), where=root) for path in (CONFIG, FLIGHTS, SEGMENTS))
+        config, table, segments, clocks = (
+            inside(root, path.as_posix(), where=root) for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
+        )
         settings = read_settings(config)
         flights = tuple(read_flights(table, nodes=settings.nodes))
-        return cls(root, settings, flights, tuple(read_segments(segments, flights=flights)))
+        imaging = tuple(read_segments(segments, flights=flights))
+        return cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
@@ -130,6 +130,14 @@ class Campaign:
             own.setdefault((segment.flight, segment.pair), []).append((segment.start, segment.end))
         return own
 
+    def clock(self, flight: str, node: str) -> Clock:
+        """Return how a node's recorder stands to its log in a flight."""
+        return self._clocks.get((flight, node), Clock(flight, node))
+
+    @cached_property
+    def _clocks(self) -> dict[tuple[str, str], Clock]:
+        return {(clock.flight, clock.node): clock for clock in self.clocks}
+
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
         settings, processing = self.values, self.values["processing"]
@@ -142,12 +150,14 @@ class Campaign:
         stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
         antennas = {"antennas": stated} if stated else {}
         segments = [list(segment) for segment in self.segments_of(flight, pair)]
+        clocks = [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks]
         chosen: dict[str, dict[str, Any]] = {
             "echo": {
                 "waveform": settings["waveform"],
                 "nodes": nodes,
                 **({"beams": sorted(beams)} if beams else {}),
                 **({"segments": segments} if segments else {}),
+                **({"clocks": clocks} if clocks else {}),
                 **{key: processing[key] for key in ("sidelink", "accuracy_db")},
             },
             "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
@@ -191,63 +201,3 @@ class Campaign:
     @cached_property
     def _flights(self) -> dict[str, Flight]:
         return {flight.name: flight for flight in self.flights}
-
-    def _recorded(self, flight: str, name: str) -> Path:
-        return inside(self.root, f"raw/{flight}/{name}", where=self.root)
-
-    def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
-        """Return raw/<flight>/<node><suffix>, which must exist."""
-        path = self._recorded(flight, f"{node}{suffix}")
-        if not path.is_file():
-            raise CampaignError(
-                "no such file",
-                where=path,
-                expected=f"the recording of node {node} in flight {flight}",
-                remedy=f"Copy it there, or take {node} out of the nodes of {flight} in {FLIGHTS}.",
-            )
-        return path
-
-    def raw_files(self, flight: str, node: str) -> dict[str, Path]:
-        """Return role → file of everything recorded by `node` in `flight`."""
-        if not isinstance(self.settings.waveform, OfdmWaveform):
-            suffix, _ = PHASE_HISTORIES[self.settings.waveform.format]
-            return {f"history.{path.name}": path for path in self._history_files(flight, node, suffix)}
-        return {
-            **{path.suffix: path for path in self.recording_files(flight, node)},
-            "track": self.track_file(flight, node),
-        }
-
-    def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
-        """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
-        folder = self.root / "raw" / flight
-        begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
-        row = next(begun, next(iter(RECORDERS)))
-        return tuple(self._raw_file(flight, node, suffix) for suffix in row)
-
-    def read_log(self, flight: str, node: str) -> "xr.Dataset":
-        """Return the `track` stage of a node's flight log."""
-        return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
-
-    def track_file(self, flight: str, node: str) -> Path:
-        """Return the one raw/<flight>/<node>.track.* file."""
-        logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
-        if len(logs) == 1:
-            return self._recorded(flight, logs[0].name)
-        raise CampaignError(
-            f"{len(logs)} track files {[path.name for path in logs]}",
-            where=self.root / "raw" / flight / f"{node}.track.*",
-            expected=f"exactly one flight log of node {node}",
-            remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
-        )
-
-    def _history_files(self, flight: str, node: str, suffix: str) -> list[Path]:
-        found = sorted((self.root / "raw" / flight).glob(f"{node}.*{suffix}"))
-        files = [self._recorded(flight, path.name) for path in found]
-        if not files:
-            raise CampaignError(
-                "no such file",
-                where=self.root / "raw" / flight / f"{node}.*{suffix}",
-                expected=f"the phase history of node {node} in flight {flight}",
-                remedy=f"Copy the {suffix} files there, named <node>.<anything>{suffix}.",
-            )
-        return files

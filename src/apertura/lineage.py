@@ -130,7 +130,8 @@ def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
         if calibration is not None and campaign.flight(flight).kind == "image":
             sources.append(campaign.manifest("calibration", calibration.flight))
     else:
-        sources = [campaign.relative(path) for path in campaign.raw_files(flight, pair.split("-")[1]).values()]
+        logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
+        sources = [campaign.relative(path) for path in (*campaign.history_files(flight, [*nodes][-1]), *logs)]
     asked = campaign.relevant("echo", pair, flight=flight)
     return Result(campaign.manifest("echo", flight, pair), tuple(sources), asked)
 

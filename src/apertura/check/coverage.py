@@ -81,7 +81,7 @@ def _all_poor(inspected: Inspected, key: Key, pulses: Times) -> CampaignError | 
     during = (times >= pulses[0]) & (times <= pulses[-1])
     if not during.any() or np.isin(fixes[during], (0, FIXES["fix"])).any():
         return None
-    from apertura.load.acquisition import poorer_fix
+    from apertura.load.node_log import poorer_fix
 
     if not poorer_fix(fixes, worst)[during].all():
         return None

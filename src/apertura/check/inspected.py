@@ -14,7 +14,7 @@ from pyproj.exceptions import CRSError
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL, geodetic_from_ecef
-from apertura.ingest import open_recording, read_track
+from apertura.ingest import PHASE_HISTORIES, open_recording, read_track
 from apertura.settings import OfdmWaveform
 
 if TYPE_CHECKING:
@@ -48,9 +48,9 @@ class Inspected:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Every flight and node of which samples and a log are needed."""
-        flights = self.campaign.flights if self.waveform else ()
-        return tuple((flight.name, node) for flight in flights for node in flight.participants)
+        """Every flight and node of which a log is needed."""
+        every = ((flight.name, node) for flight in self.campaign.flights for node in flight.participants)
+        return tuple(key for key in every if self.waveform or self.campaign.logged(*key))
 
     @property
     def recordings(self) -> dict[Key, "Recording"]:
@@ -105,8 +105,17 @@ class Inspected:
 
     @cached_property
     def geodetic(self) -> dict[Key, NDArray[np.float64]]:
-        """Flight and node → (epoch, 3) float64: latitude, longitude (deg), ellipsoidal height (m) of its log."""
-        return {key: geodetic_from_ecef(track.position.values) for key, track in self.tracks.items()}
+        """Flight and node → (epoch, 3) float64: latitude, longitude (deg), ellipsoidal height (m) of a log on Earth."""
+        places = {key: track.position.values for key, track in self.tracks.items() if track.attrs["frame"] == "ecef"}
+        return {key: geodetic_from_ecef(position_m) for key, position_m in places.items()}
+
+    @property
+    def frame(self) -> str:
+        """What positions are in, ecef or local; empty where only the samples say."""
+        logged = [track.attrs["frame"] for track in self.tracks.values()]
+        if logged or self.waveform:
+            return next(iter(logged), "ecef")
+        return PHASE_HISTORIES[self.campaign.settings.waveform.format].frame  # type: ignore[union-attr]
 
     @cached_property
     def crs(self) -> str | None:
@@ -119,11 +128,16 @@ class Inspected:
         middle = self.middle_m
         return None if middle is None else utm_crs(middle)
 
+    @property
+    def other_frame(self) -> bool:
+        """Whether the scene's CRS is another frame than positions are in."""
+        return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
+
     @cached_property
     def middle_m(self) -> NDArray[np.float64] | None:
         """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
         first = {flight.name for flight in self.campaign.image_flights[:1]}
-        logs = [track.position.values for (flight, _), track in self.tracks.items() if flight in first]
+        logs = [self.tracks[key].position.values for key in self.geodetic if key[0] in first]
         return np.median(np.concatenate(logs), axis=0) if logs else None
 
     @cached_property
@@ -132,7 +146,7 @@ class Inspected:
         from apertura.scene.grid import SceneGrid
 
         asked = self.campaign.settings.scene
-        if self.crs is None or asked.bounds_m == "auto" or (self.crs == LOCAL) is bool(self.waveform):
+        if self.crs is None or asked.bounds_m == "auto" or self.other_frame:
             return None
         xmin, ymin, xmax, ymax = asked.bounds_m
         spacing = min(xmax - xmin, ymax - ymin) / _NODES if asked.spacing_m == "auto" else asked.spacing_m

@@ -7,7 +7,17 @@ from typing import TypeVar
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.paths import inside
-from apertura.settings import CONFIG, FLIGHTS, SEGMENTS, Flight, read_flights, read_segments, read_settings
+from apertura.settings import (
+    CLOCKS,
+    CONFIG,
+    FLIGHTS,
+    SEGMENTS,
+    Flight,
+    read_clocks,
+    read_flights,
+    read_segments,
+    read_settings,
+)
 from apertura.settings.table import table_rows
 
 T = TypeVar("T")
@@ -21,7 +31,7 @@ class _AnyNode(frozenset[str]):
 
 
 def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
-    """Return a campaign, or None and what is wrong with config.yaml, flights.tsv and segments.tsv, each by itself.
+    """Return a campaign, or None and what is wrong with config.yaml and its tables, each by itself.
 
     Examples
     --------
@@ -37,9 +47,10 @@ def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
     flights = _tried(lambda: tuple(read_flights(_inside(root, FLIGHTS), nodes=nodes)), found)
     named = _named_flights(root / FLIGHTS) if flights is None else flights
     segments = _tried(lambda: tuple(read_segments(_inside(root, SEGMENTS), flights=named)), found) if named else ()
-    if settings is None or flights is None or segments is None:
+    clocks = _tried(lambda: tuple(read_clocks(_inside(root, CLOCKS), flights=named)), found) if named else ()
+    if settings is None or flights is None or segments is None or clocks is None:
         return None, found
-    return Campaign(root, settings, flights, segments), found
+    return Campaign(root, settings, flights, segments, clocks), found
 
 
 def _inside(root: Path, path: Path) -> Path:

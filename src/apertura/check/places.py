@@ -33,7 +33,7 @@ def check_nodes_apart(inspected: Inspected) -> Iterator[CampaignError]:
     for flight in inspected.campaign.flights if inspected.waveform else ():
         for node in flight.nodes:
             key, other = (flight.name, flight.transmitter), (flight.name, node)
-            if node == flight.transmitter or not {key, other} <= inspected.tracks.keys():
+            if node == flight.transmitter or not {key, other} <= inspected.geodetic.keys():
                 continue
             places = [np.median(inspected.tracks[one].position.values, axis=0) for one in (key, other)]
             heights = [float(np.median(inspected.geodetic[one][:, 2])) for one in (key, other)]

@@ -21,7 +21,7 @@ _FAR_UP_M = 1000.0  # between a point and the ground: heights are known at least
 def check_scene_crs(inspected: Inspected) -> Iterator[CampaignError]:
     """Yield a CRS that is not projected in metres, is not the frame of the recordings, or is not made for the place."""
     asked = inspected.campaign.settings.scene
-    if (asked.crs == LOCAL) is bool(inspected.waveform):
+    if inspected.other_frame:
         yield _other_frame(asked.crs)
     elif asked.crs not in {LOCAL, "auto"} and inspected.crs is None:
         yield _not_in_metres(inspected, asked.crs)
@@ -89,7 +89,7 @@ def _elsewhere(inspected: Inspected, crs: str) -> Iterator[CampaignError]:
 
 def _other_frame(crs: str) -> CampaignError:
     local = crs == LOCAL
-    data = "recordings whose logs hold latitude and longitude" if local else "phase history in metres of its own frame"
+    data = "positions on Earth, in latitude and longitude" if local else "positions in metres of a frame of their own"
     expected = "an EPSG code, or auto" if local else LOCAL
     return CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
 

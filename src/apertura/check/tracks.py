@@ -3,38 +3,29 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.check.inspected import Inspected, Key
-from apertura.check.tags import span
+from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.settings import CONFIG
 
 FASTEST_M_S = 340.0
 """No node flies faster than sound: times or positions are in another unit."""
 
-_NOWHERE_DEG = 1e-7
-"""A receiver without a fix logs latitude 0 and longitude 0; within a centimetre of there nobody flies."""
-
-
-_ABOUT_S = 10.0  # of the recording: positions further off matter to no pulse
-
 
 def check_tracks(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield logs that cannot be read, epochs at 0° 0° while pulses were sent, no heights, speeds beyond sound."""
+    """Yield logs that cannot be read, logs of two frames, no heights, speeds beyond sound."""
     yield from inspected.unread
     for key, track in inspected.tracks.items():
-        geodetic, during = inspected.geodetic[key], _during(inspected, key)
-        nowhere = int((np.abs(geodetic[during, :2]) < _NOWHERE_DEG).all(axis=1).sum())
         seconds = np.diff(track.time.values) / np.timedelta64(1, "s")
         steps_m = np.linalg.norm(np.diff(track.position.values, axis=0), axis=1)
         speed = float(np.median(steps_m / seconds))
         expected, remedy = "positions of a flight", "Drop those lines, or export the log again."
         found = ""
-        if nowhere:
-            found = f"{nowhere} of {len(geodetic)} epochs at latitude 0, longitude 0: the receiver had no fix"
-        elif np.abs(geodetic[:, 2]).max() < 1e-3:
+        if track.attrs["frame"] != inspected.frame:
+            found, expected = f"positions in frame {track.attrs['frame']}", f"{inspected.frame}, as the other logs"
+            remedy = "Give logs of one frame."
+        elif key in inspected.geodetic and np.abs(inspected.geodetic[key][:, 2]).max() < 1e-3:
             found, expected = "height 0 at every epoch", "metres above the ellipsoid"
             remedy = "Export the log with its heights."
         elif speed > FASTEST_M_S:
@@ -42,16 +33,6 @@ def check_tracks(inspected: Inspected) -> Iterator[CampaignError]:
             remedy = "Check the units of times (seconds) and positions (decimal degrees)."
         if found:
             yield CampaignError(found, where=inspected.campaign.track_file(*key), expected=expected, remedy=remedy)
-
-
-def _during(inspected: Inspected, key: Key) -> NDArray[np.bool_]:
-    """Return (epoch,) bool: which epochs positions of pulses rest on; all, where it is not known when it recorded."""
-    times = inspected.tracks[key].time.values
-    if key not in inspected.recordings:
-        return np.ones(len(times), bool)
-    first, last = span(inspected.recordings[key])
-    about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
-    return np.asarray((times >= first - about) & (times <= last + about))
 
 
 def check_attitude(inspected: Inspected) -> Iterator[CampaignError]:

@@ -17,6 +17,9 @@ GEODETIC = "EPSG:4979"
 LOCAL = "local"
 """CRS of a frame without a place on Earth: x east, y north, z up, metres."""
 
+LOCAL_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""North, east and down in a local frame, as columns."""
+
 Positions = NDArray[np.float64]
 
 

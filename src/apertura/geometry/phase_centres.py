@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
-from apertura.geometry.geodesy import body_axes, ned_axes
+from apertura.geometry.geodesy import LOCAL_NED, body_axes, ned_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
+
+_CUBIC = 3
 
 
 def phase_centres(
@@ -21,15 +23,17 @@ def phase_centres(
     lever_arm_m: tuple[float, float, float],
     attitude_from: Literal["log", "course", "none"],
     where: object,
+    frame: str = "ecef",
+    smoothing_m: float | None = None,
 ) -> NDArray[np.float64]:
-    """Return the ECEF position of an antenna at given times.
+    """Return the position of an antenna at given times.
 
     Parameters
     ----------
     track_time
         (epoch,) datetime64[ns], UTC.
     position
-        (epoch, 3) float64, logged point, ECEF metres.
+        (epoch, 3) float64, logged point in `frame`, metres.
     attitude
         (epoch, 3) float64, roll, pitch, yaw in radians; NaN where not logged.
     at
@@ -40,11 +44,15 @@ def phase_centres(
         Whether body axes come from the log, from the course over ground (level flight), or are not known.
     where
         The log, for messages.
+    frame
+        'ecef', or 'local': axes to east, north and up.
+    smoothing_m
+        Noise of the logged positions that a smoothing spline takes off; None: the spline goes through all epochs.
 
     Returns
     -------
     ndarray
-        (pulse, 3) float64, ECEF metres.
+        (pulse, 3) float64, metres in `frame`.
 
     Raises
     ------
@@ -57,11 +65,12 @@ def phase_centres(
     (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
-    centres = position_spline(_seconds(track_time - track_time[0]), position)(_seconds(at - track_time[0]))
+    spline = position_spline(_seconds(track_time - track_time[0]), position, smoothing_m=smoothing_m)
+    centres = spline(_seconds(at - track_time[0]))
     if not any(lever_arm_m):
         return np.asarray(centres)
     why = f"a lever arm of {list(lever_arm_m)} m"
-    turn = _turn(track_time, position, attitude, at=at, attitude_from=attitude_from, why=why, where=where)
+    turn = _turn(track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, why=why, where=where)
     return np.asarray(centres + np.einsum("pij,pjk,k->pi", *turn, np.array(lever_arm_m)))
 
 
@@ -73,13 +82,15 @@ def attitude_axes(
     at: NDArray[np.datetime64],
     attitude_from: Literal["log", "course", "none"],
     where: object,
+    frame: str = "ecef",
+    smoothing_m: float | None = None,
 ) -> NDArray[np.float64]:
     """Return how the body is turned at given times; parameters as `phase_centres`.
 
     Returns
     -------
     ndarray
-        (pulse, 3, 3) float64; columns are the body's forward, right and down unit vectors in ECEF.
+        (pulse, 3, 3) float64; columns are the body's forward, right and down unit vectors in `frame`.
 
     Raises
     ------
@@ -87,14 +98,18 @@ def attitude_axes(
         If the track does not cover `at`, or the log does not hold an attitude.
     """
     _check_covered(track_time, at, where)
+    spline = position_spline(_seconds(track_time - track_time[0]), position, smoothing_m=smoothing_m)
+    why = "an antenna's beam"
     ned, body = _turn(
-        track_time, position, attitude, at=at, attitude_from=attitude_from, why="an antenna's beam", where=where
+        track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, why=why, where=where
     )
     return ned @ body
 
 
-def position_spline(time_s: NDArray[np.float64], position: NDArray[np.float64]) -> "BSpline":
-    """Return the cubic spline through the epochs of a log: what is said of positions between them.
+def position_spline(
+    time_s: NDArray[np.float64], position: NDArray[np.float64], *, smoothing_m: float | None = None
+) -> "BSpline":
+    """Return the cubic spline through the epochs of a log, or near them: what is said of positions between them.
 
     Parameters
     ----------
@@ -102,31 +117,43 @@ def position_spline(time_s: NDArray[np.float64], position: NDArray[np.float64]) 
         (epoch,) float64, seconds, ascending.
     position
         (epoch, 3) float64, metres.
+    smoothing_m
+        Noise of the epochs in each axis: the spline with the fewest knots that stays as near to them, rms; None: the
+        one through all of them.
+
+    Notes
+    -----
+    Source: P. Dierckx, "Curve and Surface Fitting with Splines", Oxford 1993: the sum of squares of what the spline
+    leaves is 3·n·smoothing_m².
 
     Examples
     --------
     >>> position_spline(np.arange(5.0), np.arange(15.0).reshape(5, 3))(2.5).round(9)
     array([7.5, 8.5, 9.5])
     """
-    from scipy.interpolate import make_interp_spline  # slow to import, and most steps only read finished positions
+    from scipy.interpolate import BSpline, make_interp_spline, splprep  # slow to import, and few steps need them
 
-    return make_interp_spline(time_s, position, k=min(3, len(time_s) - 1))
+    if smoothing_m is not None and len(time_s) > _CUBIC:
+        middle = position.mean(axis=0)  # of ECEF: the fit works with what is left
+        knots, coefficients, degree = splprep((position - middle).T, u=time_s, s=position.size * smoothing_m**2)[0]
+        return BSpline(knots, np.stack(coefficients, axis=-1) + middle, degree)
+    return make_interp_spline(time_s, position, k=min(_CUBIC, len(time_s) - 1))
 
 
 def _turn(
     track_time: NDArray[np.datetime64],
-    position: NDArray[np.float64],
     attitude: NDArray[np.float64],
+    spline: "BSpline",
     *,
     at: NDArray[np.datetime64],
     attitude_from: Literal["log", "course", "none"],
+    frame: str,
     why: str,
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return NED → ECEF and body → NED at given times; `why` they are needed."""
+    """Return NED → `frame` and body → NED at given times; `why` they are needed."""
     pulses = _seconds(at - track_time[0])
-    spline = position_spline(_seconds(track_time - track_time[0]), position)
-    ned = ned_axes(spline(pulses))
+    ned = ned_axes(spline(pulses)) if frame == "ecef" else np.broadcast_to(LOCAL_NED, (len(pulses), 3, 3))
     angles = (
         _course(spline.derivative()(pulses), ned)
         if attitude_from == "course"
@@ -152,7 +179,7 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
             remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "
-            "both nodes are placed, or give the whole log.",
+            "both nodes are placed, or give the whole log; a recorder with a clock of its own: `apertura align`.",
         )
 
 

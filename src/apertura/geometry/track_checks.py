@@ -57,7 +57,14 @@ class CheckedTrack:
         }
 
 
-def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool_], tolerated_m: float) -> CheckedTrack:
+def check_track(
+    time_s: Floats,
+    position_m: Floats,
+    *,
+    poor_fix: NDArray[np.bool_],
+    tolerated_m: float,
+    longest_gap_s: float = np.inf,
+) -> CheckedTrack:
     """Return which epochs of a log are sound and where it has holes.
 
     Parameters
@@ -70,6 +77,8 @@ def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool
         (epoch,) bool, epochs whose solution is worse than asked for.
     tolerated_m
         Error of the spline through a gap that an image bears, such as λ/16, metres.
+    longest_gap_s
+        Between epochs, whatever a spline through it costs, seconds.
 
     Notes
     -----
@@ -98,7 +107,7 @@ def check_track(time_s: Floats, position_m: Floats, *, poor_fix: NDArray[np.bool
         faults["track_times"] = [(float(time_s[0]), rounded_m)]
     return CheckedTrack(
         cause == "",
-        (*_holes(time_s, place, cause, tolerated_m), *steps),
+        (*_holes(time_s, place, cause, tolerated_m, longest_gap_s), *steps),
         {name: tuple(sorted(where, key=lambda fault: -fault[1])) for name, where in faults.items() if where},
         _interpolation_m(time_s[sound], place[sound]),
     )
@@ -128,7 +137,9 @@ def _listed(time_s: Floats, size_m: Floats) -> list[tuple[float, float]]:
     return list(zip(time_s.tolist(), size_m.tolist(), strict=True))
 
 
-def _holes(time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerated_m: float) -> list[Hole]:
+def _holes(
+    time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerated_m: float, longest_gap_s: float
+) -> list[Hole]:
     """Return the times between sound epochs where the log is silent for too long, or its fix is poor."""
     sound = np.flatnonzero(cause == "")
     if sound.size < 2:
@@ -139,13 +150,14 @@ def _holes(time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerate
     ends = ((-np.inf, float(time[0]), 0), (float(time[-1]), np.inf, -1))
     holes = [Hole(start_s, end_s, str(cause[epoch]), np.inf) for start_s, end_s, epoch in ends if cause[epoch]]
     lengths = np.diff(time)
-    for number in np.flatnonzero((lengths > LONG_GAP * interval_s) | (np.diff(sound) > 1)):
+    shortest_s = min(LONG_GAP * interval_s, longest_gap_s)
+    for number in np.flatnonzero((lengths > shortest_s) | (np.diff(sound) > 1)):
         inside = set(cause[sound[number] + 1 : sound[number + 1]].tolist())
         poor, missing = "fix_poor" in inside, round(float(lengths[number]) / interval_s) - 1
-        if not poor and lengths[number] <= LONG_GAP * interval_s:
+        if not poor and lengths[number] <= shortest_s:
             continue
         error_m = _gap_error_m(time, place, missing)
-        if poor or error_m > bearable_m:
+        if poor or error_m > bearable_m or lengths[number] > longest_gap_s:
             name = "fix_poor" if poor else min(inside, default="track_gap")
             holes.append(Hole(float(time[number]), float(time[number + 1]), name, error_m))
     return holes

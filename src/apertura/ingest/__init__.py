@@ -6,7 +6,8 @@ Rows name their readers and do not import them: a step pays for the formats that
 import pkgutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apertura.atomic import naming
 from apertura.errors import CampaignError, quoted
@@ -40,8 +41,24 @@ TRACKS: Mapping[str, LogFormat] = {
 
 _HEADING_BYTES = 8192
 
-PHASE_HISTORIES: Mapping[str, tuple[str, str]] = {"afrl_mat": (".mat", "apertura.ingest.afrl:read_afrl_mat")}
-"""waveform.format → suffix of <node>.*, reader(paths, pair=) → `echo`."""
+
+class HistoryFormat(NamedTuple):
+    """How phase history is read."""
+
+    suffix: str
+    """Of <node>.*, or of <node> itself."""
+    reader: str
+    """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs."""
+    described: bool = False
+    """Whether the reader also takes described=, the section `waveform` of the config."""
+    frame: str = ""
+    """Of its positions, local or ecef; empty: the files say, or a flight log."""
+
+
+PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
+    "afrl_mat": HistoryFormat(".mat", "apertura.ingest.afrl:read_afrl_mat", frame="local"),
+}
+"""waveform.format → how it is read."""
 
 
 def open_recording(files: Sequence[Path]) -> "Recording":
@@ -107,7 +124,23 @@ def log_suffixes() -> list[str]:
     return sorted({suffix[1:] for row in TRACKS.values() for suffix in row.suffixes})
 
 
-def read_phase_history(kind: str, paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
-    """Return the `echo` stage of phase-history files; `kind` is a key of `PHASE_HISTORIES`."""
-    echo: xr.Dataset = pkgutil.resolve_name(PHASE_HISTORIES[kind][1])(paths, pair=pair)
+def read_phase_history(
+    kind: str, paths: Sequence[Path], *, pair: str, described: Mapping[str, Any] = MappingProxyType({})
+) -> "xr.Dataset":
+    """Return the `echo` stage of phase-history files.
+
+    Parameters
+    ----------
+    kind
+        A key of `PHASE_HISTORIES`.
+    paths
+        The files, joined in this order.
+    pair
+        Transmitter-receiver.
+    described
+        What the config says of the waveform, for formats that do not say it.
+    """
+    row = PHASE_HISTORIES[kind]
+    further = {"described": described} if row.described else {}
+    echo: xr.Dataset = pkgutil.resolve_name(row.reader)(paths, pair=pair, **further)
     return echo

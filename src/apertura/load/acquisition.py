@@ -2,60 +2,47 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.digests import digest_of
 from apertura.echo.association import Association, associate
 from apertura.echo.captures import Read
 from apertura.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.errors import CampaignError
-from apertura.geometry.phase_centres import attitude_axes, phase_centres
-from apertura.geometry.track_checks import CheckedTrack, check_track
 from apertura.ingest.sample_file import SampleFile
-from apertura.ingest.track import FIXES
+from apertura.load.node_log import NodeLog, shortest_wave
 from apertura.paths import inside
-from apertura.settings import Node, OfdmWaveform
+from apertura.settings import OfdmWaveform
 from apertura.store import open_stage
-
-Times = NDArray[np.datetime64]
 
 
 @dataclass(frozen=True)
-class Acquisition:
-    """What one node recorded in one flight.
+class Acquisition(NodeLog):
+    """What one node recorded in one flight, beside its log.
 
     Attributes
     ----------
-    name, settings
-        Of the node.
-    raw, track
-        Its stages.
+    raw
+        Its stage.
     samples
         The recorder's file.
     files
         raw/<flight>/<node>, what its files' names begin with.
-    recording, log
-        Its files of samples, and its flight log, for messages.
+    recording
+        Its files of samples, for messages.
     numerology
         Of the symbol.
     """
 
-    name: str
     raw: xr.Dataset
-    track: xr.Dataset
-    settings: Node
     samples: SampleFile
     files: Path
     recording: str
-    log: str
     numerology: Numerology
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
@@ -102,72 +89,6 @@ class Acquisition:
 
         return read
 
-    @cached_property
-    def checked(self) -> CheckedTrack:
-        """What may be used of the log: errors of λ/16 between its epochs are borne."""
-        poor = np.zeros(self.track.sizes["epoch"], bool)
-        if "fix" in self.track:
-            poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
-        return check_track(
-            self.log_seconds(self.track.time.values),
-            self.track.position.values,
-            poor_fix=poor,
-            tolerated_m=SPEED_OF_LIGHT_M_S / float(self.numerology.frequency_hz[-1]) / 16,
-        )
-
-    def log_seconds(self, at: Times) -> NDArray[np.float64]:
-        """Return times as seconds since the log's first epoch, float64."""
-        return np.asarray((at - self.track.time.values[0]) / np.timedelta64(1, "s"))
-
-    def log_time(self, time_s: float) -> str:
-        """Return the UTC time of day, to 10 ms, of seconds since the log's first epoch."""
-        time = self.track.time.values[0] + np.timedelta64(round(time_s * 1e9), "ns")
-        return f"{np.datetime_as_string(time, 'ms')[11:-1]}Z"
-
-    @property
-    def interval_s(self) -> float:
-        """Median time between epochs of the log, seconds."""
-        return float(np.median(np.diff(self.log_seconds(self.track.time.values))))
-
-    @property
-    def speed_m_s(self) -> float:
-        """Median speed over the log, metres per second."""
-        step_m = np.linalg.norm(np.diff(self.track.position.values, axis=0), axis=1)
-        return float(np.median(step_m / np.diff(self.log_seconds(self.track.time.values))))
-
-    def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
-        """Return where an antenna was, by the sound epochs of the log, (time, 3) float64 metres, ECEF."""
-        return phase_centres(
-            *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
-        )
-
-    def body_axes(self, at: Times) -> NDArray[np.float64]:
-        """Return forward, right, down of the body in ECEF at given times, (time, axis, body) float64."""
-        return attitude_axes(*self._sound, at=at, **self._from_log)
-
-    @property
-    def _sound(self) -> tuple[Times, NDArray[np.float64], NDArray[np.float64]]:
-        sound = self.track.isel(epoch=self.checked.kept)
-        return sound.time.values, sound.position.values, sound.attitude.values
-
-    @property
-    def _from_log(self) -> dict[str, Any]:
-        return {"attitude_from": self.settings.attitude, "where": self.log}
-
-
-def poorer_fix(fix: NDArray[np.int8], worst: Literal["fix", "float", "any"]) -> NDArray[np.bool_]:
-    """Return (epoch,) bool: solutions poorer than `worst`; none in a log without RTK, nor where nothing is logged.
-
-    Examples
-    --------
-    >>> poorer_fix(np.array([1, 2, 5, 0], np.int8), "fix"), poorer_fix(np.array([5, 4], np.int8), "fix")
-    (array([False,  True,  True, False]), array([False, False]))
-    """
-    rtk = FIXES["fix"], FIXES["float"]
-    if worst == "any" or not np.isin(fix, rtk).any():
-        return np.zeros(len(fix), bool)
-    return ~np.isin(fix, (0, *rtk[: 1 + (worst == "float")]))
-
 
 def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Acquisition:
     """Return the finished raw and track stages of a node.
@@ -178,6 +99,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmW
         If it was recorded at another carrier or sample rate than `waveform`.
     """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
+    raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
     files = Path("raw") / flight / node
     recording, log = (_read_from(stage, files) for stage in (raw, track))
     for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
@@ -193,7 +115,8 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmW
     samples = SampleFile(path, len(raw.attrs["channels"]))
     _check_same(campaign, raw)
     settings, numerology = campaign.settings.nodes[node], numerology_of(waveform)
-    return Acquisition(node, raw, track, settings, samples, files, recording, log, numerology)
+    wave_m = shortest_wave(numerology.frequency_hz)
+    return Acquisition(node, settings, track, log, wave_m, raw, samples, files, recording, numerology)
 
 
 def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:

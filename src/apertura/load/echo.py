@@ -16,7 +16,8 @@ from apertura.echo.captures import Pulses, Saturation, blocks_of
 from apertura.echo.demodulate import remove_path
 from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
-from apertura.load.acquisition import Acquisition, Times, common_pulses
+from apertura.load.acquisition import Acquisition, common_pulses
+from apertura.load.node_log import Times
 from apertura.load.positions import Placed, place
 from apertura.load.segments import keep_segments
 from apertura.load.transmitted import symbol_samples

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,17 +15,17 @@ from apertura.echo.compression import window_weights
 from apertura.echo.demodulate import subcarrier_numbers
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
-from apertura.geometry.phase_centres import attitude_axes, phase_centres
 from apertura.imaging.stages import phase_history_of
 from apertura.ingest import open_recording
 from apertura.load.antennas import beams_of, body_axes
+from apertura.load.node_log import raw_log, shortest_wave
 from apertura.load.positions import position_error
 from apertura.load.recorded import recorded_echo
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
 from apertura.quality.budget import NodePositions
 from apertura.quality.path_errors import Effect
-from apertura.settings import Node, OfdmWaveform
+from apertura.settings import OfdmWaveform
 from apertura.store import manifest_of, open_stage
 
 
@@ -98,7 +97,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     if echo is None:
         if isinstance(waveform, OfdmWaveform):
             return _expected(campaign, flight, pair, waveform)
-        echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair, waveform.format))
+        echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     limit_m = float(echo.path_limit.values.min())
     beams = beams_of(campaign, pair, body_axes(echo))
@@ -120,50 +119,27 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     )
 
 
-@dataclass(frozen=True)
-class _Log:
-    """A node's log as it lies in raw/, and what the config says of the node."""
-
-    track: xr.Dataset
-    settings: Node
-    file: Path
-
-    def antenna(self, name: str, at: NDArray[np.datetime64]) -> NDArray[np.float64]:
-        arm = getattr(self.settings.lever_arms_m, name)
-        return phase_centres(*self._epochs, at=at, lever_arm_m=arm, **self._stated)
-
-    def body_axes(self, at: NDArray[np.datetime64]) -> NDArray[np.float64]:
-        return attitude_axes(*self._epochs, at=at, **self._stated)
-
-    @property
-    def _epochs(self) -> tuple[NDArray[np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
-        return self.track.time.values, self.track.position.values, self.track.attitude.values
-
-    @property
-    def _stated(self) -> dict[str, Any]:
-        return {"attitude_from": self.settings.attitude, "where": self.file}
-
-
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
     """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
-    tx, rx = (_log(campaign, flight, node) for node in pair.split("-"))
+    numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
+    frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
+    tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
     last = min(log.track.time.values[-1] for log in (tx, rx))
-    recorded = open_recording(campaign.recording_files(flight, pair.split("-", maxsplit=1)[0])).captures.time
+    recorded = open_recording(campaign.recording_files(flight, tx.name)).captures.time
+    recorded = campaign.clock(flight, tx.name).utc(recorded)
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
     times = times[inside_segments(campaign, flight, pair, times)]
     beams = {"radar_tx": tx, "radar_rx": rx}
     axes = {antenna: beams[antenna].body_axes(times) for antenna in campaign.antennas(pair)}
     offset = rx.settings.path_offset_m
     beyond_m = offset.radar
-    if tx.file != rx.file:
+    if tx.name != rx.name:
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
         beyond_m -= offset.sidelink + float(length_m.min())
-    numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
     weight = window_weights(campaign.settings.processing.window, len(frequency))
     limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m
-    known = {log.file: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
+    known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     return OpenPair(
         flight,
         pair,
@@ -176,11 +152,6 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
     )
-
-
-def _log(campaign: Campaign, flight: str, node: str) -> _Log:
-    file = campaign.track_file(flight, node)
-    return _Log(campaign.read_log(flight, node), campaign.settings.nodes[node], file)
 
 
 def _pulse_times(

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
 from apertura.geometry.track_checks import CheckedTrack
-from apertura.load.acquisition import Acquisition
+from apertura.load.node_log import NodeLog, Times
 from apertura.settings import Node
-
-Times = NDArray[np.datetime64]
 
 _LINES = {
     "fix_poor": "the log's solution is poorer than {asked}",
@@ -36,7 +34,7 @@ class Placed:
     flags
         Edge crossed → what was measured, in one line.
     report
-        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m.
+        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m, and smoothing_residual_m where that was asked.
     """
 
     good: NDArray[np.bool_]
@@ -45,7 +43,7 @@ class Placed:
     report: dict[str, dict[str, Any]]
 
 
-def place(tx: Acquisition, rx: Acquisition, at: Times) -> Placed:
+def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
     """Return which pulses, at the transmitter's tags `at`, both logs of a pair give positions for.
 
     Raises
@@ -71,9 +69,15 @@ def place(tx: Acquisition, rx: Acquisition, at: Times) -> Placed:
     report = {
         leg: position_error(node.track, node.settings, at[good])
         | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
+        | _smoothed(node)
         for leg, node in (("tx", tx), ("rx", rx))
     }
     return Placed(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
+
+
+def _smoothed(node: NodeLog) -> dict[str, float]:
+    residual_m = node.smoothing_residual_m
+    return {} if residual_m is None else {"smoothing_residual_m": residual_m}
 
 
 def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
@@ -108,7 +112,7 @@ def stated_error(settings: Node) -> dict[str, Any]:
     }
 
 
-def _flags(node: Acquisition, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
+def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
     """Return what of a node's log touches its pulses: flag → one line."""
     checked, lines = node.checked, {}
     begin, end = node.log_seconds(at[[0, -1]]) + np.array([-1.0, 1.0]) * 2 * node.interval_s
@@ -121,6 +125,9 @@ def _flags(node: Acquisition, at: Times, barred: dict[str, NDArray[np.bool_]]) -
         longest = _longest(node, checked, name) if out else ""
         asked = what.format(asked=node.settings.worst_fix)
         lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {asked}{longest}{worst}"
+    if node.track.attrs["dropped"]:
+        counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
+        lines["track_epochs_dropped"] = f"{node.name}: epochs of the log left out: {counted}"
     if "track_times" in checked.faults:
         lines["track_times"] = (
             f"{node.name}: times of the log are written so coarsely that positions err by "
@@ -129,12 +136,12 @@ def _flags(node: Acquisition, at: Times, barred: dict[str, NDArray[np.bool_]]) -
     return lines
 
 
-def _worst(node: Acquisition, faults: list[tuple[float, float]]) -> str:
+def _worst(node: NodeLog, faults: list[tuple[float, float]]) -> str:
     time_s, size_m = faults[0]
     return f"{size_m:.3f} m at {node.log_time(time_s)}" if size_m else f"at {node.log_time(time_s)}"
 
 
-def _longest(node: Acquisition, checked: CheckedTrack, cause: str) -> str:
+def _longest(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
     holes = [hole for hole in checked.holes if hole.cause == cause and np.isfinite(hole.end_s - hole.start_s)]
     if not holes:
         return " at an end of the log"

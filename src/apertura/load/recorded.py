@@ -1,18 +1,72 @@
-"""The echo of a recorder that hands over transfer functions, as it lies in raw/."""
+"""The echo of a recorder that hands over transfer functions, as it lies in raw/; its positions may lie in a log."""
+
+from typing import Any
 
 import xarray as xr
 
 from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.errors import CampaignError
 from apertura.ingest import read_phase_history
-from apertura.load.positions import stated_error
+from apertura.load.node_log import raw_log, shortest_wave
+from apertura.load.positions import place, stated_error
 
 
-def recorded_echo(campaign: Campaign, flight: str, pair: str, kind: str) -> xr.Dataset:
-    """Return the echo of a pair; `kind` is a key of `PHASE_HISTORIES`.
+def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
+    """Return the echo of a pair as a recorder wrote it, at the times of its log's clock.
 
-    Its positions travel with its samples; how well they are known only the config can say.
+    Raises
+    ------
+    CampaignError
+        If positions travel neither with the samples nor in a flight log, or do in both.
     """
     tx, rx = pair.split("-")
-    nodes, files = campaign.settings.nodes, list(campaign.raw_files(flight, rx).values())
+    files = campaign.history_files(flight, rx)
+    described = campaign.settings.waveform.model_dump()
+    history = read_phase_history(described["format"], files, pair=pair, described=described)
+    history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
+    logged, placed = campaign.logged(flight, tx), "tx_position" in history
+    if logged == placed:
+        found = "positions both with the samples and in a flight log" if logged else "samples without positions"
+        expected = "positions of one source: phase history with positions, or a flight log raw/<flight>/<node>.track.*"
+        raise CampaignError(found, files[0], expected, "Take one away." if logged else "Copy the flight log there.")
+    if logged:
+        return _placed_by_logs(campaign, flight, (tx, rx), history)
+    nodes = campaign.settings.nodes
     known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
-    return read_phase_history(kind, files, pair=pair).assign_attrs(positions=known)
+    return history.assign_attrs(positions=known)
+
+
+def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:
+    """Return phase history at the antennas' places, without the pulses that have none.
+
+    The path of the receiving node beyond geometry (docs/theory.md, eq. 3) comes off the delay that samples are referred
+    to: no sample changes.
+    """
+    wave_m = shortest_wave(history.frequency.values)
+    logs = {node: raw_log(campaign, flight, node, wave_m) for node in nodes}
+    tx, rx = (logs[node] for node in nodes)
+    placed = place(tx, rx, history.time.values)
+    history = history.isel(pulse=placed.good)
+    at = history.time.values
+    offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S
+    beams = {"tx_axes": (tx, tx.settings.antennas.radar_tx), "rx_axes": (rx, rx.settings.antennas.radar_rx)}
+    axes: dict[str, Any] = {
+        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, (log, beam) in beams.items() if beam
+    }
+    counts: dict[str, Any] = {"used": len(at), "dropped": int((~placed.good).sum()), "reasons": placed.reasons}
+    clock = campaign.clock(flight, rx.name)
+    return history.assign(
+        reference_delay=history.reference_delay - offset_s,
+        path_limit=history.path_limit - offset_s * SPEED_OF_LIGHT_M_S,
+        tx_position=(("pulse", "axis"), tx.antenna("radar_tx", at)),
+        rx_position=(("pulse", "axis"), rx.antenna("radar_rx", at)),
+        **axes,
+    ).assign_attrs(
+        frame=tx.track.attrs["frame"],
+        flags={**history.attrs["flags"], **placed.flags},
+        positions=placed.report,
+        pulses=counts,
+        stated_offset_m=rx.settings.path_offset_m.radar,
+        time_tags={"std_s": tx.settings.time_tag_std_s if clock.std_s is None else clock.std_s},
+    )

@@ -13,7 +13,8 @@ from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.stages import aperture_of, phase_history_of
-from apertura.load.acquisition import Acquisition, Times
+from apertura.load.acquisition import Acquisition
+from apertura.load.node_log import Times
 
 MOST_PULSES = 512
 """Pulses of a pair that suspicions are tried on, evenly spread."""

@@ -3,6 +3,7 @@
 Only `load`, `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
 """
 
+from apertura.settings.clocks import CLOCKS, Clock, read_clocks
 from apertura.settings.config import CONFIG, Settings, located, read_settings, validated
 from apertura.settings.flights import FLIGHTS, Flight, read_flights
 from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
@@ -13,12 +14,14 @@ from apertura.settings.segments import SEGMENTS, Segment, read_segments
 from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Waveform
 
 __all__ = [
+    "CLOCKS",
     "CONFIG",
     "FLIGHTS",
     "SEGMENTS",
     "Antenna",
     "Antennas",
     "Calibration",
+    "Clock",
     "Flight",
     "LeverArms",
     "Name",
@@ -33,6 +36,7 @@ __all__ = [
     "Settings",
     "Waveform",
     "located",
+    "read_clocks",
     "read_flights",
     "read_segments",
     "read_settings",

@@ -25,8 +25,8 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     parents: list[xr.Dataset] = []
     calibration = calibrated(campaign, flight, pair)
     if isinstance(waveform, PhaseHistoryWaveform):
-        files = list(campaign.raw_files(flight, pair.split("-")[1]).values())
-        formed = PairEcho.recorded(recorded_echo(campaign, flight, pair, waveform.format))
+        files = [campaign.root / name for name in lineage.result.sources]
+        formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
     else:
         files = [campaign.codes_file]
         codes = read_codes(files[0], waveform.subcarriers)

@@ -1,0 +1,97 @@
+"""raw/ of a campaign folder: which file holds what, by the names of flights and nodes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apertura.errors import CampaignError
+from apertura.ingest import PHASE_HISTORIES, RECORDERS, log_suffixes, read_track
+from apertura.paths import inside
+from apertura.settings import FLIGHTS, OfdmWaveform, Settings
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class RawFolder:
+    """What lies in raw/ of a campaign.
+
+    Attributes
+    ----------
+    root
+        The campaign folder.
+    settings
+        Its config.
+    """
+
+    root: Path
+    settings: Settings
+
+    def raw_files(self, flight: str, node: str) -> dict[str, Path]:
+        """Return role → file of everything recorded by `node` in `flight`."""
+        if isinstance(self.settings.waveform, OfdmWaveform):
+            recorded = {path.suffix: path for path in self.recording_files(flight, node)}
+            return {**recorded, "track": self.track_file(flight, node)}
+        history = {f"history.{path.name}": path for path in self.history_files(flight, node)}
+        return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
+
+    def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
+        """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
+        folder = self.root / "raw" / flight
+        begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
+        row = next(begun, next(iter(RECORDERS)))
+        return tuple(self._raw_file(flight, node, suffix) for suffix in row)
+
+    def history_files(self, flight: str, node: str) -> list[Path]:
+        """Return the files of a node's phase history, in the order of their names."""
+        suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
+        found = sorted((self.root / "raw" / flight).glob(f"{node}*{suffix}"))
+        own = [path.name for path in found if path.name[len(node)] == "." and not _is_log(path, node)]
+        if not own:
+            raise CampaignError(
+                "no such file",
+                where=self.root / "raw" / flight / f"{node}.*{suffix}",
+                expected=f"the phase history of node {node} in flight {flight}",
+                remedy=f"Copy the {suffix} files there, named <node>{suffix} or <node>.<anything>{suffix}.",
+            )
+        return [self._recorded(flight, name) for name in own]
+
+    def logged(self, flight: str, node: str) -> bool:
+        """Return whether a flight log of a node lies there."""
+        return any((self.root / "raw" / flight).glob(f"{node}.track.*"))
+
+    def track_file(self, flight: str, node: str) -> Path:
+        """Return the one raw/<flight>/<node>.track.* file."""
+        logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
+        if len(logs) == 1:
+            return self._recorded(flight, logs[0].name)
+        raise CampaignError(
+            f"{len(logs)} track files {[path.name for path in logs]}",
+            where=self.root / "raw" / flight / f"{node}.track.*",
+            expected=f"exactly one flight log of node {node}",
+            remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
+        )
+
+    def read_log(self, flight: str, node: str) -> "xr.Dataset":
+        """Return the `track` stage of a node's flight log."""
+        return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
+
+    def _recorded(self, flight: str, name: str) -> Path:
+        return inside(self.root, f"raw/{flight}/{name}", where=self.root)
+
+    def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
+        """Return raw/<flight>/<node><suffix>, which must exist."""
+        path = self._recorded(flight, f"{node}{suffix}")
+        if not path.is_file():
+            raise CampaignError(
+                "no such file",
+                where=path,
+                expected=f"the recording of node {node} in flight {flight}",
+                remedy=f"Copy it there, or take {node} out of the nodes of {flight} in {FLIGHTS}.",
+            )
+        return path
+
+
+def _is_log(path: Path, node: str) -> bool:
+    return path.name.startswith(f"{node}.track.")

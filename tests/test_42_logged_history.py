@@ -1,0 +1,136 @@
+"""Phase history whose positions lie in a flight log, and whose clock is not the log's."""
+
+import numpy as np
+import pytest
+import xarray as xr
+import yaml
+from folders import complaint, run_steps
+
+from apertura.campaign import Campaign
+from apertura.check import problems
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
+from apertura.ingest import PHASE_HISTORIES, HistoryFormat
+from apertura.store import open_stage
+
+CRS = "EPSG:32632"
+EAST, NORTH = 570_000.0, 5_363_000.0
+FREQUENCY = 1.2e9 + 2e6 * np.arange(200)
+BEGAN = np.datetime64("2025-05-14T09:30", "ns")
+BEHIND_S = 4.44
+"""By which the recorder's clock is behind the log's."""
+
+
+def place(east, north, up):
+    return ecef_from_projected(CRS, EAST + np.asarray(east), NORTH + np.asarray(north), np.asarray(up) + 500.0)
+
+
+def read_toy_history(paths, *, pair):
+    stored = np.load(paths[0])
+    count = len(stored["time"])
+    return xr.Dataset(
+        {
+            "time": ("pulse", stored["time"]),
+            "transfer": (("pulse", "subcarrier"), stored["transfer"]),
+            "frequency": ("subcarrier", FREQUENCY),
+            "reference_delay": ("pulse", np.zeros(count)),
+            "path_limit": ("pulse", np.full(count, np.inf)),
+        },
+        attrs={"pair": pair, "flags": {}},
+    )
+
+
+@pytest.fixture
+def campaign(tmp_path, monkeypatch):
+    """Twelve metres flown in twelve seconds, unevenly, past one target; 1.5 m of cable."""
+    monkeypatch.setitem(PHASE_HISTORIES, "toy", HistoryFormat(".npz", f"{__name__}:read_toy_history"))
+    root = tmp_path / "campaign"
+    (root / "raw" / "f01").mkdir(parents=True)
+    (root / "config").mkdir()
+    epoch_s, pulse_s = np.arange(0, 14, 0.1), np.arange(1, 13, 0.02)
+
+    def flown(time_s):
+        return place(time_s - 7 + 0.3 * np.sin(time_s), np.zeros_like(time_s), np.full_like(time_s, 10.0))
+
+    rows = [
+        f"{BEGAN + np.timedelta64(round(t * 1e9), 'ns')}Z,{lat:.10f},{lon:.10f},{height:.5f}"
+        for t, (lat, lon, height) in zip(epoch_s, geodetic_from_ecef(flown(epoch_s)), strict=True)
+    ]
+    head = "time_utc,latitude_deg,longitude_deg,height_m"
+    (root / "raw/f01/uav1.track.csv").write_text("\n".join([head, *rows]) + "\n")
+    path_m = 2 * np.linalg.norm(flown(pulse_s) - place(1.0, 20.0, 0.0), axis=1) + 1.5
+    transfer = np.exp(-2j * np.pi * FREQUENCY * path_m[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+    clock = BEGAN + np.round((pulse_s - BEHIND_S) * 1e9).astype("timedelta64[ns]")
+    np.savez(root / "raw/f01/uav1.npz", time=clock, transfer=transfer)
+    config = {
+        "campaign": "rail",
+        "waveform": {"kind": "phase_history", "format": "toy"},
+        "nodes": {"uav1": {"path_offset_m": {"radar": 1.5}, "log": {"longest_gap_s": 1.0}}},
+        "scene": {
+            "crs": CRS,
+            "bounds_m": [EAST - 3.0625, NORTH + 16.9375, EAST + 4.9375, NORTH + 22.9375],
+            "spacing_m": 0.125,
+            "height_m": 500.0,
+            "height_datum": "ellipsoid",
+        },
+    }
+    (root / "config/config.yaml").write_text(yaml.safe_dump(config))
+    (root / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1\n")
+    return root
+
+
+def keep_time(root, offset_s=BEHIND_S, **cells):
+    cells = {"flight": "f01", "node": "uav1", "offset_s": offset_s, "drift_ppm": 0, "std_s": 1e-3} | cells
+    table = "\n".join("\t".join(map(str, row)) for row in (cells.keys(), cells.values()))
+    (root / "config/clocks.tsv").write_text(table + "\n")
+
+
+def brightest(root):
+    image = abs(open_stage(Campaign.load(root).stage("image", "f01", "uav1-uav1"), "image").image)
+    peak = image.argmax(...)
+    return float(image.x[peak["x"]]) - EAST, float(image.y[peak["y"]]) - NORTH, float(image.max())
+
+
+def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
+    keep_time(campaign)
+    assert problems(campaign) == []
+    run_steps(campaign, exports=False)
+    east, north, peak = brightest(campaign)
+    assert (east, north) == (1.0, 20.0)
+    assert peak > 0.97
+    echo = open_stage(Campaign.load(campaign).stage("echo", "f01", "uav1-uav1"), "echo")
+    assert echo.attrs["time_tags"]["std_s"] == 1e-3
+    assert echo.attrs["frame"] == "ecef"
+
+
+def test_by_a_clock_half_a_second_off_the_target_is_as_far_off_as_was_flown_meanwhile(campaign):
+    keep_time(campaign, BEHIND_S + 0.5)
+    run_steps(campaign, exports=False)
+    assert abs(brightest(campaign)[0] - 1.5) < 0.25
+
+
+def test_a_log_that_does_not_cover_the_pulses_is_told_of_with_the_clock(campaign):
+    message = complaint(lambda: run_steps(campaign, exports=False))
+    assert "begins 3.440 s after the first pulse" in message
+    assert "apertura align" in message
+
+
+@pytest.mark.parametrize(
+    ("cells", "told"),
+    [
+        ({"node": "uav7"}, "flight f01 has no node 'uav7'"),
+        ({"offset_s": "soon"}, "offset_s 'soon'"),
+        ({"drift_ppm": 5000}, "drift_ppm '5000'"),
+    ],
+)
+def test_a_line_of_clocks_that_makes_no_sense_is_named(campaign, cells, told):
+    keep_time(campaign, **cells)
+    message = complaint(lambda: Campaign.load(campaign))
+    assert "clocks.tsv: line 2" in message
+    assert told in message
+
+
+def test_samples_without_any_positions_are_refused(campaign):
+    (campaign / "raw/f01/uav1.track.csv").unlink()
+    message = complaint(lambda: run_steps(campaign, exports=False))
+    assert "samples without positions" in message
