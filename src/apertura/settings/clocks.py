@@ -59,7 +59,8 @@ class Clock:
             return times
         elapsed_ns = (times - times[0]).astype("int64")
         further_ns = self.offset_ns + (elapsed_ns * (self.drift_ppm * 1e-6)).round().astype("int64")
-        return times + further_ns.astype("timedelta64[ns]")
+        shifted: NDArray[np.datetime64] = times + further_ns.astype("timedelta64[ns]")
+        return shifted
 
 
 def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[Clock]:
