@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apertura import __version__
+from apertura import __version__, raw_commands
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError, explained
 from apertura.paths import leave_working_folder
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
+app.command()(raw_commands.align)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]

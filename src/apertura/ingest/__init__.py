@@ -57,6 +57,7 @@ class HistoryFormat(NamedTuple):
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "afrl_mat": HistoryFormat(".mat", "apertura.ingest.afrl:read_afrl_mat", frame="local"),
+    "pulson": HistoryFormat(".out", "apertura.ingest.pulson:read_pulson"),
 }
 """waveform.format → how it is read."""
 

@@ -3,7 +3,7 @@
 Only `load`, `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
 """
 
-from apertura.settings.clocks import CLOCKS, Clock, read_clocks
+from apertura.settings.clocks import CLOCK_COLUMNS, CLOCKS, Clock, read_clocks
 from apertura.settings.config import CONFIG, Settings, located, read_settings, validated
 from apertura.settings.flights import FLIGHTS, Flight, read_flights
 from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
@@ -15,6 +15,7 @@ from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Wavef
 
 __all__ = [
     "CLOCKS",
+    "CLOCK_COLUMNS",
     "CONFIG",
     "FLIGHTS",
     "SEGMENTS",

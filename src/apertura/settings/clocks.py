@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CLOCKS = Path("config/clocks.tsv")
-_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
+CLOCK_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
 _FARTHEST_S, _LARGEST_PPM = Decimal(5_000_000_000), Decimal(1000)
 _EXPECTED = "flight, node, seconds to add to the recorder's time, ppm by which it runs slow, standard deviation in s"
 
@@ -82,7 +82,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[Clock]:
         return
     nodes = {flight.name: flight.participants for flight in flights}
     told: set[tuple[str, str]] = set()
-    for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per flight and node."):
+    for where, cells in table_rows(path, CLOCK_COLUMNS, remedy="Write one line per flight and node."):
         flight, node = cells["flight"], cells["node"]
         problem = ""
         if flight not in nodes:

@@ -1,0 +1,116 @@
+"""A node's echoes by the clock of its recorder, and where it was by the clock of its log."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign import Campaign
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.errors import CampaignError
+from apertura.geometry.aperture import Aperture
+from apertura.ingest import read_phase_history
+from apertura.ingest.times import FIRST
+from apertura.load.node_log import NodeLog, raw_log, shortest_wave
+from apertura.refinement.motion import Logged, Recorded
+from apertura.settings import OfdmWaveform
+from apertura.store import manifest_of, open_stage
+
+_SECOND = np.timedelta64(1, "s")
+
+
+@dataclass(frozen=True, eq=False)
+class Unaligned:
+    """What is to be aligned.
+
+    Attributes
+    ----------
+    echo, log
+        As `apertura.refinement` takes them: each by seconds of its own, from its first pulse and its first epoch.
+    apart_ns
+        By how much the log's first epoch is later than the recorder's first pulse.
+    applied_ns
+        What of an offset in config/clocks.tsv is in the recorder's times already.
+    stated_ns
+        That offset, 0 without.
+    taken_off_m
+        Path beyond geometry that is taken off the echoes already.
+    own_clock
+        Whether the recorder's times mean nothing but differences.
+    """
+
+    echo: Recorded
+    log: Logged
+    apart_ns: int
+    applied_ns: int
+    stated_ns: int
+    taken_off_m: float
+    own_clock: bool
+
+    def less_path(self, path_m: float) -> "Unaligned":
+        """Return the same without so much path beyond geometry in the echoes."""
+        delay_s = self.echo.reference_delay_s - (path_m - self.taken_off_m) / SPEED_OF_LIGHT_M_S
+        return replace(self, echo=replace(self.echo, reference_delay_s=delay_s), taken_off_m=path_m)
+
+    def offset_ns(self, offset_s: float) -> int:
+        """Return what clocks.tsv is to state, for an offset between the first pulse and the first epoch."""
+        return self.applied_ns + self.apart_ns + round(offset_s * 1e9)
+
+    @property
+    def stated_s(self) -> float:
+        """What `offset_ns` makes of it is what is stated already."""
+        return (self.stated_ns - self.applied_ns - self.apart_ns) * 1e-9
+
+
+def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
+    """Return what a node that sends and receives recorded in a flight, and its log.
+
+    Raises
+    ------
+    CampaignError
+        If the node has no log, or its echoes are not there yet.
+    """
+    stated_ns, applied_ns = campaign.clock(flight, node).offset_ns, 0
+    if isinstance(campaign.settings.waveform, OfdmWaveform):
+        path = campaign.stage("echo", flight, f"{node}-{node}")
+        if not manifest_of(path).is_file():
+            raise CampaignError(
+                "not there yet",
+                where=path,
+                expected=f"the echo of {node} by its own pulses",
+                remedy=f"Run `snakemake results/{flight}/{node}-{node}/echo.manifest.json` first.",
+            )
+        history = open_stage(path, "echo")
+        off_m, applied_ns = float(history.attrs["stated_offset_m"]), stated_ns
+    else:
+        described = campaign.settings.waveform.model_dump()
+        files = campaign.history_files(flight, node)
+        history = read_phase_history(described["format"], files, pair=f"{node}-{node}", described=described)
+        off_m = 0.0
+    times = history.time.values
+    log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
+    echo = Recorded(
+        np.asarray(history.transfer.values),
+        history.frequency.values,
+        history.reference_delay.values,
+        _seconds(times, times[0]),
+    )
+    apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
+    own_clock = bool(times[0] < FIRST)
+    return Unaligned(echo, _logged(log), apart_ns, applied_ns, stated_ns, off_m, own_clock)
+
+
+def _logged(log: NodeLog) -> Logged:
+    times = log.track.time.values[log.checked.kept]
+    began = log.track.time.values[0]
+
+    def placed(at_s: NDArray[np.float64]) -> Aperture:
+        at = began + np.round(at_s * 1e9).astype("timedelta64[ns]")
+        return Aperture(log.antenna("radar_tx", at), log.antenna("radar_rx", at))
+
+    first_s, last_s = _seconds(times[[0, -1]], began)
+    return Logged(placed, first_s + 1e-9, last_s - 1e-9)
+
+
+def _seconds(times: NDArray[np.datetime64], began: np.datetime64) -> NDArray[np.float64]:
+    return np.asarray((times - began) / _SECOND, np.float64)

@@ -1,0 +1,32 @@
+"""What people ask of recordings and logs before anything is run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from apertura.paths import leave_working_folder
+
+
+def align(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    flight: Annotated[str, typer.Argument(help="flight")],
+    node: Annotated[str, typer.Argument(help="node that sends and receives")],
+    *,
+    point: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="reflector: easting, northing in scene.crs, ellipsoidal height (z in a local frame), m"),
+    ] = None,
+    search_s: Annotated[float | None, typer.Option(min=0, help="how far the clock may be off, s")] = None,
+    search_m: Annotated[float, typer.Option(min=0, help="how long the path may be, m of total path")] = 10.0,
+    keep_path: Annotated[bool, typer.Option("--keep-path", help="the path is as the config says")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
+) -> None:
+    """Find the clock and the range of a recorder against its flight log: where echoes add up best."""
+    from apertura.campaign import Campaign
+
+    opened = Campaign.load(leave_working_folder(campaign))
+    from apertura.steps.align import print_alignment
+
+    asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m}
+    print_alignment(opened, flight, node, write=write, **asked)

@@ -1,0 +1,135 @@
+"""`apertura align`: the clock and the range of a recorder against its flight log, from the echoes themselves."""
+
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+from apertura.atomic import write_text
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import frame_from_map
+from apertura.load.ground import Ground
+from apertura.load.unaligned import Unaligned, unaligned
+from apertura.paths import inside
+from apertura.refinement.clock_alignment import Alignment, align_on_point
+from apertura.refinement.scene_alignment import align_on_scene
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround
+from apertura.settings import CLOCK_COLUMNS, CLOCKS, CONFIG
+
+NEAR_S = 5.0
+"""How far a clock that tells UTC is thought to be off."""
+
+
+def align(
+    campaign: Campaign,
+    flight: str,
+    node: str,
+    *,
+    point: tuple[float, float, float] | None = None,
+    search_s: float | None = None,
+    search_m: float = 10.0,
+) -> tuple[Alignment, dict[str, Any]]:
+    """Return how the recorder of a node stands to its log, and what that means in the campaign's own terms.
+
+    Parameters
+    ----------
+    campaign, flight, node
+        Of a node that sends and receives.
+    point
+        Easting, northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres; None:
+        what is bright on the ground of the scene, wherever it stands.
+    search_s
+        How far the clock may be off; None: `NEAR_S`, or anything where the recorder has no clock but its own.
+    search_m
+        How long the electrical path may be, metres of total path; 0: it is as the config says.
+
+    Returns
+    -------
+    Alignment
+        In the recorder's and the log's own seconds.
+    dict
+        offset_s, of clocks.tsv, to its last digit as text; path_offset_m, of the config.
+
+    Raises
+    ------
+    CampaignError
+        If nothing can be told.
+    """
+    given = unaligned(campaign, campaign.flight(flight).name, node)
+    if search_m == 0.0:
+        given = given.less_path(campaign.settings.nodes[node].path_offset_m.radar)
+    within_s = _within(given, search_s)
+    try:
+        if point is None:
+            found = align_on_scene(given.echo, given.log, *_scene(campaign), within_s=within_s, search_m=search_m)
+        else:
+            place = frame_from_map(campaign.settings.scene.crs, *point)
+            found = align_on_point(given.echo, given.log, place, within_s=within_s, search_m=search_m)
+    except ValueError as error:
+        raise CampaignError(
+            str(error),
+            where=campaign.root / "raw" / flight,
+            expected="a recording made while the log tells where its node was",
+            remedy="Check that recording and log belong together, and nodes.<node>.log.",
+        ) from error
+    offset = Decimal(given.offset_ns(found.offset_s)).scaleb(-9)
+    return found, {"offset_s": str(offset), "path_offset_m": given.taken_off_m + found.path_m}
+
+
+def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float) -> Path:
+    """Write the line of a node's clock into config/clocks.tsv; those of others are kept."""
+    path = inside(campaign.root, CLOCKS.as_posix(), where=campaign.root)
+    others = [clock for clock in campaign.clocks if (clock.flight, clock.node) != (flight, node)]
+    kept = [
+        (one.flight, one.node, Decimal(one.offset_ns).scaleb(-9), one.drift_ppm, "" if one.std_s is None else one.std_s)
+        for one in others
+    ]
+    rows = [CLOCK_COLUMNS, *kept, (flight, node, offset_s, 0, f"{std_s:.6f}")]
+    write_text(path, "".join("\t".join(map(str, row)) + "\n" for row in rows))
+    return path
+
+
+def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **asked: Any) -> None:
+    """Align, say what was found and what to do with it, and write clocks.tsv where that is asked."""
+    found, stated = align(campaign, flight, node, **asked)
+    print(
+        f"{flight} {node}: the recording begins {found.offset_s:.4f} s ± {found.offset_width_s:.4f} s after the first "
+        f"epoch of the log; path beyond geometry {stated['path_offset_m']:.4f} m ± {found.path_width_m:.4f} m"
+    )
+    print(
+        f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above other offsets"
+    )
+    for name, line in found.flags.items():
+        print(f"{name}: {line}")
+    print(f"{CLOCKS}: {flight}\t{node}\t{stated['offset_s']}\t0\t{found.offset_width_s:.6f}")
+    if asked["search_m"] > 0:
+        print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {stated['path_offset_m']:.4f}")
+    if write:
+        path = keep(campaign, flight, node, offset_s=stated["offset_s"], std_s=found.offset_width_s)
+        print(f"{path} is written")
+
+
+def _within(given: Unaligned, search_s: float | None) -> tuple[float, float]:
+    """Return which offsets between first pulse and first epoch are tried."""
+    recorded_s = float(given.echo.time_s[-1])
+    anything = given.log.first_s - recorded_s, given.log.last_s
+    if search_s is None and given.own_clock:
+        return anything
+    near_s = NEAR_S if search_s is None else search_s
+    return max(anything[0], given.stated_s - near_s), min(anything[1], given.stated_s + near_s)
+
+
+def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
+    """Return the grid that the config states, and level ground."""
+    asked = campaign.settings.scene
+    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m}:
+        raise CampaignError(
+            "crs, bounds_m or spacing_m is auto",
+            where=f"{CONFIG}: scene",
+            expected="a scene that is stated: what is settled from a flight needs its clock first",
+            remedy="State them, or give the place of a reflector by --point.",
+        )
+    bounds_m, spacing_m = asked.bounds_m, asked.spacing_m
+    grid = SceneGrid.from_bounds(asked.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]
+    return grid, Ground.of(asked, campaign.height_files(), crs=asked.crs).level(grid)
