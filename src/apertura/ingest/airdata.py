@@ -25,11 +25,11 @@ _FEWEST = 4  # without them a position is dead reckoning
 _APART_S = 1.5
 """By what seconds and clock step apart where the clock stood still: a whole second is late by 1 s at most."""
 
-_WIDEST_S = 0.5
-"""Within what the seconds of a part must tell its clock's zero."""
+_SURE_S = 0.1
+"""How well the seconds of a part must tell its clock's zero, and how far an epoch may lie outside its second: AirData's
+interval."""
 
-_MISFIT_S = 0.1
-"""By what an epoch may lie outside its second: one interval of AirData's."""
+_ROUNDING_S = 1e-6
 
 _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
 
@@ -115,10 +115,10 @@ def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64]) -> _Clock
         rows = part == number
         low, high = (told - clock_s)[rows].max(), (told - clock_s)[rows].min() + 1
         offset[rows] = (low + high) / 2
-        sure[rows] = high - low <= _WIDEST_S
+        sure[rows] = high - low <= 2 * _SURE_S + _ROUNDING_S
         misfit = max(misfit, (low - high) / 2 if sure[rows].any() else 0.0)
-    if misfit > _MISFIT_S or not sure.any():
-        found = f"{misfit:.2f} s apart" if misfit > _MISFIT_S else "one a second, so that no second is seen to change"
+    if misfit > _SURE_S or not sure.any():
+        found = f"{misfit:.2f} s apart" if misfit > _SURE_S else "one a second, so that no second is seen to change"
         raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
     elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")
     return _Clock(zero + elapsed, sure, misfit, int(part[-1]) + 1)

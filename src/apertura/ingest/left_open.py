@@ -1,5 +1,6 @@
 """What a flight log leaves open and the config must say, and what both say otherwise: one message each."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,8 @@ import numpy as np
 from apertura.errors import CampaignError, quoted
 from apertura.ingest.log_options import LogOptions
 from apertura.ingest.times import utc_times
+
+_UNIX = re.compile(r"1970-01-01(?:[T ]00:00(?::00(?:\.0+)?)?)?", re.ASCII)
 
 
 def unsaid(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
@@ -65,8 +68,11 @@ def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np
     """
     if options.start_utc is None:
         raise unsaid("start_utc", found, node=node, where=where)
+    text = options.start_utc.strip().removesuffix("Z").removesuffix("+00:00")
+    if _UNIX.fullmatch(text):  # no recording is that old, but seconds are counted from there
+        return np.datetime64(0, "ns")
     try:
-        return np.datetime64(utc_times([options.start_utc.strip().removesuffix("Z").removesuffix("+00:00")])[0])
+        return np.datetime64(utc_times([text])[0])
     except ValueError as error:
         raise CampaignError(
             quoted(options.start_utc),
