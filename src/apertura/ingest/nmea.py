@@ -18,9 +18,8 @@ from apertura.ingest.tables import LARGEST_LOG, number
 from apertura.ingest.times import utc_times
 from apertura.ingest.track import FIXES, make_track, remarked
 
-_SENTENCE = re.compile(rb"([^\r\n$]*)\$([^\r\n$*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")
+_BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")
 _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
-_LIKE_A_SENTENCE = re.compile(r"[A-Z]{2}[A-Z0-9]{3},")
 _DATED = {"RMC", "ZDA"}
 _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
 _TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
@@ -86,19 +85,24 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
 
 def _sentences(log: _Log) -> Iterator[Any]:
     """Yield the sentences that are wanted and whole; those that are broken are counted."""
-    for match in _SENTENCE.finditer(log.path.read_bytes()):
-        stamp, body, checksum = match.groups()
-        text = body.decode("latin-1")
-        if not _LIKE_A_SENTENCE.match(text):
-            continue
-        log.stamped += bool(_STAMP.fullmatch(stamp))
-        if not checksum or int(checksum, 16) != NMEASentence.checksum(text):
-            log.dropped["sentences broken off or with a wrong checksum"] += 1
-        elif _WANTED.match(text):
-            try:
-                yield NMEASentence.parse(f"${text}*{checksum.decode()}", check=True)
-            except ParseError as error:
-                raise _error(f"sentence {quoted(text, 100)}", log.path) from error
+    for line in log.path.read_bytes().splitlines():
+        stamp, *pieces = line.split(b"$")
+        for number, piece in enumerate(pieces):
+            match = _BODY.match(piece)
+            if match:
+                log.stamped += number == 0 and bool(_STAMP.fullmatch(stamp))
+                yield from _whole(match[1].decode("latin-1"), match[2], log)
+
+
+def _whole(text: str, checksum: bytes | None, log: _Log) -> Iterator[Any]:
+    """Yield a sentence that is wanted and whole."""
+    if not checksum or int(checksum, 16) != NMEASentence.checksum(text):
+        log.dropped["sentences broken off or with a wrong checksum"] += 1
+    elif _WANTED.match(text):
+        try:
+            yield NMEASentence.parse(f"${text}*{checksum.decode()}", check=True)
+        except ParseError as error:
+            raise _error(f"sentence {quoted(text, 100)}", log.path) from error
 
 
 def _time_of_day(text: str) -> int | None:
