@@ -108,7 +108,7 @@ def utc_from_gps(time_gps: Times) -> Times:
     _check(time_gps)
     ahead = np.asarray(np.searchsorted(_SINCE_GPS, time_gps, side="right"), np.int64)
     # n − 1 s after UTC's midnight GPS time meets the n-th leap second; for a second it has not passed
-    within = np.flatnonzero((ahead > 0) & (time_gps < _SINCE_GPS[ahead - 1] + _SECOND))
+    within = np.flatnonzero((ahead > 0) & (time_gps - _SINCE_GPS[ahead - 1] < _SECOND))
     if within.size:
         wrong = np.ravel(time_gps)[within[0]]
         raise ValueError(f"GPS time {wrong} is within a leap second of UTC (23:59:60), which has no date")
