@@ -58,9 +58,7 @@ def test_heights_above_the_sea_ask_for_an_offset(tmp_path):
 
 
 def test_times_are_utc_whatever_the_config_says(tmp_path):
-    assert "datetime(utc) is UTC" in complaint(
-        lambda: read(tmp_path, logs.airdata(TIMES, PLACES), time_system="gpst")
-    )
+    assert "datetime(utc) is UTC" in complaint(lambda: read(tmp_path, logs.airdata(TIMES, PLACES), time_system="gpst"))
 
 
 def test_feet_are_feet(tmp_path):

@@ -107,9 +107,7 @@ def test_a_map_that_does_not_fit_the_log_is_one_message(tmp_path, heading, optio
 
 def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
     heading = f"time_utc,{GEODETIC},alt"
-    message = complaint(
-        lambda: read(tmp_path, heading, TIMES, *PLACES.T, PLACES[:, 2], columns={"height_m": "alt"})
-    )
+    message = complaint(lambda: read(tmp_path, heading, TIMES, *PLACES.T, PLACES[:, 2], columns={"height_m": "alt"}))
     assert "column height_m, besides 'alt' that config.yaml maps to it" in message
     assert "columns time and time_s" in complaint(
         lambda: read(tmp_path, f"time,time_s,{GEODETIC}", TIMES, range(40), *PLACES.T)

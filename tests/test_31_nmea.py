@@ -56,9 +56,7 @@ def test_a_receiver_that_is_not_sure_has_no_date(tmp_path):
 
 
 def test_times_of_nmea_are_utc_whatever_the_config_says(tmp_path):
-    assert "times of NMEA are UTC" in complaint(
-        lambda: read(tmp_path, logs.nmea(TIMES, PLACES), time_system="gpst")
-    )
+    assert "times of NMEA are UTC" in complaint(lambda: read(tmp_path, logs.nmea(TIMES, PLACES), time_system="gpst"))
 
 
 @pytest.mark.parametrize("separation", ["", "0.0"])
@@ -135,7 +133,14 @@ def test_a_sentence_within_a_leap_second_is_no_epoch(tmp_path):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("235957.20", "235977.20"), (",4,12", ",77,12"), (",M,48", ",F,48"), ("4824.", "48"), (",E,", ",Q,"), ("48.000", "48_0")],
+    [
+        ("235957.20", "235977.20"),
+        (",4,12", ",77,12"),
+        (",M,48", ",F,48"),
+        ("4824.", "48"),
+        (",E,", ",Q,"),
+        ("48.000", "48_0"),
+    ],
 )
 def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
     bodies = [line[1:].partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]

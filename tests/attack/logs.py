@@ -1,6 +1,7 @@
 """Flight logs of many makers, written as bytes from one list of epochs, for seeds and for tests of what comes back."""
 
 import functools
+import itertools
 import operator
 from collections.abc import Sequence
 
@@ -34,14 +35,14 @@ def of_day(time: np.datetime64, digits: int = 2) -> str:
     return text[: 7 + digits] if digits else text[:6]
 
 
-def gga(time: np.datetime64, geodetic: Sequence[float], *, talker="GN", quality=4, separation="48.000", digits=2) -> str:
+def gga(
+    time: np.datetime64, geodetic: Sequence[float], *, talker="GN", quality=4, separation="48.000", digits=2
+) -> str:
     """Return GGA of an ellipsoidal height that is `separation` above the sea's."""
     latitude, longitude, height = geodetic
     place = f"{degrees_minutes(latitude, 2, 'NS')},{degrees_minutes(longitude, 3, 'EW')}"
-    sea = height - float(separation or 0)
-    return sealed(
-        f"{talker}GGA,{of_day(time, digits)},{place},{quality},12,0.8,{sea:.6f},M,{separation},{'M' if separation else ''},,"
-    )
+    heights = f"{height - float(separation or 0):.6f},M,{separation},{'M' if separation else ''}"
+    return sealed(f"{talker}GGA,{of_day(time, digits)},{place},{quality},12,0.8,{heights},,")
 
 
 def rmc(time: np.datetime64, *, status: str = "A") -> str:
@@ -83,13 +84,14 @@ def airdata(times: np.ndarray, geodetic: np.ndarray, *, clock_ms: np.ndarray | N
     for number, (time, (latitude, longitude, height)) in enumerate(zip(times, geodetic, strict=True)):
         utc = str(time)[:19].replace("T", " ")
         said = '"Mode, changed"' if number == 3 else ""
-        lines.append(
-            f"{clock[number]},{utc},{latitude:.9f},{longitude:.9f},{height - 48:.6f},{satellites},0, 90.5, -2.5, 1.5,{said}"
-        )
+        place = f"{latitude:.9f},{longitude:.9f},{height - 48:.6f}"
+        lines.append(f"{clock[number]},{utc},{place},{satellites},0, 90.5, -2.5, 1.5,{said}")
     return "\n".join(lines) + "\n"
 
 
-def capture(seconds: np.ndarray, bodies: dict[str, np.ndarray], *, unit: str = "Meters", lost: Sequence[int] = ()) -> str:
+def capture(
+    seconds: np.ndarray, bodies: dict[str, np.ndarray], *, unit: str = "Meters", lost: Sequence[int] = ()
+) -> str:
     """Return a take of Motive: per body (frame, 7) quaternion x, y, z, w and position x, y, z; a marker besides."""
     names = [name for name in bodies for _ in range(7)]
     rows = [
@@ -104,7 +106,7 @@ def capture(seconds: np.ndarray, bodies: dict[str, np.ndarray], *, unit: str = "
     ]
     for frame, second in enumerate(seconds):
         poses = [["" if frame in lost else f"{value:.6f}" for value in poses[frame]] for poses in bodies.values()]
-        rows.append(f"{frame},{second:.6f}," + ",".join([*sum(poses, []), "", "", ""]))
+        rows.append(f"{frame},{second:.6f}," + ",".join([*itertools.chain(*poses), "", "", ""]))
     return "\r\n".join(rows) + "\r\n"
 
 

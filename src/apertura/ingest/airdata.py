@@ -46,9 +46,9 @@ class _Clock(NamedTuple):
 def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a DJI flight as AirData exports it, at 10 Hz.
 
-    datetime(utc) holds whole seconds, which are taken as cut off: UTC is the clock time(millisecond) plus the offset with
-    which no epoch leaves its second. The clock stands still while motors are off, so every part between has an offset of
-    its own; parts too short to see a second change are left out. What does not fit is told (remarks). Heights are above
+    datetime(utc) holds whole seconds, which are taken as cut off: UTC is the clock time(millisecond) plus the offset
+    with which no epoch leaves its second. The clock stands still while motors are off, so every part between has an
+    offset of its own; parts too short to tell it are left out. What does not fit is told (remarks). Heights are above
     mean sea level: options.height_offset_m is needed. The log does not say how a position was solved (RTK or not).
 
     Raises

@@ -1,4 +1,4 @@
-"""Flight logs as CSV: a time, a position in one of three frames and optionally attitude, under names of ours or mapped."""
+"""Flight logs as CSV: a time, a position in one of three frames, maybe attitude, under names of ours or mapped."""
 
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -45,8 +45,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
       since options.start_utc, or with time_system gpst since 1980-01-06, GPS time);
     - the first that is whole of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
       x_m, y_m, z_m (ECEF); east_m, north_m, up_m (axes of the campaign's own);
-    - where known roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind of
-      solution: a name or number of `FIXES`). Empty cells of these are epochs of which the log says nothing.
+    - where known roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind
+      of solution: a name or number of `FIXES`). Empty cells of these are epochs of which the log says nothing.
 
     Raises
     ------
@@ -69,8 +69,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         raise CampaignError(
             str(error).partition("\n")[0],
             where=path,
-            expected="columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, "
-            f"z_m, or east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality "
+            expected="columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, "
+            f"y_m, z_m, or east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality "
             f"({', '.join(FIXES)}, or their numbers 1 to 6); or their names in nodes.{node}.log.columns",
             remedy="Correct the log or export it again.",
         ) from error

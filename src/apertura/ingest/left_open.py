@@ -39,8 +39,8 @@ def contradicted(key: str, found: str, *, node: str, where: Path) -> CampaignErr
 
     Examples
     --------
-    >>> print(contradicted("time_system", "times are UTC", node="uav1", where=Path("a.pos")))
-    a.pos: times are UTC; expected what config.yaml says, nodes.uav1.log.time_system. Remove the key, if the log is right.
+    >>> print(contradicted("base", "ref pos 48 9 600", node="uav1", where=Path("a.pos")))
+    a.pos: ref pos 48 9 600; expected what config.yaml says, nodes.uav1.log.base. Remove the key, if the log is right.
     """
     expected = f"what config.yaml says, nodes.{node}.log.{key}"
     return CampaignError(found, where, expected, "Remove the key, if the log is right.")

@@ -57,8 +57,8 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     """Return the `track` stage of an NMEA 0183 log of any talkers.
 
     Positions, their kind and the geoid separation are those of GGA: ellipsoidal height is altitude plus separation. GGA
-    has a time of day; its date is that of the RMC (valid) or ZDA nearest before it, or options.start_utc's where there is
-    none, and goes on over midnight. GST states standard deviations. Of one epoch by several talkers GN is taken.
+    has a time of day; its date is that of the RMC (valid) or ZDA before it, or options.start_utc's where there is none,
+    and goes on over midnight. GST states standard deviations. Of one epoch by several talkers GN's is taken.
 
     Raises
     ------
@@ -87,10 +87,10 @@ def _sentences(log: _Log) -> Iterator[Any]:
     """Yield the sentences that are wanted and whole; those that are broken are counted."""
     for line in log.path.read_bytes().splitlines():
         stamp, *pieces = line.split(b"$")
-        for number, piece in enumerate(pieces):
+        for place, piece in enumerate(pieces):
             match = _BODY.match(piece)
             if match:
-                log.stamped += number == 0 and bool(_STAMP.fullmatch(stamp))
+                log.stamped += place == 0 and bool(_STAMP.fullmatch(stamp))
                 yield from _whole(match[1].decode("latin-1"), match[2], log)
 
 

@@ -1,4 +1,4 @@
-"""Motion captures as OptiTrack's Motive exports them (CSV): rigid bodies in a room, in a frame of the campaign's own."""
+"""Motion captures as OptiTrack's Motive exports them (CSV): rigid bodies in a room, which is the campaign's frame."""
 
 import csv
 from pathlib import Path
@@ -42,9 +42,9 @@ class _Take(NamedTuple):
 def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a rigid body in a motion capture, options.body where there are several.
 
-    Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were −z, x
-    and −y when the body was defined. Times are options.start_utc plus the take's seconds: its own Capture Start Time is
-    a wall clock without zone. Frames in which the body was not seen are left out and counted.
+    Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were
+    −z, x and −y when the body was defined. Times are options.start_utc plus the take's seconds: its own Capture Start
+    Time is a wall clock without zone. Frames in which the body was not seen are left out and counted.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Pa
 def _numbers(
     lines: list[str], width: int, columns: list[int], first: int, path: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return seconds (frame,) and a pose (frame, 7), NaN where a cell is empty; `first` is the number of the first line."""
+    """Return seconds (frame,) and a pose (frame, 7), NaN where a cell is empty; `first` numbers the first line."""
     rows = []
     for line, text in enumerate(lines, first):
         if not text.strip():

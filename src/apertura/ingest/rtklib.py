@@ -51,10 +51,10 @@ class _Header(NamedTuple):
 def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of an RTKLIB solution.
 
-    Its header says whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions are
-    latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east, north
-    and up of ``ref pos`` or options.base. Columns Q and standard deviations, where named, are kept; those of ECEF are
-    turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted.
+    Its header says whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
+    are latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east,
+    north and up of ``ref pos`` or options.base. Columns Q and standard deviations, where named, are kept; those of ECEF
+    are turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted.
 
     Raises
     ------
@@ -92,7 +92,10 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) 
 def _header(lines: list[str], path: Path) -> _Header:
     split = ((line, _CELLS.split(line.strip("% \t"))) for line in lines)
     found = (
-        (line, names, kind) for line, names in split for kind, columns in _POSITIONS.items() if set(columns) <= set(names)
+        (line, names, kind)
+        for line, names in split
+        for kind, columns in _POSITIONS.items()
+        if set(columns) <= set(names)
     )
     _, names, kind = next(found, ("", [""], ""))
     if not kind:
@@ -131,7 +134,7 @@ def _check_said(header: _Header, options: LogOptions, *, node: str, where: Path)
 def _rows(
     lines: list[str], header: _Header, path: Path
 ) -> tuple[list[str | np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return of each solution its time (as text where it is a date), its position as logged, and Q with standard deviations or NaN."""
+    """Return of each solution its time, a date as text; its position as logged; Q and standard deviations, or NaN."""
     sexagesimal = header.position == "sexagesimal"
     angles = [header.cell_of[name] for name in _POSITIONS[header.position]]
     named = _STD_ECEF if header.position == "ecef" else _STD
@@ -231,7 +234,7 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
 
 
 def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return standard deviations to north, east and up; those of ECEF come with roots of covariances that keep signs."""
+    """Return standard deviations to north, east and up; ECEF's come with signed roots of their covariances."""
     if np.isnan(stated).all():
         return None
     if stated.shape[1] == len(_STD):

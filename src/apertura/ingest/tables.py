@@ -95,7 +95,7 @@ def read_table(
 
 
 def _check_cells(path: Path, heading: int) -> None:
-    """Raise ValueError where a line has fewer cells than the heading: a piece of the file is gone, maybe of a number."""
+    """Raise ValueError where a line has fewer cells than the heading: a piece is gone, maybe of a number."""
     with path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.reader(stream, skipinitialspace=True)
         try:

@@ -104,7 +104,7 @@ def make_track(
 
 
 def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
-    """Return a track with what a person should know of how its log was read, in the attribute `remarks`; it is told, too.
+    """Return a track with what a person should know of how its log was read, in its `remarks`; it is told, too.
 
     Parameters
     ----------
