@@ -287,7 +287,7 @@ def test_a_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
     (tmp_path / "a.track.toy").write_text("48 9 600\n48 9 601\n")
     track = read_track(tmp_path / "a.track.toy", node="a")
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values[1]), [48, 9, 601], atol=1e-8)
-    with pytest.raises(CampaignError, match=r"<node>\.track\.<.*\|toy>"):
+    with pytest.raises(CampaignError, match=r"<node>\.track\.<.*\|toy[|>]"):
         Campaign(tmp_path, None, ()).track_file("f01", "b")
 
 

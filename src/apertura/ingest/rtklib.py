@@ -138,7 +138,8 @@ def _rows(
     sexagesimal = header.position == "sexagesimal"
     angles = [header.cell_of[name] for name in _POSITIONS[header.position]]
     named = _STD_ECEF if header.position == "ecef" else _STD
-    wanted = [header.cell_of.get("Q"), *(header.cell_of.get(name) for name in named)]
+    whole = [header.cell_of[name] for name in named] if set(named) <= set(header.cell_of) else []
+    wanted = [header.cell_of.get("Q"), *whole]
     times, positions, stated = [], [], []
     for line, text in enumerate(lines, 1):
         if not text.strip() or text[0] == "%":
@@ -235,7 +236,7 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
 
 def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return standard deviations to north, east and up; ECEF's come with signed roots of their covariances."""
-    if np.isnan(stated).all():
+    if not stated.shape[1]:
         return None
     if stated.shape[1] == len(_STD):
         return stated
