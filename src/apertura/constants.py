@@ -2,6 +2,3 @@
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact by definition of the metre)."""
-
-GPS_UTC_LEAP_S = 18
-"""Seconds by which GPS time is ahead of UTC since 2017-01-01."""

@@ -1,8 +1,10 @@
 """One valid file becomes many wrong ones: bytes in the manner of AFL, and parts where the format is known."""
 
 import csv
+import functools
 import io
 import json
+import operator
 import struct
 from collections.abc import Callable, Sequence
 
@@ -219,6 +221,17 @@ def cells(delimiter: str) -> Mutator:
         return ending.join(delimiter.join(line) for line in rows).encode("utf-8", "surrogateescape")
 
     return mutate
+
+
+def resealed(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
+    """Change cells of sentences and write their checksums anew: what else is wrong with them must be seen."""
+    lines = cells(",")(data, generator, tokens).split(b"\n")
+    for number, line in enumerate(lines):
+        stamp, dollar, rest = line.partition(b"$")
+        body, star, _ = rest.partition(b"*")
+        if dollar and star:
+            lines[number] = b"%s$%s*%02X\r" % (stamp, body, functools.reduce(operator.xor, body, 0))
+    return b"\n".join(lines)
 
 
 def quoted_cells(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:

@@ -11,6 +11,7 @@ from apertura.errors import CampaignError
 from apertura.ingest import open_recording, read_track
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.log_options import LogOptions
 from apertura.ingest.mat_fields import read_fields
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
@@ -132,6 +133,10 @@ _TIFF = "II*\0 MM\0* II+\0 <VRTDataset /vsicurl/http://127.0.0.1/x <GDAL_WMS> \x
 _SIGMF = (
     f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z"
 )
+_MAPPED = LogOptions(
+    start_utc="2025-05-14",
+    columns={"time_s": "t", "latitude_deg": "lat", "longitude_deg": "lon", "height_m": "alt"},
+)
 _TIMES = "2025-05-14T09:30:60Z 9999-12-31 0001-01-01T00:00:00+23:59 now NaT 2025-W20-3 T Z , ; : / - ."
 _JSON_TREE = (mutators.json_tree,)
 _YAML_TREE = (mutators.yaml_tree, mutators.yaml_tree, mutators.bomb)
@@ -162,6 +167,41 @@ PARSERS: dict[str, Parser] = {
         lambda path: read_track(path, node="uav1"),
         (mutators.cells(" "),),
         f"{_TIMES} % GPST UTC JST latitude(deg) Q sdn(m) /geodetic 99999999999",
+    ),
+    "other.pos": Parser(
+        "uav1.track.pos",
+        seeds.other_solutions,
+        lambda path: read_track(path, node="uav1"),
+        (mutators.cells(" "), mutators.cells(",")),
+        f"{_TIMES} % JST ref pos : x-ecef(m) e-baseline(m) latitude(d'\") sdxy(m) Q -0",
+    ),
+    "mapped.csv": Parser(
+        "uav1.track.csv",
+        seeds.mapped_tracks,
+        lambda path: read_track(path, node="uav1", options=_MAPPED),
+        _CSV,
+        "t lat lon alt time_s time_utc x_m 1e9 4e9",
+    ),
+    "track.nmea": Parser(
+        "uav1.track.nmea",
+        seeds.nmea,
+        lambda path: read_track(path, node="uav1", options=LogOptions(start_utc="2025-05-14")),
+        (mutators.resealed, mutators.resealed, mutators.cells(",")),
+        "$ * $GPGGA, $GNRMC, $GPZDA, $GPGST, *00 240060.00 235960 311299 A V M N S",
+    ),
+    "airdata.csv": Parser(
+        "uav1.track.csv",
+        seeds.airdata,
+        lambda path: read_track(path, node="uav1", options=LogOptions(height_offset_m=17.0)),
+        _CSV,
+        f"{_TIMES} time(millisecond) datetime(utc) satellites (feet) 1e300",
+    ),
+    "capture.csv": Parser(
+        "uav1.track.csv",
+        seeds.captures,
+        lambda path: read_track(path, node="uav1", options=LogOptions(start_utc="2025-05-14", body="Radar")),
+        (mutators.cells(","),),
+        "Quaternion Global Meters Millimeters Radar Type Name Frame X W Rotation Position",
     ),
     "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
     "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),

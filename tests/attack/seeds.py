@@ -11,9 +11,12 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.io import savemat
 
+from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.settings.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
+
+from . import logs
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 
@@ -110,6 +113,51 @@ def solutions() -> list[bytes]:
     weeks = [f"2366 {293400 + n}.000   {rest.format(n, 2)}" for n in range(8)]
     texts = [head.format(system) + "\n".join(lines) + "\n" for system, lines in (("GPST", weeks), ("UTC", dates))]
     return [*(text.encode() for text in texts), *real("campaign-sample/raw/f01/uav2.track.pos", lines=40)]
+
+
+def other_solutions() -> list[bytes]:
+    """Return RTKLIB solutions as ECEF, as baselines and in degrees, minutes and seconds."""
+    times, places = logs.circle(8)
+    ecef = ecef_from_geodetic(*places.T)
+    names = "x-ecef(m) y-ecef(m) z-ecef(m) sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)"
+    columns = np.hstack([ecef, np.full((8, 6), 0.01)])
+    baseline = "e-baseline(m) n-baseline(m) u-baseline(m)"
+    angles = [["48 24 10.5", "-0 57 03.6", height] for height in places[:, 2]]
+    texts = [
+        logs.solution(times, columns, names, system="GPST"),
+        logs.solution(times, ecef - ecef[0], baseline, separator=",", head=["% ref pos   : 48.4,9.95,600.0"]),
+        logs.solution(times, angles, "latitude(d'\") longitude(d'\") height(m)", system="JST"),
+    ]
+    return [text.encode() for text in texts]
+
+
+def mapped_tracks() -> list[bytes]:
+    """Return a CSV log that counts seconds, under names of its own."""
+    _, places = logs.circle(8)
+    rows = [f"{number / 10:.1f},{a},{b},{h}" for number, (a, b, h) in enumerate(places)]
+    return ["\n".join(["t,lat,lon,alt", *rows, ""]).encode()]
+
+
+def nmea() -> list[bytes]:
+    """Return NMEA logs with and without dates and a host's stamps."""
+    times, places = logs.circle(8)
+    texts = [logs.nmea(times, places), logs.nmea(times, places, every=1, prefix="2025-05-14 23:59:57.1 ", talker="GP")]
+    return [text.encode() for text in texts]
+
+
+def airdata() -> list[bytes]:
+    """Return exports of DJI flights, one whose clock stood still; and the head of a real one."""
+    times, places = logs.circle(24)
+    late = times + np.where(np.arange(24) < 12, 0, 74_000).astype("timedelta64[ms]")
+    texts = [logs.airdata(times, places), logs.airdata(late, places, clock_ms=100 + 100 * np.arange(24))]
+    flight = "dji_rtk_ansfl/Jul-7th-2022-11-10AM-Flight-Airdata.csv"
+    return [*(text.encode() for text in texts), *real(flight, lines=40)]
+
+
+def captures() -> list[bytes]:
+    """Return takes of two bodies and the head of a real one."""
+    text = logs.capture(np.arange(12) / 360, logs.poses(), lost=[5])
+    return [text.encode(), *real("bwsi_rail_passA/Rail SAR 2.csv", lines=30)]
 
 
 def patterns() -> list[bytes]:

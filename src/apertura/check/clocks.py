@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from apertura.constants import GPS_UTC_LEAP_S
+from apertura.leap_seconds import LATEST_S
 
 Span = tuple[np.datetime64, np.datetime64]
 
@@ -52,8 +52,8 @@ def likely_cause(shift: float) -> str:
     (': GPST taken for UTC?', ': local time taken for UTC?', '')
     """
     size = abs(shift)
-    if abs(size - GPS_UTC_LEAP_S) <= _NEAR_S:
-        return ": GPST taken for UTC?" if shift > 0 else ": 18 s of GPST taken off times in UTC?"
+    if abs(size - LATEST_S) <= _NEAR_S:
+        return ": GPST taken for UTC?" if shift > 0 else f": {LATEST_S} s of GPST taken off times in UTC?"
     zones = round(size / _ZONE_S)
     if zones and size <= _LONGEST_ZONE_S + _NEAR_ZONE_S and abs(size - zones * _ZONE_S) <= _NEAR_ZONE_S:
         return ": local time taken for UTC?"

@@ -34,7 +34,10 @@ class LogFormat(NamedTuple):
 
 
 TRACKS: Mapping[str, LogFormat] = {
+    "airdata": LogFormat((".csv",), "apertura.ingest.airdata:read_airdata", "time(millisecond),datetime(utc)"),
+    "optitrack": LogFormat((".csv",), "apertura.ingest.optitrack:read_optitrack", "Format Version,1."),
     "csv": LogFormat((".csv",), "apertura.ingest.csv_track:read_csv_track"),
+    "nmea": LogFormat((".nmea", ".txt"), "apertura.ingest.nmea:read_nmea", "$"),
     "rtklib": LogFormat((".pos",), "apertura.ingest.rtklib:read_rtklib_pos"),
 }
 """Name of a format → how it is recognised and read; of those that fit a file the first is taken."""

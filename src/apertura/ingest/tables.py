@@ -1,5 +1,6 @@
 """Tables of comma-separated values that strangers wrote: columns by name, each once, numbers and nothing else."""
 
+import csv
 import re
 import warnings
 from collections.abc import Sequence
@@ -30,20 +31,43 @@ def number(text: str) -> float:
     return float(text)
 
 
-def read_table(path: Path, required: Sequence[str], *, optional: Sequence[str] = ()) -> pd.DataFrame:
-    """Return the columns of a CSV file that are asked for; others are not read.
+def cut_off(path: Path) -> bool:
+    """Return whether a file ends within a line: of the last number digits may be lost.
+
+    Parameters
+    ----------
+    path
+        A text that ends each line; an empty one is not cut off.
+    """
+    with path.open("rb") as stream:
+        if not stream.seek(0, 2):
+            return False
+        stream.seek(-1, 2)
+        return stream.read() not in {b"\n", b"\r"}
+
+
+def read_table(
+    path: Path,
+    required: Sequence[str],
+    *,
+    optional: Sequence[str] = (),
+    texts: Sequence[str] = ("time_utc", "quality"),
+) -> pd.DataFrame:
+    """Return the table in a CSV file, whose columns stand under their names.
 
     Parameters
     ----------
     path
         UTF-8, with or without byte-order mark; the first line names the columns.
     required, optional
-        Names of columns.
+        Names of columns that must be there, or may, but once.
+    texts
+        Names of columns that are not read as numbers.
 
     Raises
     ------
     ValueError
-        If it is no table, lacks a column or has one twice, or a line has more cells than the heading.
+        If it is no table, lacks a column or has one twice, or a line has more or fewer cells than the heading.
     """
     if path.stat().st_size > LARGEST_LOG:
         raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read")
@@ -55,11 +79,12 @@ def read_table(path: Path, required: Sequence[str], *, optional: Sequence[str] =
                 encoding="utf-8-sig",
                 skipinitialspace=True,
                 index_col=False,
-                dtype=dict.fromkeys(("time_utc", "quality"), str),
+                dtype=dict.fromkeys(texts, str),
                 low_memory=False,
             )
         except pd.errors.ParserWarning as error:
             raise ValueError("a line has more cells than the heading") from error
+    _check_cells(path, len(table.columns))
     missing = [name for name in required if name not in table.columns]
     if missing:
         raise ValueError(f"no column {missing[0]} among {quoted(list(table.columns), 300)}")
@@ -67,6 +92,18 @@ def read_table(path: Path, required: Sequence[str], *, optional: Sequence[str] =
     if doubled:
         raise ValueError(f"column {doubled[0]} a second time")
     return table
+
+
+def _check_cells(path: Path, heading: int) -> None:
+    """Raise ValueError where a line has fewer cells than the heading: a piece is gone, maybe of a number."""
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        rows = csv.reader(stream, skipinitialspace=True)
+        try:
+            short = next((len(row) for row in rows if row and len(row) < heading), None)
+        except csv.Error as error:
+            raise ValueError(f"line {rows.line_num}: {error}") from error
+    if short is not None:
+        raise ValueError(f"line {rows.line_num} has {short} cells, the heading {heading}")
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:

@@ -1,5 +1,6 @@
 """What every flight log becomes: times in UTC, positions in ECEF, attitude in radians."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -21,6 +22,7 @@ LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 FARTHEST_M = 1e5
 """From the origin of a local frame."""
 
+_LOG = logging.getLogger(__name__)
 _EARTH_M = 6.37e6
 _NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; within a centimetre of there nobody flies
 _WIDEST_DEG = 1080.0
@@ -99,6 +101,22 @@ def make_track(
         {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
         attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
     )
+
+
+def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
+    """Return a track with what a person should know of how its log was read, in its `remarks`; it is told, too.
+
+    Parameters
+    ----------
+    track
+        Of `make_track`.
+    remark
+        One line.
+    where
+        The log.
+    """
+    _LOG.warning("%s: %s", where, remark)
+    return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
 
 
 def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> None:

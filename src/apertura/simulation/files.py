@@ -10,8 +10,8 @@ import numpy as np
 from numpy.random import default_rng
 from numpy.typing import NDArray
 
-from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import projected_from_ecef
+from apertura.leap_seconds import gps_from_utc
 from apertura.simulation.continuous import pulse_samples
 from apertura.simulation.impairments import Floats
 from apertura.simulation.observation import Observation
@@ -119,9 +119,9 @@ def write_pos_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats
     -----
     Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
     """
-    ahead = np.timedelta64(GPS_UTC_LEAP_S if system == "GPST" else 0, "s")
+    stated = gps_from_utc(time_utc) if system == "GPST" else time_utc
     lines = []
-    for time, (latitude, longitude, height) in zip(time_utc + ahead, geodetic, strict=True):
+    for time, (latitude, longitude, height) in zip(stated, geodetic, strict=True):
         text = np.datetime_as_string(time, "ms").replace("-", "/").replace("T", " ")
         lines.append(f"{text}   {latitude:14.11f} {longitude:15.11f} {height:11.5f}{_POS_QUALITY}")
     path.write_text(_POS_HEADER.format(system=system) + "\n".join(lines) + "\n", encoding="utf-8")

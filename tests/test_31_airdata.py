@@ -1,0 +1,155 @@
+"""AirData's exports of DJI logs: two clocks become one, heights ask for their datum."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from folders import complaint
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apertura.contracts import check
+from apertura.geometry.geodesy import geodetic_from_ecef, ned_axes
+from apertura.ingest import read_track
+from apertura.ingest.log_options import LogOptions
+from tests.attack import logs
+
+TIMES, PLACES = logs.circle(60)
+
+
+def read(tmp_path, text, **options):
+    path = tmp_path / "a.track.csv"
+    path.write_text(text)
+    return check(read_track(path, node="a", options=LogOptions(**{"height_offset_m": 48.0, **options})), "track")
+
+
+def test_an_export_becomes_positions_attitude_and_times_to_the_interval(tmp_path):
+    track = read(tmp_path, logs.airdata(TIMES, PLACES))
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values), PLACES, atol=2e-6, rtol=0)
+    np.testing.assert_allclose(np.degrees(track.attitude.values[0]), [1.5, -2.5, 90.5])
+    assert "fix" not in track
+    np.testing.assert_array_equal(np.diff(track.time.values), np.diff(TIMES))
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(begins_ms=st.integers(0, 5000))
+def test_the_fraction_of_a_second_is_found_to_half_an_interval(tmp_path_factory, begins_ms):
+    times = TIMES + np.timedelta64(begins_ms, "ms")
+    track = read(tmp_path_factory.mktemp("log"), logs.airdata(times, PLACES))
+    assert (np.abs(track.time.values - times) <= np.timedelta64(50, "ms")).all()
+    assert "0.00 s off the clock of milliseconds in 1 parts" in track.remarks[0]
+
+
+def test_a_clock_that_stood_still_while_motors_were_off_is_set_anew(tmp_path):
+    """As in the real log: 74 s pass between two rows that lie 100 ms apart; a part of 0.3 s tells no time."""
+    times = TIMES.copy()
+    times[30:33] += np.timedelta64(500_000, "ms")
+    times[33:] += np.timedelta64(573_900, "ms")
+    clock = 100 + 100 * np.arange(60)
+    track = read(tmp_path, logs.airdata(times, PLACES, clock_ms=clock))
+    kept = np.delete(times, [30, 31, 32])
+    assert (np.abs(track.time.values - kept) <= np.timedelta64(50, "ms")).all()
+    assert track.dropped == {"in a part too short to tell its time": 3}
+    assert "in 3 parts" in track.remarks[0]
+
+
+def test_heights_above_the_sea_ask_for_an_offset(tmp_path):
+    message = complaint(lambda: read(tmp_path, logs.airdata(TIMES, PLACES), height_offset_m=None))
+    assert "heights above mean sea level; expected key nodes.a.log.height_offset_m" in message
+
+
+def test_times_are_utc_whatever_the_config_says(tmp_path):
+    assert "datetime(utc) is UTC" in complaint(lambda: read(tmp_path, logs.airdata(TIMES, PLACES), time_system="gpst"))
+
+
+def test_feet_are_feet(tmp_path):
+    text = logs.airdata(TIMES, PLACES).replace("seaLevel(meters)", "seaLevel(feet)")
+    heights = geodetic_from_ecef(read(tmp_path, text).position.values)[:, 2]
+    np.testing.assert_allclose(heights, (PLACES[:, 2] - 48) * 0.3048 + 48, atol=1e-6)
+
+
+def test_rows_said_twice_and_rows_without_satellites_are_no_epochs(tmp_path):
+    lines = logs.airdata(TIMES, PLACES).splitlines()
+    lines[20] = lines[20].replace(",17,", ",3,")
+    track = read(tmp_path, "\n".join([*lines[:10], lines[9], *lines[10:]]) + "\n")
+    assert track.dropped == {"said twice": 1, "fewer than 4 satellites": 1}
+    np.testing.assert_array_equal(np.diff(np.delete(TIMES, 19)), np.diff(track.time.values))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda lines: lines[:5] + [lines[5].replace("23:59:57", "noon")] + lines[6:], "'2025-05-14 noon' is no time"),
+        (lambda lines: [*lines[:5], lines[6], lines[5], *lines[7:]], "does not increase"),
+        (lambda lines: [lines[0].replace("seaLevel", "takeoff"), *lines[1:]], "no column altitude_above_seaLevel"),
+        (lambda lines: [lines[0].replace("latitude,", "lat,"), *lines[1:]], "no column latitude"),
+        (lambda lines: [*lines[:7], lines[7].replace("48.4", "x"), *lines[8:]], "could not convert"),
+        (lambda lines: [*lines[:7], lines[7][:40], *lines[8:]], "cells, the heading 11"),
+        (lambda _: logs.airdata(TIMES, PLACES, clock_ms=110 * np.arange(60)).splitlines(), " s apart"),
+        (lambda lines: [lines[0], *lines[1:5]], "no second is seen to change"),
+    ],
+)
+def test_an_export_that_cannot_be_read_is_one_message(tmp_path, change, expected):
+    text = "\n".join(change(logs.airdata(TIMES, PLACES).splitlines())) + "\n"
+    message = complaint(lambda: read(tmp_path, text))
+    assert "a.track.csv: " in message
+    assert expected in message
+
+
+@pytest.fixture(scope="module")
+def real(shared):
+    return shared / "dji_rtk_ansfl" / "Jul-7th-2022-11-10AM-Flight-Airdata.csv"
+
+
+@pytest.fixture(scope="module")
+def flight(real):
+    return check(read_track(real, node="uav1", options=LogOptions(height_offset_m=17.0)), "track")
+
+
+@pytest.fixture(scope="module")
+def table(real):
+    return pd.read_csv(real, skipinitialspace=True)
+
+
+def test_epochs_span_bounds_and_rate_of_a_real_flight_are_those_of_its_rows(flight, table):
+    assert flight.sizes["epoch"] == len(table) == 9773
+    assert flight.dropped == {}
+    assert str(flight.time.values[0])[:19] == "2022-07-07T08:10:25"
+    assert np.median(np.diff(flight.time.values)) == np.timedelta64(100, "ms")
+    geodetic = geodetic_from_ecef(flight.position.values)
+    columns = ["latitude", "longitude", "altitude_above_seaLevel(meters)"]
+    for axis, (column, beyond) in enumerate(zip(columns, (0, 0, 17), strict=True)):
+        np.testing.assert_allclose(geodetic[:, axis], table[column] + beyond, atol=1e-9 if axis < 2 else 1e-6)
+
+
+def test_every_epoch_of_a_real_flight_lies_in_its_second_of_utc(flight, table):
+    """Though the clock of milliseconds stood still twice, for 74.5 s and 12.3 s, while motors were off."""
+    second = table["datetime(utc)"].to_numpy("datetime64[ns]")
+    within = (flight.time.values - second) / np.timedelta64(1, "s")
+    assert within.min() >= -0.051
+    assert within.max() <= 1.051
+    assert "0.05 s off the clock of milliseconds in 3 parts" in flight.remarks[0]
+    gaps = np.diff(flight.time.values) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(np.sort(gaps)[-3:], [0.2, 12.4, 74.6], atol=0.051)
+
+
+def test_a_real_flight_moves_as_fast_as_its_log_says(flight, table):
+    """Positions over times against logged speeds to north and east: 0.05 m/s, and no other lag fits better."""
+    rows = slice(2000, 7000)
+    north, east = (flight.position.values @ ned_axes(flight.position.values[0]))[rows, :2].T
+    seconds = (flight.time.values[rows] - flight.time.values[0]) / np.timedelta64(1, "s")
+    logged = table[["xSpeed(m/s)", "ySpeed(m/s)"]].to_numpy()[rows].T
+    moved = np.stack([np.gradient(axis, seconds) for axis in (north, east)])
+    assert np.median(np.abs(moved - logged)) < 0.1
+
+
+def test_the_rtk_truth_of_a_part_agrees_with_the_whole_flight(flight, table, shared):
+    truth = pd.read_csv(shared / "dji_rtk_ansfl" / "GTExtended.csv", skipinitialspace=True)
+    rows = np.flatnonzero(table["time(millisecond)"].isin(truth["time(millisecond)"]))
+    assert len(rows) == len(truth) == 239
+    position = flight.position.values[rows]
+    moved = (position - position[0]) @ ned_axes(position[0])
+    np.testing.assert_allclose(moved, truth[["North", "East", "Down"]], atol=0.1)
+    seconds = (flight.time.values[rows] - flight.time.values[rows[0]]) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(seconds, (truth["time(millisecond)"] - 56100) / 1000, atol=1e-6)
+    for axis, column in enumerate(["roll(degrees)", "pitch(degrees)", "compass_heading(degrees)"]):
+        np.testing.assert_allclose(np.degrees(flight.attitude.values[rows, axis]), truth[column])

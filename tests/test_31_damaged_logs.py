@@ -1,0 +1,108 @@
+"""A log that is cut, reordered or has a bit flipped loses epochs or is refused; none of the others moves."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apertura.errors import CampaignError
+from apertura.ingest import read_track
+from apertura.ingest.log_options import LogOptions
+from tests.attack import logs
+
+TIMES, PLACES = logs.circle()
+PLAIN = [f"{time}Z,{a:.9f},{b:.9f},{h:.6f}" for time, (a, b, h) in zip(TIMES, PLACES, strict=True)]
+LOGS = {
+    "csv": ("a.track.csv", "\n".join(["time_utc,latitude_deg,longitude_deg,height_m", *PLAIN]) + "\n", {}),
+    "rtklib": ("a.track.pos", logs.solution(TIMES, PLACES, "latitude(deg) longitude(deg) height(m)"), {}),
+    "nmea": ("a.track.nmea", logs.nmea(TIMES, PLACES), {}),
+    "airdata": ("a.track.csv", logs.airdata(TIMES, PLACES), {"height_offset_m": 48.0}),
+    "optitrack": (
+        "a.track.csv",
+        logs.capture(np.arange(12) / 360, logs.poses()),
+        {"start_utc": "2025-05-14", "body": "Radar"},
+    ),
+}
+HEADING = {"csv": 1, "rtklib": 2, "nmea": 0, "airdata": 1, "optitrack": 7}
+SHIFT = {"airdata": np.timedelta64(150, "ms")}
+"""By how much the fraction of a second may be taken otherwise where fewer epochs tell it."""
+
+PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
+
+
+def read(folder, kind, data):
+    """Return the track of a damaged log, or None where it is refused."""
+    name, _, options = LOGS[kind]
+    (folder / name).write_bytes(data)
+    try:
+        return read_track(folder / name, node="a", options=LogOptions(**options))
+    except CampaignError:
+        return None
+
+
+def moved(track, whole, kind):
+    """Return how many epochs are none of the whole log's: of its position, at its time."""
+    if track is None:
+        return 0
+    nearest = np.abs(track.position.values[:, None] - whole.position.values).max(axis=2).argmin(axis=1)
+    off = np.abs(track.position.values - whole.position.values[nearest]).max(axis=1) > 1e-9
+    late = np.abs(track.time.values - whole.time.values[nearest]) > SHIFT.get(kind, np.timedelta64(0, "ns"))
+    return int((off | late).sum())
+
+
+@pytest.mark.parametrize("kind", LOGS)
+@PROPERTY
+@given(data=st.data())
+def test_a_log_that_is_cut_off_ends_earlier_or_is_refused(tmp_path_factory, kind, data):
+    folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
+    whole = read(folder, kind, text)
+    # half of the places lie within the last lines, where numbers are cut
+    place = data.draw(st.one_of(st.integers(0, len(text) - 1), st.integers(len(text) - 300, len(text) - 1)))
+    track = read(folder, kind, text[:place])
+    assert moved(track, whole, kind) == 0
+    assert track is None or track.sizes["epoch"] <= whole.sizes["epoch"]
+
+
+@pytest.mark.parametrize("kind", LOGS)
+@PROPERTY
+@given(data=st.data())
+def test_a_log_whose_lines_change_places_is_refused_or_the_same(tmp_path_factory, kind, data):
+    folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1]
+    whole = read(folder, kind, text.encode())
+    lines = text.split("\n")[:-1]
+    first, second = (data.draw(st.integers(HEADING[kind], len(lines) - 1)) for _ in range(2))
+    lines[first], lines[second] = lines[second], lines[first]
+    assert moved(read(folder, kind, ("\n".join(lines) + "\n").encode()), whole, kind) == 0
+
+
+@pytest.mark.parametrize("kind", LOGS)
+@PROPERTY
+@given(data=st.data())
+def test_a_log_that_lost_a_piece_is_refused_or_lacks_epochs(tmp_path_factory, kind, data):
+    """Of the line that a piece is missing from the two ends may be one plausible line; no other epoch moves."""
+    folder, text = tmp_path_factory.mktemp("log"), LOGS[kind][1].encode()
+    whole = read(folder, kind, text)
+    place = data.draw(st.integers(text.index(b"\n") + 1, len(text) - 1))
+    length = data.draw(st.integers(1, 150))
+    track = read(folder, kind, text[:place] + text[place + length :])
+    assert moved(track, whole, kind) <= (0 if kind == "nmea" else 1)
+
+
+@pytest.mark.parametrize("kind", LOGS)
+@PROPERTY
+@given(data=st.data())
+def test_a_flipped_bit_moves_one_epoch_at_most(tmp_path_factory, kind, data):
+    """Without a checksum a digit that became another is a position; how far it stands out is `check_track`'s."""
+    folder, text = tmp_path_factory.mktemp("log"), bytearray(LOGS[kind][1].encode())
+    whole = read(folder, kind, bytes(text))
+    place = data.draw(st.integers(0, len(text) - 1))
+    text[place] ^= 1 << data.draw(st.integers(0, 7))
+    assert moved(read(folder, kind, bytes(text)), whole, kind) <= (0 if kind == "nmea" else 1)
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_a_line_that_stands_twice_is_refused_or_counted(tmp_path, kind):
+    lines = LOGS[kind][1].split("\n")
+    doubled = "\n".join([*lines[:-2], lines[-2], *lines[-2:]])
+    track, whole = (read(tmp_path, kind, text.encode()) for text in (doubled, LOGS[kind][1]))
+    assert track is None or (track.sizes["epoch"] == whole.sizes["epoch"] and moved(track, whole, kind) == 0)
