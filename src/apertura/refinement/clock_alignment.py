@@ -198,6 +198,8 @@ def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, cont
     if rival > 10 ** (RIVAL_DB / 10):
         other_s = float(offsets_s[np.where(away, power, 0.0).argmax()])
         flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-10 * np.log10(rival):.1f} dB worse"
+    if 2 * width_s > offsets_s[-1] - offsets_s[0]:
+        flags["alignment_ambiguous"] = f"all offsets from {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s do as well"
     if min(best_s - offsets_s[0], offsets_s[-1] - best_s) < width_s:
         flags["alignment_at_edge"] = f"{best_s:.3f} s lies at an end of {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s"
     if contrast_db < LEAST_CONTRAST_DB:

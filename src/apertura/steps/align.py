@@ -98,7 +98,8 @@ def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, 
         f"epoch of the log; path beyond geometry {stated['path_offset_m']:.4f} m ± {found.path_width_m:.4f} m"
     )
     print(
-        f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above other offsets"
+        f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above "
+        f"{'other offsets' if asked['point'] else 'the median of the image'}"
     )
     for name, line in found.flags.items():
         print(f"{name}: {line}")

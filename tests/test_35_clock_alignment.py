@@ -1,0 +1,102 @@
+"""A recorder's clock and path from its echoes: found where a node changed its speed, refused or flagged where not."""
+
+import numpy as np
+import pytest
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.geometry.aperture import Aperture
+from apertura.refinement.clock_alignment import align_on_point
+from apertura.refinement.motion import Logged, Recorded, plausible_offsets
+from apertura.refinement.scene_alignment import align_on_scene
+from apertura.scene.grid import SceneGrid
+from apertura.scene.terrain import FlatGround
+
+BEHIND_S, PATH_M = 3.217, 1.43
+FREQUENCY = 3.0e9 + 10e6 * np.arange(100)
+POINTS = np.array([[0.3, 4.0, 0.0], [-0.9, 4.6, 0.0], [1.1, 3.5, 0.0]])
+
+
+def start_and_stop(time_s):
+    """Stand for 3 s, go 3 m in 8 s with a swing, stand."""
+    along = np.clip((time_s - 5.0) / 8.0, 0.0, 1.0)
+    return 3.0 * (along + 0.04 * np.sin(4 * np.pi * along)) - 1.5
+
+
+def steadily(time_s):
+    return 0.3 * (time_s - 9.0)
+
+
+def flown(along):
+    return np.stack([along, 0 * along, np.full_like(along, 1.0)], -1)
+
+
+def given(move, *, amplitudes=(1.0, 0.4, 0.5), seed=3):
+    """Pulses from 1 to 15 s, by a clock that reads `BEHIND_S` less; constant coupling and noise added."""
+    pulse_s = np.arange(1.0, 15.0, 0.02)
+    antenna = flown(move(pulse_s))
+    rng = np.random.default_rng(seed)
+    paths = [2 * np.linalg.norm(antenna - point, axis=1) + PATH_M for point in POINTS]
+    transfer = sum(
+        amplitude * np.exp(-2j * np.pi * FREQUENCY * path[:, None] / SPEED_OF_LIGHT_M_S)
+        for amplitude, path in zip(amplitudes, paths, strict=True)
+    )
+    transfer = transfer + 5 * np.exp(-2j * np.pi * FREQUENCY * 0.5 / SPEED_OF_LIGHT_M_S)
+    transfer = transfer + rng.normal(0, 0.3, (2, *transfer.shape)).T.swapaxes(0, 1) @ [1, 1j]
+    echo = Recorded(transfer.astype(np.complex64), FREQUENCY, np.zeros(len(pulse_s)), pulse_s - BEHIND_S)
+    log = Logged(lambda at_s: Aperture(flown(move(at_s)), flown(move(at_s))), 0.0, 18.0)
+    return echo, log
+
+
+def test_a_start_and_a_stop_leave_a_fraction_of_a_second():
+    low, high = plausible_offsets(*given(start_and_stop), (-10.0, 15.0))
+    assert low < BEHIND_S < high
+    assert high - low < 2.0
+
+
+def test_constant_velocity_rules_no_offset_out():
+    low, high = plausible_offsets(*given(steadily), (1.0, 6.0))
+    assert (low, high) == pytest.approx((1.0, 6.0), abs=0.1)
+
+
+def test_offset_and_path_are_found_on_a_known_point():
+    found = align_on_point(*given(start_and_stop), POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
+    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
+    assert found.path_m == pytest.approx(PATH_M, abs=0.005)
+    assert found.contrast_db > 15
+    assert not found.flags
+    assert 0.01 < found.offset_width_s < 0.2
+
+
+def test_a_path_that_is_known_is_kept():
+    echo, log = given(start_and_stop)
+    known = Recorded(
+        echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s
+    )
+    found = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
+    assert found.path_m == 0.0
+    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
+
+
+def test_a_point_that_is_not_there_is_told_of():
+    found = align_on_point(*given(start_and_stop), np.array([-1.4, 9.0, 0.0]), within_s=(-10.0, 15.0), search_m=0.2)
+    assert {"alignment_uncertain", "alignment_ambiguous"} & found.flags.keys()
+
+
+def test_sharpness_alone_finds_both_where_the_speed_changes():
+    grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
+    found = align_on_scene(*given(start_and_stop), grid, FlatGround(0.0), within_s=(-10.0, 15.0), search_m=2.0)
+    assert found.offset_s == pytest.approx(BEHIND_S, abs=0.1)
+    assert found.path_m == pytest.approx(PATH_M, abs=0.1)
+    assert np.linalg.norm(np.array(found.report["brightest_m"]) - POINTS[0]) < 0.06
+
+
+def test_at_constant_velocity_sharpness_tells_nothing():
+    grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
+    found = align_on_scene(*given(steadily), grid, FlatGround(0.0), within_s=(2.5, 4.0), search_m=0.0)
+    assert "alignment_ambiguous" in found.flags
+
+
+def test_a_log_of_another_day_is_refused():
+    echo, log = given(start_and_stop)
+    with pytest.raises(ValueError, match="no offset puts half of the pulses inside the log"):
+        plausible_offsets(echo, log, (100.0, 120.0))
