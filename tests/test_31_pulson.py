@@ -68,7 +68,9 @@ def test_another_file_is_refused(tmp_path, content):
 
 
 @settings(max_examples=60, deadline=None)
-@given(at=st.integers(0, 32 + 6 * MESSAGES * _MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000))
+@given(
+    at=st.integers(0, 32 + 6 * MESSAGES * _MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000)
+)
 def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, bit, last):
     paths_m = 8 + 0.1 * np.arange(6)
     content = bytearray(recorded(paths_m))

@@ -69,9 +69,7 @@ def test_offset_and_path_are_found_on_a_known_point():
 
 def test_a_path_that_is_known_is_kept():
     echo, log = given(start_and_stop)
-    known = Recorded(
-        echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s
-    )
+    known = Recorded(echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s)
     found = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
     assert found.path_m == 0.0
     assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)

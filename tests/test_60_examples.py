@@ -1,0 +1,104 @@
+"""The campaigns of examples/, whose configs are in the repository and whose data are not."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import run_steps
+
+from apertura.campaign import Campaign
+from apertura.check import problems
+from apertura.ingest.optitrack import body_position
+from apertura.steps.align import align, keep
+from apertura.store import open_stage
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def rail_pass(shared, tmp_path):
+    root = tmp_path / "rail_pass"
+    shutil.copytree(EXAMPLES / "rail_pass", root)
+    folder = root / "raw" / "passA"
+    folder.mkdir(parents=True)
+    shutil.copyfile(shared / "bwsi_rail_passA" / "July23_03.out", folder / "radar.out")
+    shutil.copyfile(shared / "bwsi_rail_passA" / "Rail SAR 2.csv", folder / "radar.track.csv")
+    return root
+
+
+def reflector(root):
+    return body_position(root / "raw/passA/radar.track.csv", "Corner Reflector")
+
+
+def response(root, point):
+    """Where the reflector is brightest (m off), how far above the image's median (dB), its widths at -3 dB (m)."""
+    image = abs(open_stage(Campaign.load(root).stage("image", "passA", "radar-radar"), "image").image)
+    near = image.where((abs(image.x - point[0]) < 0.3) & (abs(image.y - point[1]) < 0.3), 0.0).values
+    row, column = np.unravel_index(near.argmax(), near.shape)
+    values, peak = image.values, near.max()
+    off_m = float(np.hypot(image.x[column] - point[0], image.y[row] - point[1]))
+    widths_m = [width(cut, at) * 0.02 for cut, at in ((values[row], column), (values[:, column], row))]
+    return off_m, 20 * np.log10(peak / np.nanmedian(values)), widths_m
+
+
+def width(cut, peak):
+    """Samples between the -3 dB points on both sides of a peak."""
+    least = cut[peak] / np.sqrt(2)
+    left = peak - int((cut[peak::-1] < least).argmax())
+    right = peak + int((cut[peak:] < least).argmax())
+    inner = (least - cut[left]) / (cut[left + 1] - cut[left]), (least - cut[right]) / (cut[right - 1] - cut[right])
+    return right - left - sum(inner)
+
+
+def test_the_rail_pass_is_aligned_by_its_reflector_as_its_config_says(rail_pass):
+    campaign = Campaign.load(rail_pass)
+    found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)))
+    assert not found.flags
+    assert found.offset_s == pytest.approx(4.4535, abs=1e-3)
+    assert float(stated["offset_s"]) == pytest.approx(campaign.clock("passA", "radar").offset_ns * 1e-9, abs=1e-3)
+    assert stated["path_offset_m"] == pytest.approx(campaign.settings.nodes["radar"].path_offset_m.radar, abs=2e-3)
+
+
+def test_a_path_that_was_frozen_leaves_only_the_clock_to_be_found(rail_pass):
+    """As another pass of the same radar needs it."""
+    (rail_pass / "config/clocks.tsv").unlink()
+    campaign = Campaign.load(rail_pass)
+    found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)), search_m=0.0)
+    keep(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
+    kept, stated_before = Campaign.load(rail_pass).clock("passA", "radar"), 1563913933.0905
+    assert kept.offset_ns * 1e-9 == pytest.approx(stated_before, abs=2e-3)
+    assert kept.std_s == pytest.approx(found.offset_width_s, abs=1e-6)
+    assert stated["path_offset_m"] == 3.8225
+
+
+def test_the_reflector_of_the_rail_pass_is_where_it_was_tracked(rail_pass):
+    assert problems(rail_pass) == []
+    run_steps(rail_pass, exports=False)
+    off_m, above_db, (across_m, along_m) = response(rail_pass, reflector(rail_pass))
+    assert off_m < 0.02
+    assert above_db > 20
+    assert across_m < 0.15
+    assert along_m < 0.10
+
+
+@pytest.mark.slow
+def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(rail_pass):
+    (rail_pass / "config/clocks.tsv").unlink()
+    campaign = Campaign.load(rail_pass)
+    found, stated = align(campaign, "passA", "radar", search_m=6.0)
+    keep(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
+    config = rail_pass / "config/config.yaml"
+    config.write_text(config.read_text().replace("radar: 3.8225", f"radar: {stated['path_offset_m']:.4f}"))
+    run_steps(rail_pass, exports=False)
+    assert response(rail_pass, reflector(rail_pass))[0] < 0.10
+
+
+def test_gotcha_is_without_problems(shared, tmp_path):
+    root = tmp_path / "gotcha"
+    shutil.copytree(EXAMPLES / "gotcha", root)
+    folder = root / "raw" / "pass1"
+    folder.mkdir(parents=True)
+    for file in (shared / "gotcha_afrl").glob("*.mat"):
+        shutil.copyfile(file, folder / f"aircraft.{file.name}")
+    assert problems(root) == []
