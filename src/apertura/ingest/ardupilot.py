@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError, quoted
 from apertura.ingest.autopilot import Attitude, Epochs, autopilot_track
-from apertura.ingest.dataflash_fields import NEEDED
+from apertura.ingest.dataflash_fields import COLUMNS, NEEDED
 from apertura.ingest.isolated import UnreadableError, read_isolated
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.track import FIXES
@@ -80,7 +80,7 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         As `read_ardupilot`.
     """
     chosen, known = _receiver(fields, options, node, where)
-    rows = {name: fields[f"GPS/{name}"][fields["GPS/I"] == chosen] for name in NEEDED}
+    rows = {name: fields[f"GPS/{name}"][fields["GPS/I"] == chosen] for name in COLUMNS["GPS"]}
     stated = _accuracy(fields, chosen, rows["TimeUS"])
     height = _height(fields, rows["Alt"], stated["AEl"], chosen, options)
     if height is None:
@@ -102,6 +102,7 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         fixed=fix > 0,
         fix=fix,
         std_m=np.stack([stated["HAcc"], stated["HAcc"], stated["VAcc"]], -1),
+        velocity=_velocity(rows, stated["VV"]),
     )
     delay_s = _parameter(fields, _DELAYS, chosen, 0.0) / 1e3
     delay_s = delay_s if 0 < delay_s < 1 else _DELAY_S
@@ -128,13 +129,13 @@ def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tu
 
 
 def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Floats]:
-    """Return HAcc, VAcc and AEl (m) of the GPA message that was written with each epoch; NaN where there is none."""
+    """Return HAcc, VAcc, AEl (m), VV (VZ is known) of the GPA message written with each epoch; NaN where none was."""
     own = fields["GPA/I"] == receiver
     times, order = np.unique(fields["GPA/TimeUS"][own], return_index=True)
     place = np.searchsorted(times, time_us)
     there = place < times.size
     there[there] = times[place[there]] == time_us[there]
-    stated = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "AEl")}
+    stated = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "VV", "AEl")}
     for name, values in stated.items():
         values[there] = fields[f"GPA/{name}"][own][order][place[there]]
     return stated
@@ -162,6 +163,13 @@ def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
     utc = np.full(week.size, np.datetime64("NaT"), "datetime64[ns]")
     utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))
     return utc
+
+
+def _velocity(rows: Fields, vertical: Floats) -> Floats:
+    """Return velocities to north, east and down."""
+    course = np.radians(rows["GCrs"])
+    down = np.where(vertical == 1, rows["VZ"], np.nan)
+    return np.stack([rows["Spd"] * np.cos(course), rows["Spd"] * np.sin(course), down], -1)
 
 
 def _attitude(fields: Fields) -> Attitude | None:

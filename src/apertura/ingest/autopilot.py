@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from apertura.errors import CampaignError
 from apertura.ingest.boot_clock import clock_of
 from apertura.ingest.log_options import LogOptions
+from apertura.ingest.own_velocity import contradicted
 from apertura.ingest.times import utc_times
 from apertura.ingest.track import make_track
 
@@ -55,6 +56,8 @@ class Epochs:
         (epoch,) int8: a value of `FIXES`; None: not logged.
     std_m
         (epoch, 3) float64: to north, east and up; values that no receiver states become NaN.
+    velocity
+        (epoch, 3) float64 to north, east and down, m/s, NaN where not logged.
     """
 
     boot_s: Floats
@@ -63,12 +66,13 @@ class Epochs:
     fixed: NDArray[np.bool_]
     fix: NDArray[np.int8] | None
     std_m: Floats
+    velocity: Floats
 
     def only(self, kept: NDArray[np.bool_]) -> "Epochs":
         """Return the epochs that are kept."""
         fix = None if self.fix is None else self.fix[kept]
         placed = self.boot_s[kept], self.time_utc[kept], self.geodetic[kept]
-        return Epochs(*placed, self.fixed[kept], fix, self.std_m[kept])
+        return Epochs(*placed, self.fixed[kept], fix, self.std_m[kept], self.velocity[kept])
 
 
 def autopilot_track(
@@ -76,8 +80,9 @@ def autopilot_track(
 ) -> xr.Dataset:
     """Return the `track` stage of an autopilot's log.
 
-    Epochs without a fix, height or time of their own, those that the log holds twice and those whose time is not that
-    of the autopilot's clock are left out and counted. Attitude is taken where the autopilot was when an epoch was true.
+    Epochs without a fix, height or time of their own, those that the log holds twice, whose time is not that of the
+    autopilot's clock or whose place is not where the receiver's velocity leads are left out and counted. Attitude is
+    taken where the autopilot was when an epoch was true.
 
     Parameters
     ----------
@@ -105,7 +110,7 @@ def autopilot_track(
         return epochs.only(~wrong)
 
     epochs = without(~epochs.fixed, "no fix")
-    epochs = without(~np.isfinite(epochs.geodetic).all(axis=1), "no ellipsoidal height")
+    epochs = without(~np.isfinite(epochs.geodetic.sum(axis=1)), "no ellipsoidal height")
     if epochs.time_utc.size and np.isnat(epochs.time_utc).all():
         epochs = replace(epochs, time_utc=_counted(epochs.boot_s, options, node, where))
     epochs = without(np.asarray(np.isnat(epochs.time_utc)), "no time of the receiver")
@@ -114,6 +119,8 @@ def autopilot_track(
     if epochs.boot_s.size:
         clock, agree = clock_of(epochs.boot_s, epochs.time_utc, delay_s=delay_s, where=where)
         epochs = without(~agree, "a time that is not the autopilot's")
+        moved = contradicted(epochs.time_utc, epochs.geodetic, epochs.velocity)
+        epochs = without(moved, "not where the receiver's velocity leads")
         angles = None if attitude is None else _angles_deg(attitude, clock.boot_s(epochs.time_utc))
     stated = np.where((epochs.std_m > 0) & (epochs.std_m < _WORST_STD_M), epochs.std_m, np.nan)
     return make_track(

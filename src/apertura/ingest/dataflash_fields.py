@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 COLUMNS = {
-    "GPS": ("TimeUS", "I", "Status", "GMS", "GWk", "Lat", "Lng", "Alt"),
-    "GPA": ("TimeUS", "I", "HAcc", "VAcc", "AEl"),
+    "GPS": ("TimeUS", "I", "Status", "GMS", "GWk", "Lat", "Lng", "Alt", "Spd", "GCrs", "VZ"),
+    "GPA": ("TimeUS", "I", "HAcc", "VAcc", "VV", "AEl"),
     "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
 }
 """Message → its columns that are read; those that a version of ArduPilot does not log are NaN."""
@@ -57,6 +57,8 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 def _row(message: Any, kind: str) -> list[float]:
     """Return the columns of a message; NaN where its version has none."""
     there = set(message.get_fieldnames())
+    if len(message.fmt.columns) != len(message.fmt.format):
+        raise ValueError(f"{message.get_type()} has {len(message.fmt.columns)} columns of {message.fmt.format!r}")
     lacking = [name for name in NEEDED if kind == "GPS" and name not in there]
     if lacking:
         raise ValueError(f"{message.get_type()} messages without {', '.join(lacking)}")

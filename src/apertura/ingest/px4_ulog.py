@@ -148,7 +148,13 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
             f"Set nodes.{node}.log.height_offset_m: what makes heights above sea level ellipsoidal (the geoid's).",
         )
     return Epochs(
-        boot_s, utc, np.stack([latitude, longitude, height], -1), fixed, fix, np.stack([across, across, up], -1)
+        boot_s,
+        utc,
+        np.stack([latitude, longitude, height], -1),
+        fixed,
+        fix,
+        np.stack([across, across, up], -1),
+        _velocity(fields, source),
     )
 
 
@@ -164,6 +170,14 @@ def _height(
     if not copied:
         return ellipsoidal
     return sea_level + offset_m if sea_level is not None and offset_m is not None else None
+
+
+def _velocity(fields: Fields, source: str) -> NDArray[np.float64]:
+    unknown = np.full(fields[f"{source}/timestamp"].size, np.nan)
+    axes = [_first(fields, source, (f"vel_{axis}_m_s", f"vel_{axis}")) for axis in "ned"]
+    valid = np.asarray(fields.get(f"{source}/vel_ned_valid", 1)) == 1
+    velocity = np.stack([unknown if axis is None else axis for axis in axes], -1)
+    return np.where(valid[..., None], velocity, np.nan)
 
 
 def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.float64] | None:
