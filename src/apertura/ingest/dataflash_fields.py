@@ -14,8 +14,8 @@ COLUMNS = {
 }
 """Message → its columns that are read; those that a version of ArduPilot does not log are NaN."""
 
-NEEDED = ("TimeUS", "Status", "GMS", "GWk", "Lat", "Lng", "Alt")
-"""Columns of GPS without which there are no positions in time."""
+NEEDED = tuple(name for name in COLUMNS["GPS"] if name != "I")
+"""Columns of GPS that every version since 3.3 logs; one that is not there was damaged."""
 
 _SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # the second receiver, before it became I = 1 of the same message
 _BINARY = b"\xa3\x95"

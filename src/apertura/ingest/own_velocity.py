@@ -8,14 +8,15 @@ from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
 Floats = NDArray[np.float64]
 
 _NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the 20 m/s² by which velocity may bend between epochs
-_MOST = 0.1
+_MOST, _FEW = 0.5, 10
 
 
 def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: Floats) -> NDArray[np.bool_]:
     """Return which epochs are not where their neighbours and the velocities lead.
 
     A step that starts or ends at an epoch misses by |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch whose steps all
-    miss is contradicted. Where that is more than a tenth of them, it is the velocities that are wrong: none is.
+    miss is contradicted. Where more than half of ten or more steps miss, it is the velocities that are wrong: no epoch
+    is.
 
     Parameters
     ----------
@@ -46,11 +47,14 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     wrong = np.zeros(len(time_utc), bool)
     if len(wrong) < 3:
         return wrong
+    ends = velocity[:-1], velocity[1:]  # of each step; one stands in for the other where that is not known
     with np.errstate(invalid="ignore"):  # of what is no place on Earth, which is refused later
         position = ecef_from_geodetic(*geodetic.T)
         steps = np.einsum("eij,ei->ej", ned_axes(position)[:-1], np.diff(position, axis=0))
         lasting = (np.diff(time_utc) / np.timedelta64(1, "s"))[:, None]
-        missed = steps - (velocity[1:] + velocity[:-1]) / 2 * lasting
+        before, after = (np.where(np.isnan(v), w, v) for v, w in (ends, ends[::-1]))
+        missed = steps - (before + after) / 2 * lasting
         far = (np.abs(missed) > _NEAR_M + _CURVED_M_S2 * lasting**2).any(axis=1)  # NaN is not
-    wrong = np.concatenate([[True], far]) & np.concatenate([far, [True]])
-    return wrong if wrong.mean() <= _MOST else np.zeros_like(wrong)
+    if far.size >= _FEW and far.mean() > _MOST:
+        return wrong
+    return np.asarray(np.concatenate([[True], far]) & np.concatenate([far, [True]]))
