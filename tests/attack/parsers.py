@@ -8,12 +8,10 @@ from typing import Any
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
-from apertura.ingest import open_recording, read_track
-from apertura.ingest import ardupilot, dataflash_fields, px4_ulog, ulog_fields
+from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, ulog_fields
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
-from apertura.ingest.log_options import LogOptions
-from apertura.ingest.log_options import AS_IT_SAYS
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
@@ -224,7 +222,7 @@ PARSERS: dict[str, Parser] = {
         seeds.ulogs,
         _autopilot(ulog_fields.read_fields, px4_ulog.track_of),
         (),
-        "ULog\x01\x12\x35 vehicle_gps_position sensor_gps: uint64_t timestamp; int32_t[9] lat lon D\x00 A\x00 \x2f\x73\x13",
+        "ULog\x01\x12\x35 vehicle_gps_position sensor_gps: uint64_t timestamp; int32_t[9] lat D\x00 A\x00 \x2f\x73\x13",
         True,
     ),
     "track.bin": Parser(

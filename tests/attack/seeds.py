@@ -15,9 +15,6 @@ from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.settings.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
-
-from . import logs
-
 from tests.autopilot_logs import (
     dataflash,
     dataflash_rows,
@@ -27,6 +24,8 @@ from tests.autopilot_logs import (
     ulog_fused,
     ulog_receiver,
 )
+
+from . import logs
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 
@@ -174,7 +173,9 @@ def ulogs() -> list[bytes]:
     """Return logs of PX4 of both generations, with attitude and fused positions."""
     attitude = ("vehicle_attitude", 0, ulog_attitude(12, 10.0))
     old = ulog(("vehicle_gps_position", 0, ulog_receiver(epochs=12)), attitude)
-    new = ulog(("sensor_gps", 1, ulog_receiver(old=False, epochs=12)), attitude, ("vehicle_global_position", 0, ulog_fused(12)))
+    new = ulog(
+        ("sensor_gps", 1, ulog_receiver(old=False, epochs=12)), attitude, ("vehicle_global_position", 0, ulog_fused(12))
+    )
     return [old, new]
 
 

@@ -34,7 +34,7 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
 
     Notes
     -----
-    Source: docs/theory/flight_logs.md, eq. 2.
+    Source: docs/theory/autopilots.md, eq. 2.
 
     Examples
     --------
