@@ -222,6 +222,7 @@ def test_a_step_between_solutions_is_no_epoch_out_of_place(tmp_path):
         (ulog((ATTITUDE, 0, ulog_attitude())), "no message of any of them"),
         (ulog((GPS, 0, ulog_receiver(lat=None))), "no latitude and longitude"),
         (ulog((GPS, 0, ulog_receiver(fix_type=None))), "no fix_type"),
+        (ulog((GPS, 0, ulog_receiver(vel_d_m_s=None))), "no vel_d_m_s"),
         (ulog((GPS, 0, ulog_receiver(fix_type=np.zeros(60, int)))), "no heights above the ellipsoid"),
         (ulog((GPS, 0, ulog_receiver(epochs=1))), "1 epochs"),
     ],

@@ -25,6 +25,9 @@ _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix
 _STATES = {"dead_reckoning": 0, "lat_lon_valid": 1, "alt_valid": 1}
 """What flags of fused positions are where a receiver holds them; versions of PX4 log some of them."""
 
+_ALWAYS = ("fix_type", "vel_n_m_s", "vel_e_m_s", "vel_d_m_s")
+"""Fields of receivers in every version of PX4; one that is not there was damaged."""
+
 _DELAY_MS = 110.0
 _FIRST_US, _LAST_US = 3.2e14, 7.2e15  # of UTC, 1980 to 2198; 0 is: not known
 _LATITUDE, _LONGITUDE = ("latitude_deg", "lat"), ("longitude_deg", "lon")
@@ -128,8 +131,9 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
         raise _error(f"no latitude and longitude in {source}", where)
     of = {name: fields.get(f"{source}/{name}") for name in ("fix_type", "eph", "epv")}
     fix = None if of["fix_type"] is None else np.array([_KINDS.get(int(kind), 0) for kind in of["fix_type"]], np.int8)
-    if fix is None and not source.startswith(FUSED):
-        raise _error(f"no fix_type in {source}", where)
+    lacking = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
+    if lacking:
+        raise _error(f"no {', '.join(lacking)} in {source}", where)
     fixed = np.ones(latitude.size, bool) if fix is None else fix > 0
     for name, good in _STATES.items():
         fixed &= np.asarray(fields.get(f"{source}/{name}", good)) == good
