@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
-from apertura.ingest import open_recording, read_track
+from apertura.errors import CampaignError, shown
+from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, ulog_fields
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
-from apertura.ingest.log_options import LogOptions
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
@@ -92,6 +92,19 @@ def _history(path: Path) -> Any:
     return joined([path], [fields], pair="a-a")
 
 
+def _autopilot(fields_of: Any, track_of: Any) -> Callable[[Path], Any]:
+    """As a reader of an autopilot's log, in this process: whoever calls it lets it die."""
+
+    def read(path: Path) -> Any:
+        try:
+            fields = fields_of(path)
+        except Exception as error:  # of whatever kind: there it is the last line of a process
+            raise CampaignError(shown(error, 300), path, "a log", "Copy it again.") from error
+        return track_of(fields, node="uav1", options=AS_IT_SAYS, where=path)
+
+    return read
+
+
 def _dem(path: Path) -> Any:
     dem = open_dem(path, GRID, datum="ellipsoid")
     return dem.heights(GRID)
@@ -138,6 +151,7 @@ _MAPPED = LogOptions(
     columns={"time_s": "t", "latitude_deg": "lat", "longitude_deg": "lon", "height_m": "alt"},
 )
 _TIMES = "2025-05-14T09:30:60Z 9999-12-31 0001-01-01T00:00:00+23:59 now NaT 2025-W20-3 T Z , ; : / - ."
+_DATAFLASH = "FMT, GPS, GPA, ATT, PARM, FMTU, UNIT, MULT, TimeUS,I,Status QBBIHBcLLeffffB QZaMn , ,,,, 128 1e999 nan"
 _JSON_TREE = (mutators.json_tree,)
 _YAML_TREE = (mutators.yaml_tree, mutators.yaml_tree, mutators.bomb)
 _CSV = (mutators.cells(","), mutators.cells(","), mutators.quoted_cells)
@@ -202,6 +216,30 @@ PARSERS: dict[str, Parser] = {
         lambda path: read_track(path, node="uav1", options=LogOptions(start_utc="2025-05-14", body="Radar")),
         (mutators.cells(","),),
         "Quaternion Global Meters Millimeters Radar Type Name Frame X W Rotation Position",
+    ),
+    "track.ulg": Parser(
+        "uav1.track.ulg",
+        seeds.ulogs,
+        _autopilot(ulog_fields.read_fields, px4_ulog.track_of),
+        (),
+        "ULog\x01\x12\x35 vehicle_gps_position sensor_gps: uint64_t timestamp; int32_t[9] lat D\x00 A\x00 \x2f\x73\x13",
+        True,
+    ),
+    "track.bin": Parser(
+        "uav1.track.bin",
+        seeds.dataflash_logs,
+        _autopilot(dataflash_fields.read_fields, ardupilot.track_of),
+        (),
+        f"{_DATAFLASH} \xa3\x95\x80 \xa3\x95\x82",
+        True,
+    ),
+    "track.log": Parser(
+        "uav1.track.log",
+        seeds.dataflash_texts,
+        _autopilot(dataflash_fields.read_fields, ardupilot.track_of),
+        (mutators.cells(","),),
+        _DATAFLASH,
+        True,
     ),
     "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
     "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),

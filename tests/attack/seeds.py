@@ -15,6 +15,15 @@ from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.settings.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
+from tests.autopilot_logs import (
+    dataflash,
+    dataflash_rows,
+    dataflash_text,
+    ulog,
+    ulog_attitude,
+    ulog_fused,
+    ulog_receiver,
+)
 
 from . import logs
 
@@ -158,6 +167,26 @@ def captures() -> list[bytes]:
     """Return takes of two bodies and the head of a real one."""
     text = logs.capture(np.arange(12) / 360, logs.poses(), lost=[5])
     return [text.encode(), *real("bwsi_rail_passA/Rail SAR 2.csv", lines=30)]
+
+
+def ulogs() -> list[bytes]:
+    """Return logs of PX4 of both generations, with attitude and fused positions."""
+    attitude = ("vehicle_attitude", 0, ulog_attitude(12, 10.0))
+    old = ulog(("vehicle_gps_position", 0, ulog_receiver(epochs=12)), attitude)
+    new = ulog(
+        ("sensor_gps", 1, ulog_receiver(old=False, epochs=12)), attitude, ("vehicle_global_position", 0, ulog_fused(12))
+    )
+    return [old, new]
+
+
+def dataflash_logs() -> list[bytes]:
+    """Return binary logs of ArduPilot with one receiver and with two."""
+    return [dataflash(dataflash_rows(epochs=12)), dataflash(dataflash_rows(epochs=8, receivers=(0, 1)))]
+
+
+def dataflash_texts() -> list[bytes]:
+    """Return the same as text."""
+    return [dataflash_text(dataflash_rows(epochs=12)), dataflash_text(dataflash_rows(epochs=8, receivers=(0, 1)))]
 
 
 def patterns() -> list[bytes]:

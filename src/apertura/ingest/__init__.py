@@ -38,6 +38,8 @@ TRACKS: Mapping[str, LogFormat] = {
     "optitrack": LogFormat((".csv",), "apertura.ingest.optitrack:read_optitrack", "Format Version,1."),
     "csv": LogFormat((".csv",), "apertura.ingest.csv_track:read_csv_track"),
     "nmea": LogFormat((".nmea", ".txt"), "apertura.ingest.nmea:read_nmea", "$"),
+    "px4": LogFormat((".ulg",), "apertura.ingest.px4_ulog:read_px4_ulog"),
+    "ardupilot": LogFormat((".bin", ".log"), "apertura.ingest.ardupilot:read_ardupilot", heading="FMT"),
     "rtklib": LogFormat((".pos",), "apertura.ingest.rtklib:read_rtklib_pos"),
 }
 """Name of a format → how it is recognised and read; of those that fit a file the first is taken."""

@@ -1,0 +1,248 @@
+"""ArduPilot logs: GPS weeks become UTC, heights are ellipsoidal or refused, the receiver is the one asked for."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from autopilot_logs import N_M, START, dataflash, dataflash_rows, dataflash_text, flight, utc_of
+from folders import complaint
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apertura.contracts import check
+from apertura.errors import CampaignError
+from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.geometry.track_checks import check_track
+from apertura.ingest import read_track
+from apertura.ingest.ardupilot import track_of
+from apertura.ingest.dataflash_fields import read_fields
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
+
+SECOND = np.timedelta64(1, "s")
+KINDS = {".bin": dataflash, ".log": dataflash_text}
+
+
+def read(tmp_path, rows, *, suffix=".bin", options=AS_IT_SAYS, forms=None):
+    path = tmp_path / f"a.track{suffix}"
+    path.write_bytes(KINDS[suffix](rows, forms))
+    return check(read_track(path, node="a", options=options), "track")
+
+
+def apart_m(track):
+    """Return how far epochs are from where the flight was at their times."""
+    exact, geodetic, _ = flight(4000, 400.0)
+    seconds = (track.time.values - START) / SECOND
+    where = np.stack([np.interp(seconds, exact, axis) for axis in ecef_from_geodetic(*geodetic.T).T], -1)
+    return np.linalg.norm(track.position.values - where, axis=1)
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_a_track_is_what_the_receiver_said(tmp_path, suffix):
+    track = read(tmp_path, dataflash_rows(), suffix=suffix)
+    time, geodetic, yaw = flight()
+    np.testing.assert_array_equal(track.time.values, utc_of(time))  # 18 s behind the log's own weeks
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values), geodetic, atol=6e-3)
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, :2], geodetic[:, :2], atol=6e-8)
+    np.testing.assert_allclose(track.position_std.values, np.tile([0.02, 0.02, 0.03], (60, 1)))
+    np.testing.assert_allclose(
+        np.degrees(track.attitude.values), np.stack([np.full(60, 10.0), np.full(60, 3.0), yaw], -1), atol=2e-3
+    )
+    assert set(track.fix.values) == {1}
+    assert track.attrs["dropped"] == {}
+    assert track.attrs["source"] == "GPS 0 of 0"
+
+
+def test_the_log_written_here_is_one_to_the_makers_own_reader(tmp_path):
+    """The epochs are those that pymavlink gives one by one, at the times that it makes of weeks."""
+    from pymavlink.DFReader import DFReader_binary
+
+    path = tmp_path / "a.track.bin"
+    path.write_bytes(dataflash(dataflash_rows()))
+    log, rows = DFReader_binary(str(path)), []
+    while (message := log.recv_match(type=["GPS"])) is not None:
+        rows.append((log.clock._gpsTimeToTime(message.GWk, message.GMS), message.Lat, message.Lng, message.Alt))
+    seconds, *places = np.array(rows).T
+    track = read_track(path, node="a")
+    unix_s = track.time.values.astype(np.int64) / 1e9
+    np.testing.assert_allclose(unix_s, seconds, atol=1e-6)
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, :2].T, places[:2], atol=1e-9)
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, 2] - N_M, places[2], atol=1e-6)
+
+
+def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_path):
+    """GPS1_DELAY_MS says by how much it hears of an epoch late; 0 leaves it to the driver, 120 ms here."""
+    said = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
+    own = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 0.0}))
+    turned = np.degrees(own.attitude.values[:, 2] - said.attitude.values[:, 2])
+    np.testing.assert_allclose(turned, 0.1 * np.degrees(8 / 50), atol=2e-3)
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, suffix):
+    rows = dataflash_rows(without_ael=True)
+    message = complaint(lambda: read(tmp_path, rows, suffix=suffix))
+    assert "heights are above sea level (GPS.Alt)" in message
+    assert "nodes.a.log.height_offset_m" in message
+    assert apart_m(read(tmp_path, rows, suffix=suffix, options=LogOptions(height_offset_m=N_M))).max() < 0.02
+
+
+def test_ellipsoidal_heights_of_a_driver_that_turns_the_geoid_over_are_not_used(tmp_path):
+    rows = dataflash_rows(parameters={"GPS_TYPE": 15})
+    assert "NovAtel" in complaint(lambda: read(tmp_path, rows))
+    assert apart_m(read(tmp_path, rows, options=LogOptions(height_offset_m=N_M))).max() < 0.02
+
+
+def test_one_of_several_receivers_is_chosen_by_number(tmp_path):
+    """The second is 1e-5 degrees, 1.11 m, to the north."""
+    rows = dataflash_rows(receivers=(0, 1))
+    first = read(tmp_path, rows)
+    assert first.attrs["source"] == "GPS 0 of 0, 1"
+    assert first.sizes["epoch"] == 60
+    second = read(tmp_path, rows, options=LogOptions(body="1"))
+    north = geodetic_from_ecef(second.position.values)[:, 0] - geodetic_from_ecef(first.position.values)[:, 0]
+    np.testing.assert_allclose(north, 1e-5, atol=2e-7)
+    message = complaint(lambda: read(tmp_path, rows, options=LogOptions(body="2")))
+    assert "no receiver '2'; expected one of 0, 1" in message
+    assert "nodes.a.log.body" in message
+
+
+def test_messages_of_a_second_receiver_in_older_logs_are_its_own(tmp_path):
+    own = "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"
+    forms = dict.fromkeys(("GPS", "GPS2"), ("QBIHBcLLeffffB", own))
+    rows = [(name + "2" * values.get("I", 0), values) for name, values in dataflash_rows(receivers=(0, 1))]
+    rows = [(name, values) for name, values in rows if not name.startswith("GPA")]
+    tracks = [
+        read(tmp_path, rows, forms=forms, options=LogOptions(body=body, height_offset_m=N_M)) for body in ("0", "1")
+    ]
+    assert tracks[1].attrs["source"] == "GPS 1 of 0, 1"
+    moved = [geodetic_from_ecef(track.position.values)[0, 0] for track in tracks]
+    assert moved[1] - moved[0] == pytest.approx(1e-5, abs=2e-7)
+
+
+def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path):
+    track = read(tmp_path, dataflash_rows(Status=np.resize([6, 5, 4, 3, 2, 1], 60)))
+    assert track.attrs["dropped"] == {"no fix": 20}
+    assert Counter(track.fix.values.tolist()) == {1: 10, 2: 10, 4: 10, 5: 10}
+
+
+def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
+    weeks = np.where(np.arange(60) < 9, 0, 2366)
+    assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no time of the receiver": 9}
+    message = complaint(lambda: read(tmp_path, dataflash_rows(GWk=np.zeros(60, int))))
+    assert "no epoch has a time in UTC" in message
+    assert "nodes.a.log.start_utc" in message
+
+
+def test_a_flight_before_the_last_leap_seconds_is_behind_by_fewer(tmp_path):
+    """Week 1850, in June 2015, was 16 s ahead of UTC; the same milliseconds ten years later are 18 s ahead."""
+    track = read(tmp_path, dataflash_rows(GWk=np.full(60, 1850)))
+    assert (track.time.values[0] - START) / SECOND == (1850 - 2366) * 7 * 86400 + 2
+
+
+def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path):
+    moved = [
+        (name, {**v, "Lat": v["Lat"] + 1e-5 * (name == "GPS" and n == 59)}) if name == "GPS" else (name, v)
+        for n, (name, v) in numbered(dataflash_rows())
+    ]
+    track = read(tmp_path, moved)
+    assert track.attrs["dropped"] == {"not where the receiver's velocity leads": 1}
+    assert apart_m(track).max() < 0.02
+
+
+def numbered(rows):
+    """Return messages with how many of the same name came before."""
+    seen = Counter()
+    for name, values in rows:
+        yield seen[name], (name, values)
+        seen[name] += 1
+
+
+@pytest.mark.parametrize(
+    ("suffix", "data", "found"),
+    [
+        (".bin", b"", "a flight log of kind '.bin'"),
+        (".log", b"GPS, 1, 2\n" * 50, "a flight log of kind '.log'"),
+        (".log", b"FMT\n" * 50, "no FMT message at its beginning"),
+        (".log", b"FMT, 1\n" * 50, "no GPS message"),
+        (".bin", dataflash([]), "no GPS message"),
+        (".log", dataflash_text([]), "no GPS message"),
+        (
+            ".bin",
+            dataflash(dataflash_rows(), {"GPS": ("QBB", "TimeUS,I,Status")}),
+            "GPS messages without GMS, GWk, Lat",
+        ),
+        (".bin", dataflash(dataflash_rows(epochs=1)), "1 epochs"),
+        (".log", dataflash_text(dataflash_rows()).replace(b"GPS, 3", b"GPS, x"), "not readable"),
+        (".log", b"FMT, 1, 2, X, Z, \xff\n" + dataflash_text(dataflash_rows()), "not readable"),
+    ],
+)
+def test_what_is_no_log_of_a_flight_is_refused(tmp_path, suffix, data, found):
+    path = tmp_path / f"a.track{suffix}"
+    path.write_bytes(data)
+    assert found in complaint(lambda: read_track(path, node="a"))
+
+
+# A damaged log: DataFlash holds no checksums
+
+LOGS = {suffix: write(dataflash_rows()) for suffix, write in KINDS.items()}
+DAMAGED = settings(max_examples=120, deadline=None, derandomize=True)
+PLACES = st.integers(0, 10**6)
+
+
+def read_damaged(path, data):
+    """Return the track of a damaged log, or None where it is refused, as the reader does in its own process."""
+    path.write_bytes(data)
+    try:
+        fields = read_fields(path)
+    except Exception:
+        return None
+    try:
+        return check(track_of(fields, node="a", options=AS_IT_SAYS, where=path), "track")
+    except CampaignError:
+        return None
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def log(request, tmp_path_factory):
+    return tmp_path_factory.mktemp("damaged") / f"a.track{request.param}"
+
+
+@DAMAGED
+@given(PLACES)
+def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
+    data = LOGS[log.suffix]
+    track = read_damaged(log, data[: place % len(data)])
+    if track is not None:
+        assert_no_position_is_silently_wrong(track)
+
+
+@DAMAGED
+@given(st.lists(st.tuples(PLACES, st.integers(0, 7)), min_size=1, max_size=4))
+def test_no_flipped_bit_moves_a_position_silently(log, flips):
+    data = bytearray(LOGS[log.suffix])
+    for place, bit in flips:
+        data[place % len(data)] ^= 1 << bit
+    track = read_damaged(log, bytes(data))
+    if track is not None:
+        assert_no_position_is_silently_wrong(track)
+
+
+@DAMAGED
+@given(st.randoms(use_true_random=False), st.integers(1, 20))
+def test_messages_in_another_order_are_refused_or_the_same(log, random, swaps):
+    rows = dataflash_rows()
+    for _ in range(swaps):
+        first, second = random.randrange(len(rows)), random.randrange(len(rows))
+        rows[first], rows[second] = rows[second], rows[first]
+    track = read_damaged(log, KINDS[log.suffix](rows))
+    if track is not None:
+        assert apart_m(track).max() < 0.02
+
+
+def assert_no_position_is_silently_wrong(track):
+    """Every epoch is where the flight then was, or is found by the check that every track goes through."""
+    time_s = (track.time.values - track.time.values[0]) / SECOND
+    checked = check_track(time_s, track.position.values, poor_fix=np.zeros(time_s.size, bool), tolerated_m=0.01)
+    inside = np.minimum(np.arange(time_s.size), np.arange(time_s.size)[::-1]) >= 6
+    wrong = apart_m(track) > np.where(inside, 0.15, 0.6)  # near the ends only the receiver's velocity tells
+    assert not (wrong & checked.kept).any(), (track.time.values[wrong], apart_m(track)[wrong])
