@@ -163,3 +163,10 @@ def test_a_table_that_does_not_fit_its_header_is_one_message(tmp_path, old, new,
 def test_minutes_beyond_sixty_are_refused(tmp_path):
     rows = [["48 60 00.0", "9 15 36.0", "600.0"]] * 2
     assert "line 3 is" in complaint(lambda: read(tmp_path, logs.solution(TIMES[:2], rows, DMS)))
+
+
+def test_a_standard_deviation_that_no_receiver_states_is_refused(tmp_path):
+    columns = np.hstack([ECEF, np.full((40, 6), 0.01)])
+    names = f"{XYZ} sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)"
+    text = logs.solution(TIMES, columns, names).replace(" 0.010000000", " 1e308", 1)
+    assert "a standard deviation of " in complaint(lambda: read(tmp_path, text))
