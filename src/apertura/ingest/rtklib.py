@@ -32,8 +32,7 @@ _STD_ECEF = ("sdx(m)", "sdy(m)", "sdz(m)", "sdxy(m)", "sdyz(m)", "sdzx(m)")
 _CELLS = re.compile(r"\s*[,;]\s*|\s+")
 _LAST_WEEK, _WEEK_S = 11_000, 604_800
 _JST_AHEAD = np.timedelta64(9, "h")
-_SAME_BASE_M = 0.01
-_WORST_M = 1e9
+_SAME_BASE_M, _WORST_M = 0.01, 1e9
 _EXPECTED = "an RTKLIB solution whose header names its columns and says GPST, UTC or JST"
 _REMEDY = "Export the solution with these output settings."
 
