@@ -106,3 +106,11 @@ def test_a_line_that_stands_twice_is_refused_or_counted(tmp_path, kind):
     doubled = "\n".join([*lines[:-2], lines[-2], *lines[-2:]])
     track, whole = (read(tmp_path, kind, text.encode()) for text in (doubled, LOGS[kind][1]))
     assert track is None or (track.sizes["epoch"] == whole.sizes["epoch"] and moved(track, whole, kind) == 0)
+
+
+@pytest.mark.parametrize("kind", ["csv", "rtklib", "airdata", "optitrack"])
+def test_a_line_that_the_file_ends_in_is_counted_as_no_epoch(tmp_path, kind):
+    text = LOGS[kind][1].rstrip("\r\n")
+    track, whole = (read(tmp_path, kind, data.encode()) for data in (text, LOGS[kind][1]))
+    assert track.sizes["epoch"] == whole.sizes["epoch"] - 1
+    assert track.dropped == {**whole.dropped, "line cut off": 1}

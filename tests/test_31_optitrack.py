@@ -93,6 +93,7 @@ def test_a_body_that_stands_still_has_one_position(tmp_path):
         ("Frame,Time", "Fram,Time", "no line that begins with Frame"),
         (",Name,Radar", ",Name,Radaa", "missing or doubled"),
         ("X,Y,Z,W", "Y,Y,Z,W", "missing or doubled"),
+        ("Radar,Corner Reflector", "Radar,Radar", "missing or doubled"),
         (",Type,Rigid", ",Typ,Rigid", "no lines Type"),
         ("\r\n5,", "\r\n5,,", "line 13 has"),
         ("\r\n5,0.0", "\r\n5,x", "line 13: 'x"),

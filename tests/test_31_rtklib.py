@@ -93,14 +93,15 @@ def test_lines_without_a_solution_are_left_out_and_poorer_ones_kept(tmp_path):
 
 
 def test_standard_deviations_of_ecef_are_turned_to_north_east_and_up(tmp_path):
-    """From a covariance that is diagonal in north, east and up, 1, 2 and 5 cm, at every point of the flight."""
+    """From one that is diagonal in north, east and up, 5, 2 and 1 cm: some covariances in ECEF are negative."""
     axes = ned_axes(ECEF)
-    covariance = axes @ np.diag([0.01, 0.02, 0.05]) ** 2 @ np.swapaxes(axes, 1, 2)
+    covariance = axes @ np.diag([0.05, 0.02, 0.01]) ** 2 @ np.swapaxes(axes, 1, 2)
     parts = covariance[:, [0, 1, 2, 0, 1, 2], [0, 1, 2, 1, 2, 0]]
     columns = np.hstack([ECEF, np.sign(parts) * np.sqrt(np.abs(parts))])
+    assert (parts[:, 3:] < 0).any()
     names = f"{XYZ} sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)"
     track = read(tmp_path, logs.solution(TIMES, columns, names))
-    np.testing.assert_allclose(track.position_std.values, np.tile([0.01, 0.02, 0.05], (40, 1)), atol=1e-7)
+    np.testing.assert_allclose(track.position_std.values, np.tile([0.05, 0.02, 0.01], (40, 1)), atol=1e-7)
 
 
 def test_standard_deviations_stand_under_their_names_in_any_order(tmp_path):
@@ -162,3 +163,10 @@ def test_a_table_that_does_not_fit_its_header_is_one_message(tmp_path, old, new,
 def test_minutes_beyond_sixty_are_refused(tmp_path):
     rows = [["48 60 00.0", "9 15 36.0", "600.0"]] * 2
     assert "line 3 is" in complaint(lambda: read(tmp_path, logs.solution(TIMES[:2], rows, DMS)))
+
+
+def test_a_standard_deviation_that_no_receiver_states_is_refused(tmp_path):
+    columns = np.hstack([ECEF, np.full((40, 6), 0.01)])
+    names = f"{XYZ} sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m)"
+    text = logs.solution(TIMES, columns, names).replace(" 0.010000000", " 1e308", 1)
+    assert "a standard deviation of " in complaint(lambda: read(tmp_path, text))

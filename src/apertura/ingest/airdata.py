@@ -69,7 +69,8 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         height = next((name for name in _HEIGHTS if name in table), None)
         if height is None:
             raise ValueError("no column altitude_above_seaLevel, in metres or feet")
-        table, dropped = _measured(table.iloc[: len(table) - cut_off(path)])
+        cut = cut_off(path)
+        table, dropped = _measured(table.iloc[: len(table) - cut])
         clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, utc_times(table[_UTC].fillna("").str.strip().tolist()))
         logged = numbers(table[[*_PLACE, height]])
         attitude = numbers(table[_ATTITUDE])[clock.sure] if set(_ATTITUDE) <= set(table) else None
@@ -77,12 +78,12 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         found = str(error).partition("\n")[0]
         raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
     position = logged * [1.0, 1.0, _HEIGHTS[height]] + [0.0, 0.0, options.height_offset_m]
-    unsure = int((~clock.sure).sum())
+    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~clock.sure).sum())}
     track = make_track(
         clock.time[clock.sure],
         position[clock.sure],
         attitude_deg=attitude,
-        dropped={**dropped, **({"in a part too short to tell its time": unsure} if unsure else {})},
+        dropped={why: count for why, count in dropped.items() if count},
         node=node,
         where=path,
     )
@@ -97,7 +98,7 @@ def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
     if _SATELLITES in table:
         blind = numbers(table[[_SATELLITES]])[:, 0] < _FEWEST
     counts = {"said twice": doubled, f"fewer than {_FEWEST} satellites": blind & ~doubled}
-    return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items() if rows.any()}
+    return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items()}
 
 
 def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64]) -> _Clock:

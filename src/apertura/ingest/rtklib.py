@@ -32,7 +32,7 @@ _STD_ECEF = ("sdx(m)", "sdy(m)", "sdz(m)", "sdxy(m)", "sdyz(m)", "sdzx(m)")
 _CELLS = re.compile(r"\s*[,;]\s*|\s+")
 _LAST_WEEK, _WEEK_S = 11_000, 604_800
 _JST_AHEAD = np.timedelta64(9, "h")
-_SAME_BASE_M = 0.01
+_SAME_BASE_M, _WORST_M = 0.01, 1e9
 _EXPECTED = "an RTKLIB solution whose header names its columns and says GPST, UTC or JST"
 _REMEDY = "Export the solution with these output settings."
 
@@ -240,7 +240,8 @@ def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.f
         return None
     if stated.shape[1] == len(_STD):
         return stated
-    xx, yy, zz, xy, yz, zx = (np.sign(stated) * stated**2).T
+    held = stated.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
+    xx, yy, zz, xy, yz, zx = (np.sign(held) * held**2).T
     covariance = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], -1).reshape(-1, 3, 3)
     axes = ned_axes(ecef)
     return np.asarray(np.sqrt(np.einsum("nia,nij,nja->na", axes, covariance, axes).clip(0)))
