@@ -51,7 +51,7 @@ test-slow: $(SETUP)
 # Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed, and every
 # physical mistake: hours.
 attack: $(SETUP)
-	$(BIN)/python -m tests.attack.fuzz --inputs 5000
+	$(BIN)/python -m tests.attack.fuzz --seconds 600
 	$(BIN)/python -m tests.attack.faults --kills 300 --errors 50 --full 10
 	$(BIN)/python benchmarks/kills.py - 100
 	$(BIN)/python benchmarks/mistakes.py build/mistakes --base sample

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.ingest.pulson import _MESSAGE, BAND_HZ, SAMPLE_RATE_HZ, read_pulson
+from apertura.ingest.pulson import BAND_HZ, MESSAGE, SAMPLE_RATE_HZ, read_pulson
 
 TOTAL, START_PS = 800, 10_000
 MESSAGES = -(-TOTAL // 350)
@@ -23,7 +23,7 @@ def echo_of(path_m):
 
 
 def recorded(paths_m):
-    messages = np.zeros((len(paths_m), MESSAGES), _MESSAGE)
+    messages = np.zeros((len(paths_m), MESSAGES), MESSAGE)
     messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
     messages["start_ps"] = START_PS
     messages["stop_ps"] = START_PS + round(TOTAL / SAMPLE_RATE_HZ * 1e12)
@@ -54,7 +54,7 @@ def test_the_phase_of_a_scan_is_that_of_its_path(tmp_path):
 
 def test_a_scan_that_is_cut_off_or_lacks_a_message_is_left_out_and_counted(tmp_path):
     whole = recorded(8 + 0.1 * np.arange(6))
-    size = _MESSAGE.itemsize
+    size = MESSAGE.itemsize
     cut = written(tmp_path / "a.out", whole[:-size])
     assert cut.sizes["pulse"] == 5
     assert cut.attrs["flags"]["scans_incomplete"] == "1 of 6 scans"
@@ -68,9 +68,7 @@ def test_another_file_is_refused(tmp_path, content):
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    at=st.integers(0, 32 + 6 * MESSAGES * _MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000)
-)
+@given(at=st.integers(0, 32 + 6 * MESSAGES * MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000))
 def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, bit, last):
     paths_m = 8 + 0.1 * np.arange(6)
     content = bytearray(recorded(paths_m))

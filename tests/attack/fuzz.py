@@ -1,7 +1,8 @@
 """Thousands of wrong files for each parser: every one is refused in one message, or read without harm.
 
-``python -m tests.attack.fuzz --inputs 5000`` prints a table; inputs that do harm are written beside it. Files are read
-in a child process with bounded memory and time, so that a crash, a hang or a hunger for memory is seen and named.
+``python -m tests.attack.fuzz --inputs 5000``, or ``--seconds 600`` for each parser, prints a table; inputs that do harm
+are written beside it. Files are read in a child process with bounded memory and time, so that a crash, a hang or a
+hunger for memory is seen and named.
 """
 
 import argparse
@@ -33,6 +34,8 @@ MEMORY_BYTES = 2 << 30
 """Memory that reading a file may take, besides that of the libraries."""
 
 LONGEST_MESSAGE = 3000
+
+_AT_ONCE = 500  # inputs between two looks at the clock
 
 REGRESSIONS = Path(__file__).parent / "regressions"
 """Inputs that once did harm: <parser>/<name>."""
@@ -82,6 +85,20 @@ def fuzz(name: str, count: int, *, seed: int = 1) -> Tally:
     """Read `count` wrong files of a parser and tell what became of them."""
     source = inputs_of(name, seed)
     return read_all(name, count, source.__getitem__, seeds=source.seeds)
+
+
+def fuzz_for(name: str, seconds: float, *, seed: int = 1) -> Tally:
+    """Read wrong files of a parser for so long, and tell what became of them."""
+    source, whole = inputs_of(name, seed), Tally(name)
+    while whole.seconds < seconds:
+        first = sum(whole.results.values())
+        part = read_all(name, _AT_ONCE, lambda number, first=first: source[first + number], seeds=source.seeds)
+        whole.results += part.results
+        whole.different += part.different
+        whole.examples |= {kind: first + number for kind, number in part.examples.items()} | whole.examples
+        whole.harmful += [(first + number, kind, text) for number, kind, text in part.harmful]
+        whole.peak_mb, whole.seconds = max(whole.peak_mb, part.peak_mb), whole.seconds + part.seconds
+    return whole
 
 
 def read_all(name: str, count: int, source, *, seeds: Sequence[bytes]) -> Tally:
@@ -199,6 +216,7 @@ def table(tallies: Sequence[Tally]) -> str:
 def _arguments(given: Sequence[str] | None) -> argparse.Namespace:
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     asked.add_argument("--inputs", type=int, default=5000, help="inputs per parser")
+    asked.add_argument("--seconds", type=float, help="for so long for each parser, instead of a number of inputs")
     asked.add_argument("--parser", action="append", choices=sorted(PARSERS), help="one parser, or several")
     asked.add_argument("--seed", type=int, default=1)
     asked.add_argument("--save", type=Path, default=Path("build/fuzz"), help="folder of inputs that do harm")
@@ -210,7 +228,8 @@ def main(given: Sequence[str] | None = None) -> int:
     asked = _arguments(given)
     tallies = []
     for name in asked.parser or PARSERS:
-        tally = fuzz(name, asked.inputs, seed=asked.seed)
+        timed = asked.seconds is not None
+        tally = fuzz_for(name, asked.seconds, seed=asked.seed) if timed else fuzz(name, asked.inputs, seed=asked.seed)
         tallies.append(tally)
         seen: set[str] = set()
         for number, kind, text in tally.harmful:

@@ -13,6 +13,7 @@ from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
+from apertura.ingest.pulson import read_pulson
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
 from apertura.load.transmitted import read_codes, read_framing
@@ -20,7 +21,7 @@ from apertura.scene.dem_file import open_dem
 from apertura.scene.geoid import geoid_file
 from apertura.scene.geoid_grid import undulation
 from apertura.scene.grid import SceneGrid
-from apertura.settings import Flight, read_flights, read_segments, read_settings
+from apertura.settings import Flight, read_clocks, read_flights, read_segments, read_settings
 from apertura.simulation.specification import read_specification
 from apertura.steps.calibration import calibrated
 from apertura.store import manifest_of, read_manifest, record_files
@@ -172,6 +173,14 @@ PARSERS: dict[str, Parser] = {
         (mutators.cells("\t"),),
         _TIMES,
     ),
+    "clocks.tsv": Parser(
+        "clocks.tsv",
+        seeds.clocks,
+        lambda path: list(read_clocks(path, flights=[FLIGHT])),
+        (mutators.cells("\t"),),
+        "f01 uav1 uav2 nan inf 1e400 5e9 - . 1_0",
+    ),
+    "scans.out": Parser("uav1.out", seeds.scans, lambda path: read_pulson([path], pair="uav1-uav1"), (), "\xf2\x01"),
     "sigmf-meta": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _metadata, _JSON_TREE, _SIGMF),
     "sigmf-data": Parser("uav1.sigmf-data", seeds.sigmf_data, _samples),
     "track.csv": Parser("uav1.track.csv", seeds.tracks, lambda path: read_track(path, node="uav1"), _CSV, _TIMES),

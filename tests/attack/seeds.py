@@ -12,6 +12,7 @@ from rasterio.transform import from_origin
 from scipy.io import savemat
 
 from apertura.geometry.geodesy import ecef_from_geodetic
+from apertura.ingest.pulson import MESSAGE
 from apertura.settings.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
@@ -75,6 +76,24 @@ def segments() -> list[bytes]:
     first = "f01\tuav1-uav2\t2025-05-14T09:30:00\t2025-05-14T09:30:10.5\n"
     zoned = "f01\tuav1-uav1\t2025-05-14 09:30:00Z\t2025-05-14T11:30:01+02:00\n"
     return [(heading + first).encode(), (heading + zoned + first).encode()]
+
+
+def clocks() -> list[bytes]:
+    """Return tables of clocks."""
+    heading = "flight\tnode\toffset_s\tdrift_ppm\tstd_s\n"
+    return [(heading + "f01\tuav1\t1563913933.090524973\t0\t0.05\nf01\tuav2\t-4.5\t-1.5e1\t\n").encode()]
+
+
+def scans() -> list[bytes]:
+    """Return scans of a PulsON radar, the last of them cut off, and as it began to write them."""
+    messages = np.zeros((4, 2), MESSAGE)
+    messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
+    messages["start_ps"], messages["stop_ps"], messages["total"], messages["messages"] = 10_000, 40_518, 500, 2
+    messages["index"], messages["id"] = np.arange(2), np.arange(4)[:, None]
+    messages["time_ms"] = 1_000_000 + 21 * np.arange(4)[:, None]
+    messages["scan"] = np.random.default_rng(1).integers(-50_000, 50_000, messages["scan"].shape)
+    whole = bytes(32) + messages.tobytes()
+    return [whole, whole[:-1000], *real("bwsi_rail_passA/July23_03.out")]
 
 
 def sigmf_meta() -> list[bytes]:

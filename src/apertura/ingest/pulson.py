@@ -23,7 +23,7 @@ BAND_HZ = 3.1e9, 5.3e9
 
 _CONFIG_BYTES = 32  # of the radar's configuration, which a file begins with
 _SAMPLES = 350  # of each message
-_MESSAGE = np.dtype(
+MESSAGE = np.dtype(
     [("type", ">u2"), ("id", ">u2"), ("source", ">u4"), ("time_ms", ">u4"), ("reserved", "V16")]
     + [("start_ps", ">i4"), ("stop_ps", ">i4"), ("step_bins", ">i2")]
     + [("kind", "u1"), ("filter", "u1"), ("antenna", "u1"), ("mode", "u1")]
@@ -116,15 +116,15 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
 
 def _messages(content: bytes) -> NDArray[np.void]:
     """Return the messages of a file, found again behind bytes that are none."""
-    size, sign = _MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
+    size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
     at, found = min(_CONFIG_BYTES, len(content)), []
     while (at := content.find(sign, at)) >= 0 and at + size <= len(content):
         last = at
         while content[last : last + 2] == sign and last + size <= len(content):
             last += size
-        found.append(np.frombuffer(content[at:last], _MESSAGE))
+        found.append(np.frombuffer(content[at:last], MESSAGE))
         at = last
-    messages = np.concatenate(found) if found else np.empty(0, _MESSAGE)
+    messages = np.concatenate(found) if found else np.empty(0, MESSAGE)
     return np.asarray(messages[(messages["step_bins"] == _STEP_BINS) & (messages["kind"] == _RAW_SCAN)])
 
 
@@ -143,7 +143,7 @@ def _error(found: str, path: Path) -> CampaignError:
     return CampaignError(
         found,
         where=path,
-        expected=f"{_CONFIG_BYTES} bytes of configuration, then messages MRM_SCAN_INFO of {_MESSAGE.itemsize} bytes, "
+        expected=f"{_CONFIG_BYTES} bytes of configuration, then messages MRM_SCAN_INFO of {MESSAGE.itemsize} bytes, "
         "raw scans in steps of 32 bins",
         remedy="Copy the file again, or log it by the radar's own software with these settings.",
     )
