@@ -1,0 +1,55 @@
+"""Make a campaign of a radar flown along a PX4 log: samples are simulated, the flight log is the real one.
+
+python examples/px4_flight/replay.py LOG.ulg CAMPAIGN
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from apertura.geometry.geodesy import geodetic_from_ecef, ned_axes
+from apertura.ingest import read_track
+from apertura.simulation import simulate
+from apertura.simulation.scene import Origin, PointTarget
+from apertura.simulation.specification import (
+    CampaignSpecification,
+    ImageGrid,
+    SimulatedFlight,
+    SimulatedNode,
+    WaveformSpecification,
+)
+from apertura.simulation.trajectory import Waypoints
+
+FIRST_S, LAST_S = 5.6, 11.6
+"""The leg of the flight that is imaged, from the log's first epoch."""
+
+GROUND_M = 8.0
+"""Below the middle of the flight."""
+
+
+def replay(log: Path, campaign: Path) -> None:
+    """Write the campaign."""
+    track = read_track(log, node="uav1")
+    position, time = track.position.values, track.time.values
+    began = time[0] + np.timedelta64(round(FIRST_S * 1e9), "ns")
+    origin = Origin(*geodetic_from_ecef(position.mean(axis=0)) - [0, 0, GROUND_M])
+    centre = origin.ecef(np.zeros(3))
+    north, east, down = ((position - centre) @ ned_axes(centre)).T
+    places = tuple(map(tuple, np.stack([east, north, -down], axis=-1).tolist()))
+    flown = Waypoints(tuple(((time - began) / np.timedelta64(1, "s")).tolist()), places)
+    waveform = WaveformSpecification(512, 1.2e9, 400e3, 3.125e-6, 0.625e-6, 409.6e6, 100.0)
+    pulses = round((LAST_S - FIRST_S) * waveform.prf_hz)
+    flight = SimulatedFlight("f01", "uav1", {"uav1": flown}, pulses, start_utc=str(began))
+    targets = tuple(PointTarget(place) for place in ((-9.0, -7.0, 0.0), (-12.0, -4.0, 0.0), (-8.0, -11.0, 0.0)))
+    grid = ImageGrid("EPSG:32632", half_width_m=14.0, spacing_m=0.1)
+    node = {"uav1": SimulatedNode(attitude="none")}
+    made = CampaignSpecification("px4 flight, replayed", origin, waveform, targets, node, (flight,), grid)
+    simulate(campaign, made, seed=1)
+    (campaign / "raw/f01/uav1.track.csv").unlink()
+    shutil.copyfile(log, campaign / "raw/f01/uav1.track.ulg")
+
+
+if __name__ == "__main__":
+    replay(Path(sys.argv[1]), Path(sys.argv[2]))
