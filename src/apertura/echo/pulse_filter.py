@@ -109,7 +109,8 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     spectrum
         (bin,) complex, S over the band.
     asked
-        inverse, matched, or auto: matched for a flat spectrum, else inverse if it keeps the signal to noise ratio.
+        inverse, matched, or auto: matched for a flat spectrum, else inverse if it evens it and keeps the signal to noise
+        ratio.
 
     Raises
     ------
@@ -130,27 +131,25 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     mean = float(power.mean())
     if not mean > 0:
         raise ValueError("the band holds no energy")
-    matched = np.conj(spectrum) / mean
     inverse = np.conj(spectrum) / np.maximum(power, mean * 10 ** (NULL_DB / 10))
-    uneven_db, loss_db = _left_db(spectrum * matched), _loss_db(spectrum, inverse)
+    uneven_db, left_db, loss_db = _left_db(power), _left_db(spectrum * inverse), _loss_db(spectrum, inverse)
     if asked != "auto":
         name, reason = asked, "asked for"
     elif uneven_db <= FLAT_DB:
         name, reason = "matched", f"a flat spectrum: matched scatters {uneven_db:.1f} dB in range"
-    elif loss_db <= MOST_LOSS_DB:
+    elif loss_db <= MOST_LOSS_DB and left_db <= LEFT_DB:
         name, reason = "inverse", f"matched would scatter {uneven_db:.1f} dB in range; inverse loses {loss_db:.2f} dB"
     else:
-        name, reason = "matched", f"inverse would lose {loss_db:.1f} dB of the signal to noise ratio"
-    chosen = inverse if name == "inverse" else matched
+        name, reason = "matched", f"inverse would lose {loss_db:.1f} dB, and scatter {left_db:.1f} dB in range"
+    chosen = inverse if name == "inverse" else np.conj(spectrum) / mean
     loss_db, left_db = _loss_db(spectrum, chosen), _left_db(spectrum * chosen)
     flags = {}
     if left_db > LEFT_DB:
         flags["waveform_sidelobes"] = f"{name} scatters {left_db:.1f} dB of the energy of every point in range"
     if loss_db > MOST_LOSS_DB:
-        null = float(np.mean(power < mean * 10 ** (NULL_DB / 10)))
         flags["waveform_noise"] = (
-            f"{name} loses {loss_db:.1f} dB of the signal to noise ratio: {null:.0%} of the band lies "
-            f"{-NULL_DB:.0f} dB below its mean"
+            f"{name} loses {loss_db:.1f} dB of the signal to noise ratio: {np.mean(power < mean / 10):.0%} of the band "
+            "lies 10 dB below its mean"
         )
     report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "left_db": round(left_db, 1)}
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
@@ -185,10 +184,11 @@ def cut_pulses(delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: floa
 def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complexfloating]) -> float:
     """Return what of the signal to noise ratio a filter loses against the matched one, dB (Schwarz: 0 or more)."""
     gain = abs(np.vdot(np.conj(filtered), spectrum)) ** 2
-    return float(-10 * np.log10(gain / ((np.abs(filtered) ** 2).sum() * (np.abs(spectrum) ** 2).sum())))
+    kept = gain / ((np.abs(filtered) ** 2).sum() * (np.abs(spectrum) ** 2).sum())
+    return float(-10 * np.log10(min(kept, 1.0))) + 0.0
 
 
 def _left_db(response: NDArray[np.complexfloating]) -> float:
     """Return the energy outside the peak that an uneven response scatters, of that of the peak, dB."""
     level = response.real
-    return float(10 * np.log10(max(level.var() / level.mean() ** 2, 1e-12)))
+    return float(10 * np.log10(max(level.var() / level.mean() ** 2, 1e-10)))

@@ -20,7 +20,7 @@ from apertura.echo.demodulate import Numerology, demodulate
 from apertura.echo.phase_check import phase_stability
 from apertura.echo.resampling import Complexes, Floats, correct_clock
 from apertura.echo.second_path import second_path_flags
-from apertura.echo.sidelink import METHODS, choose, edges
+from apertura.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.echo.sidelink_state import SidelinkState, measure_blocks
 from apertura.progress import progress
 
@@ -147,7 +147,7 @@ def transfer_by_sidelink(
     with progress("sidelinks", len(sidelink_m)) as done:
         state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
-    unclocked = receiver.clock_flags if numerology.repeats or chosen in ("gated", "two_parameter") else {}
+    unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     residual = baseline_residual(delay_m, sidelink_m)

@@ -16,6 +16,7 @@ from apertura.echo.captures import Pulses, Saturation, blocks_of
 from apertura.echo.demodulate import remove_path
 from apertura.echo.missing_pulses import missing_flags
 from apertura.echo.pulse_filter import cut_pulses
+from apertura.echo.sidelink import DIVIDING
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.load.acquisition import Acquisition, common_pulses
 from apertura.load.node_log import Times
@@ -177,6 +178,8 @@ def _transfer(
 def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
     flags, waveform = dict(sent.flags), sent.waveform
+    if measured.report.get("sidelink", {}).get("method") in DIVIDING:
+        flags.pop("waveform_sidelobes", None)  # whatever the pulse is like, it is in both channels
     if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
         held = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
         cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)

@@ -12,7 +12,7 @@ from apertura.ingest.recording import Recording
 from apertura.lineage import result_of
 from apertura.load.transmitted import read_framing
 from apertura.paths import inside
-from apertura.settings import SampledWaveform
+from apertura.settings import CONFIG, PulseWaveform, SampledWaveform
 from apertura.steps.stamping import stamped
 from apertura.store import save_stage
 
@@ -54,6 +54,13 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     waveform, described = campaign.settings.waveform, recording.framing or {}
     if not isinstance(waveform, SampledWaveform):
         raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+    if isinstance(waveform, PulseWaveform) and waveform.lead_s:
+        raise CampaignError(
+            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
+            where=CONFIG,
+            expected="0: its captures are cut where the pulse begins",
+            remedy="Set waveform.lead_s to 0.",
+        )
     framing = read_framing(
         _preamble(recording, campaign),
         described,
