@@ -78,7 +78,7 @@ def test_simulated_captures_are_the_pulse_delayed(name):
     wave = TransmitPulse.of(
         pulse, carrier_hz=1.2e9, sample_rate_hz=RATE, prf_hz=1e3, lead_s=0.1e-6, listen_s=1e-6, band_hz=(-64e6, 64e6)
     )
-    delays = np.array([[20.3, 150.0, 5000.0, -900.0]])
+    delays = np.array([[20.3, 150.0, 5000.0, -2000.0]])
     paths = Paths(delays / RATE, np.array([[1.0, 0.3j, 1.0, 1.0]]), np.zeros((1, 4)))
     channel = Channel(wave, paths, np.ones(len(wave.codes)), np.zeros(1), np.zeros(1))
     expected = sum(
