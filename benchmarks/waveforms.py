@@ -4,6 +4,7 @@ python benchmarks/waveforms.py: the table of docs/theory/waveforms.md. Pulses of
 two nodes, three targets, no noise but that of 14 bits; noise is measured on a scene of its own, 10 dB per bin.
 """
 
+import json
 import tempfile
 import time
 from pathlib import Path
@@ -14,6 +15,7 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import window_weights
+from apertura.geometry.geodesy import frame_from_map
 from apertura.load.scene import open_scene
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.simulation import Impairments, PulseSpecification, WaveformSpecification, preset, simulate
@@ -60,8 +62,6 @@ def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
 
 def places(campaign: Campaign, pair: str) -> tuple[float, float, float]:
     """Return the largest error of place (cm) and the widths (cm) across and along range, means over targets."""
-    import json
-
     truth = json.loads((campaign.root / "truth.json").read_text())["targets"]
     grid = open_scene(campaign).grid
     pixels = open_stage(campaign.stage("image", "f01", pair), "image").image.values
@@ -79,10 +79,6 @@ def places(campaign: Campaign, pair: str) -> tuple[float, float, float]:
 
 def aligned(stage: xr.Dataset, campaign: Campaign) -> np.ndarray:
     """Return transfer functions less the path to the first target, (pulse, subcarrier)."""
-    import json
-
-    from apertura.geometry.geodesy import frame_from_map
-
     truth = json.loads((campaign.root / "truth.json").read_text())
     first = truth["targets"][0]
     place = frame_from_map(truth["crs"], np.array(first["x"]), np.array(first["y"]), np.array(first["height_m"]))
@@ -121,8 +117,9 @@ if __name__ == "__main__":
         for pair in PAIRS:
             error, *widths = places(whole, pair)
             stated = open_stage(whole.stage("echo", "f01", pair), "echo").attrs.get("waveform", {})
+            title = f"{name.split(',')[0]}, {stated.get('filter', 'codes')}"
             print(
-                f"{name} {stated.get('filter', '')} | {pair} | {error:.2f} | {widths[0]:.1f}, {widths[1]:.1f} | "
+                f"{title} | {pair} | {error:.2f} | {widths[0]:.1f}, {widths[1]:.1f} | "
                 f"{sidelobes_db(alone, pair):.1f} | {noise_loss_db(noisy, pair, 10.0):.2f} "
                 f"({stated.get('loss_db', 0.0):.2f}) | {seconds:.2f}",
                 flush=True,

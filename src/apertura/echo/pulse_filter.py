@@ -20,10 +20,10 @@ NULL_DB = -20.0
 """Bins this far below the mean are attenuated, not divided: none amplifies noise by more than a hundred."""
 
 FLAT_DB = -30.0
-"""A spectrum whose power is as even as this needs no division: all that it would scatter in range lies below."""
+"""A spectrum whose power is as even as this needs no division: all that it scatters in range lies below."""
 
-LEFT_DB = -20.0
-"""More than this scattered in range is flagged."""
+SIDELOBES_DB = -25.0
+"""Higher sidelobes are flagged; those of the window, Hann, are -31.5 dB."""
 
 MOST_LOSS_DB = 6.0
 """A division that loses more of the signal to noise ratio is not chosen, and flagged where it was asked for."""
@@ -40,8 +40,8 @@ class PulseFilter:
     inverse
         (bin,) complex64, by which the DFT of a capture is multiplied.
     report
-        Name of the filter, why it, loss_db (of signal to noise ratio against the matched filter) and left_db (energy
-        that it scatters in range, of that of each point).
+        Name of the filter, why it, loss_db (of signal to noise ratio against the matched filter) and sidelobes_db (the
+        highest beside a point in range, by a Hann window).
     flags
         Edge crossed → what was measured, in one line.
     """
@@ -109,8 +109,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     spectrum
         (bin,) complex, S over the band.
     asked
-        inverse, matched, or auto: matched for a flat spectrum, else inverse if it evens it and keeps the signal to noise
-        ratio.
+        inverse, matched, or auto: matched for a flat spectrum, else inverse where it is adequate.
 
     Raises
     ------
@@ -132,26 +131,27 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     if not mean > 0:
         raise ValueError("the band holds no energy")
     inverse = np.conj(spectrum) / np.maximum(power, mean * 10 ** (NULL_DB / 10))
-    uneven_db, left_db, loss_db = _left_db(power), _left_db(spectrum * inverse), _loss_db(spectrum, inverse)
+    uneven_db, loss_db = float(10 * np.log10(max(power.var() / mean**2, 1e-10))), _loss_db(spectrum, inverse)
+    sidelobes_db = _sidelobes_db(spectrum * inverse)
     if asked != "auto":
         name, reason = asked, "asked for"
     elif uneven_db <= FLAT_DB:
         name, reason = "matched", f"a flat spectrum: matched scatters {uneven_db:.1f} dB in range"
-    elif loss_db <= MOST_LOSS_DB and left_db <= LEFT_DB:
+    elif loss_db <= MOST_LOSS_DB and sidelobes_db <= SIDELOBES_DB:
         name, reason = "inverse", f"matched would scatter {uneven_db:.1f} dB in range; inverse loses {loss_db:.2f} dB"
     else:
-        name, reason = "matched", f"inverse would lose {loss_db:.1f} dB, and scatter {left_db:.1f} dB in range"
+        name, reason = "matched", f"inverse would lose {loss_db:.1f} dB, and leave sidelobes of {sidelobes_db:.1f} dB"
     chosen = inverse if name == "inverse" else np.conj(spectrum) / mean
-    loss_db, left_db = _loss_db(spectrum, chosen), _left_db(spectrum * chosen)
+    loss_db, sidelobes_db = _loss_db(spectrum, chosen), _sidelobes_db(spectrum * chosen)
     flags = {}
-    if left_db > LEFT_DB:
-        flags["waveform_sidelobes"] = f"{name} scatters {left_db:.1f} dB of the energy of every point in range"
+    if sidelobes_db > SIDELOBES_DB:
+        flags["waveform_sidelobes"] = f"{name} leaves sidelobes of {sidelobes_db:.1f} dB in range beside every point"
     if loss_db > MOST_LOSS_DB:
         flags["waveform_noise"] = (
             f"{name} loses {loss_db:.1f} dB of the signal to noise ratio: {np.mean(power < mean / 10):.0%} of the band "
             "lies 10 dB below its mean"
         )
-    report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "left_db": round(left_db, 1)}
+    report = {"filter": name, "reason": reason, "loss_db": round(loss_db, 2), "sidelobes_db": round(sidelobes_db, 1)}
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
 
 
@@ -188,7 +188,10 @@ def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complex
     return float(-10 * np.log10(min(kept, 1.0))) + 0.0
 
 
-def _left_db(response: NDArray[np.complexfloating]) -> float:
-    """Return the energy outside the peak that an uneven response scatters, of that of the peak, dB."""
-    level = response.real
-    return float(10 * np.log10(max(level.var() / level.mean() ** 2, 1e-10)))
+def _sidelobes_db(response: NDArray[np.complexfloating]) -> float:
+    """Return the highest sidelobe in range of a response over the band, dB: a Hann window's main lobe left out."""
+    window = np.hanning(len(response))
+    profile = np.abs(fft.ifft(response * window, 4 * len(response)))
+    lobe = 4 * 2 + 2  # two cells to its first null
+    beyond = profile[lobe:-lobe].max(initial=1e-12 * profile[0])
+    return float(20 * np.log10(beyond / profile[0]))

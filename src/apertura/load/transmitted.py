@@ -19,7 +19,7 @@ from apertura.settings import CONFIG, OfdmWaveform, PulseWaveform, SampledWavefo
 MOST_SYMBOLS = 1 << 24
 """Code symbols of a waveform."""
 
-MOST_PULSE_SAMPLES = 1 << 24
+MOST_PULSE_SAMPLES = 1 << 22
 """Of a pulse, and of a capture."""
 
 MOST_CHIPS = 1 << 20
