@@ -231,6 +231,7 @@ def test_what_a_pulse_cannot_be_is_told(changed, told):
         (np.ones(256), "shape"),
         (np.ones((256, 3), np.int16), "int16 of shape"),
         (np.full(256, np.nan, np.complex64), "256 samples that are no number"),
+        (np.full(256, 1.5e308 * (1 + 1j)), "256 samples that are no number"),
         (np.zeros((256, 2), np.int16), "silence"),
     ],
 )

@@ -136,11 +136,13 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
     if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
         raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
     pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
-    lost = int((~np.isfinite(pulse)).sum())
-    if lost or not np.abs(pulse).max() > 0:
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        level = np.abs(pulse)
+    lost = int((~np.isfinite(level)).sum())
+    if lost or not level.max() > 0:
         found = f"{lost} samples that are no number" if lost else "silence: every sample is zero"
         raise CampaignError(found, where=path, expected=expected, remedy=remedy)
-    return np.asarray(pulse / np.abs(pulse).max(), np.complex128)
+    return np.asarray(pulse / level.max(), np.complex128)
 
 
 def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
