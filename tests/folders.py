@@ -78,7 +78,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
     for flight in campaign.image_flights:
-        if campaign.settings.waveform.kind == "ofdm":
+        if campaign.settings.waveform.kind != "phase_history":
             for node in flight.nodes:
                 ingest.ingest(campaign, flight.name, node)
         for pair in flight.pairs:

@@ -39,7 +39,7 @@ def formed(iq, **more):
     pulses = len(iq["radar"])
     measured = transfer_by_sidelink(
         lambda some: {name: samples[some] for name, samples in iq.items()},
-        CODES,
+        1 / CODES,
         NUMEROLOGY,
         symbol_samples=SYMBOL,
         sidelink_m=np.full(pulses, 15.0),
@@ -147,7 +147,7 @@ def test_a_long_flight_takes_no_more_memory_than_a_short_one(monkeypatch):
     for pulses in (500, 5000):
         tracemalloc.start()
         measured = transfer_by_code(
-            lambda wanted: {"radar": some[wanted % 64]}, CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
+            lambda wanted: {"radar": some[wanted % 64]}, 1 / CODES, NUMEROLOGY, time_s=np.arange(pulses) / 20
         )
         for block in blocks_of(np.arange(pulses)):
             assert measured.form(block).shape == (len(block), 200)

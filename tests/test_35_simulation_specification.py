@@ -21,9 +21,9 @@ from apertura.simulation.specification import (
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
-    WaveformSpecification,
 )
 from apertura.simulation.trajectory import Straight, Waypoints, Wobble
+from apertura.simulation.waveforms import WaveformSpecification
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

@@ -24,6 +24,7 @@ from apertura.load.results import open_campaign
 from apertura.load.scene import open_scene
 from apertura.load.sightings import Seen, reference_points
 from apertura.load.suspects import evidence_of, seen_from
+from apertura.load.transmitted import transmitted
 from apertura.planning.autofocus import BORNE_DB, decide_autofocus
 from apertura.planning.plan import Decision
 from apertura.refinement.inputs import Sighting
@@ -160,7 +161,9 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     campaign, found = spoilt
     write_track(campaign, *found)
     track, waveform = open_refined(campaign, "f01"), campaign.settings.waveform
-    logged = {node: open_acquisition(campaign, "f01", node, waveform) for node in ("uav1", "uav2")}
+    logged = {
+        node: open_acquisition(campaign, "f01", node, transmitted(campaign, waveform)) for node in ("uav1", "uav2")
+    }
     nodes = {name: track.node(node) for name, node in logged.items()}
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)

@@ -90,9 +90,10 @@ class Campaign(RawFolder):
         return inside(self.root, name, where=f"{CONFIG}: {key}")
 
     @property
-    def codes_file(self) -> Path:
-        """The transmitted code symbols."""
-        return self.file(getattr(self.settings.waveform, "codes", ""), "waveform.codes")
+    def sent_file(self) -> Path:
+        """The file of what was transmitted: code symbols, or the samples of a pulse."""
+        key = getattr(self.settings.waveform, "file_key", "")
+        return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
 
     def relative(self, path: Path) -> str:
         """Return a path inside the campaign folder as the workflow names it."""

@@ -12,7 +12,7 @@ from typing import Any
 from apertura.campaign import Campaign
 from apertura.digests import Sources
 from apertura.provenance import canonical_json, code_sha256, sha256_text
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 
 STUDY = "study"
 """Folder of results that are made when they are asked for, and not with the images."""
@@ -89,9 +89,9 @@ def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
 
 
 def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
-    ofdm = isinstance(campaign.settings.waveform, OfdmWaveform)
+    sampled = isinstance(campaign.settings.waveform, SampledWaveform)
     for flight in sorted(campaign.flights, key=lambda flight: flight.kind != "calibration"):
-        for node in flight.participants if ofdm else ():
+        for node in flight.participants if sampled else ():
             yield from ((stage, flight.name, node) for stage in ("raw", "track"))
         yield from (("echo", flight.name, pair) for pair in flight.pairs)
         if flight.kind == "calibration":
@@ -123,10 +123,10 @@ def _track(campaign: Campaign, flight: str, node: str) -> Result:
 def _echo(campaign: Campaign, flight: str, pair: str) -> Result:
     calibration, waveform = campaign.settings.calibration, campaign.settings.waveform
     nodes = dict.fromkeys(pair.split("-"))
-    if isinstance(waveform, OfdmWaveform):
+    if isinstance(waveform, SampledWaveform):
         sources = [campaign.manifest(stage, flight, node) for node in nodes for stage in ("raw", "track")]
         samples = [campaign.relative(campaign.recording_files(flight, node)[-1]) for node in nodes]
-        sources = [waveform.codes, *samples, *sources]
+        sources = [campaign.relative(campaign.sent_file), *samples, *sources]
         if calibration is not None and campaign.flight(flight).kind == "image":
             sources.append(campaign.manifest("calibration", calibration.flight))
     else:

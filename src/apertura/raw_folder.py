@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES, RECORDERS, log_suffixes, read_track
 from apertura.paths import inside
-from apertura.settings import FLIGHTS, OfdmWaveform, Settings
+from apertura.settings import FLIGHTS, SampledWaveform, Settings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,7 +30,7 @@ class RawFolder:
 
     def raw_files(self, flight: str, node: str) -> dict[str, Path]:
         """Return role → file of everything recorded by `node` in `flight`."""
-        if isinstance(self.settings.waveform, OfdmWaveform):
+        if isinstance(self.settings.waveform, SampledWaveform):
             recorded = {path.suffix: path for path in self.recording_files(flight, node)}
             return {**recorded, "track": self.track_file(flight, node)}
         history = {f"history.{path.name}": path for path in self.history_files(flight, node)}

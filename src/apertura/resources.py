@@ -15,7 +15,7 @@ from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.documents import DAMAGED, read_json
 from apertura.errors import CampaignError
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 
 _CAPTURE_BYTES = 64  # of a recording's metadata at least
 _UNKNOWN_PIXELS = 4096**2  # of a grid that is settled by the first flight
@@ -177,14 +177,15 @@ class Resources:
     def _bytes_and_pulses(self, flight: str, node: str) -> tuple[int, int]:
         """Return the bytes of a recording and how many pulses it has at most."""
         waveform = self.campaign.settings.waveform
-        if not isinstance(waveform, OfdmWaveform):
+        if not isinstance(waveform, SampledWaveform):
             size = sum(path.stat().st_size for path in self.campaign.raw_files(flight, node).values())
             return size, size // 1000
         files = [path.stat().st_size for path in self.campaign.recording_files(flight, node)]
         samples = files[-1] / 4
-        symbol = (waveform.cyclic_prefix_s + 1 / waveform.subcarrier_spacing_hz) * waveform.sample_rate_hz
         ran_through = samples / waveform.sample_rate_hz * waveform.prf_hz  # one capture, of all pulses
-        return sum(files), math.ceil(min(samples / symbol, max(files[0] / _CAPTURE_BYTES, ran_through)))
+        return sum(files), math.ceil(
+            min(samples / waveform.needed_samples, max(files[0] / _CAPTURE_BYTES, ran_through))
+        )
 
     @cached_property
     def _shape(self) -> tuple[int, int]:
@@ -203,14 +204,14 @@ class Resources:
     def _range_samples(self) -> int:
         """How many samples a range profile has at most: those of the whole period, or of the scene's depth."""
         waveform, asked = self.campaign.settings.waveform, self.campaign.settings.scene
-        if not isinstance(waveform, OfdmWaveform):
+        if not isinstance(waveform, SampledWaveform):
             return 1000
-        whole = _OVERSAMPLING * waveform.subcarriers
+        whole = _OVERSAMPLING * waveform.most_subcarriers
         if asked.bounds_m == "auto":
             return whole
         xmin, ymin, xmax, ymax = asked.bounds_m
         depth_m = 2 * math.hypot(xmax - xmin, ymax - ymin)
-        cells = depth_m * waveform.subcarriers * waveform.subcarrier_spacing_hz / SPEED_OF_LIGHT_M_S
+        cells = depth_m * waveform.widest_band_hz / SPEED_OF_LIGHT_M_S
         return min(whole, 64 + math.ceil(1.1 * _OVERSAMPLING * cells))
 
 

@@ -16,12 +16,12 @@ from apertura.ingest.mat_fields import read_fields
 from apertura.ingest.pulson import read_pulson
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
-from apertura.load.transmitted import read_codes, read_framing
+from apertura.load.transmitted import read_codes, read_framing, read_pulse
 from apertura.scene.dem_file import open_dem
 from apertura.scene.geoid import geoid_file
 from apertura.scene.geoid_grid import undulation
 from apertura.scene.grid import SceneGrid
-from apertura.settings import Flight, read_clocks, read_flights, read_segments, read_settings
+from apertura.settings import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
 from apertura.simulation.specification import read_specification
 from apertura.steps.calibration import calibrated
 from apertura.store import manifest_of, read_manifest, record_files
@@ -157,6 +157,10 @@ _JSON_TREE = (mutators.json_tree,)
 _YAML_TREE = (mutators.yaml_tree, mutators.yaml_tree, mutators.bomb)
 _CSV = (mutators.cells(","), mutators.cells(","), mutators.quoted_cells)
 
+_PULSE = PulseWaveform(
+    kind="samples", carrier_hz=1.2e9, sample_rate_hz=1e6, prf_hz=1e3, pulse_s=seeds.SYMBOLS * 1e-6, listen_s=1e-4
+)
+
 PARSERS: dict[str, Parser] = {
     "config.yaml": Parser("config.yaml", seeds.configs, read_settings, _YAML_TREE, _YAML),
     "flights.tsv": Parser(
@@ -252,6 +256,7 @@ PARSERS: dict[str, Parser] = {
     ),
     "pattern.csv": Parser("horn.csv", seeds.patterns, read_beam_pattern, _CSV, "cut azimuth elevation angle_deg , -"),
     "codes.npy": Parser("codes.npy", seeds.codes, lambda path: read_codes(path, seeds.SYMBOLS), (), _NPY),
+    "pulse.npy": Parser("pulse.npy", seeds.pulses, lambda path: read_pulse(path, _PULSE), (), _NPY),
     "preamble.npy": Parser("preamble.npy", seeds.preambles, _preamble, (), _NPY),
     "afrl.mat": Parser(
         "a.x.mat", seeds.matlab, _history, (), "MATLAB\x00 IM MI fp freq r0 x\x9c \x0e\x00 \x0f\x00", True

@@ -226,6 +226,13 @@ def codes() -> list[bytes]:
     return [_npy(symbols.astype(np.complex64)), _npy(symbols), _npy(symbols.astype(">c8"))]
 
 
+def pulses() -> list[bytes]:
+    """Return samples of a pulse as complex numbers and as pairs of integers."""
+    pulse = np.exp(1j * np.pi * np.arange(SYMBOLS) ** 2 / SYMBOLS)
+    pairs = np.stack([pulse.real, pulse.imag], -1) * 30000
+    return [_npy(pulse.astype(np.complex64)), _npy(pairs.astype(np.int16)), _npy(pairs.astype(">i2"))]
+
+
 def preambles() -> list[bytes]:
     """Return chips as integers and as numbers."""
     chips = np.where(np.arange(31) % 3, 1, -1)

@@ -51,14 +51,14 @@ def check_calibration(inspected: Inspected) -> Iterator[CampaignError]:
 
 
 def _reflector(inspected: Inspected, flight: Flight, asked: Calibration) -> Iterator[CampaignError]:
-    """Yield a reflector from which no echo arrives while the symbol lasts."""
+    """Yield a reflector from which no echo arrives while a capture lasts."""
     waveform = inspected.waveform
     aperture = waveform and pair_aperture(inspected, flight, flight.transmitter, waveform)
     if not waveform or not aperture or inspected.crs is None:
         return
     place = frame_from_map(inspected.crs, *(np.array(value) for value in asked.reflector_m))
     distance_m = float(np.linalg.norm(aperture.tx_m - place, axis=1).min())
-    reach_m = SPEED_OF_LIGHT_M_S * (waveform.cyclic_prefix_s + waveform.symbol_s)
+    reach_m = SPEED_OF_LIGHT_M_S * waveform.capture_s
     if distance_m > reach_m:
         yield CampaignError(
             f"{list(asked.reflector_m)} is {distance_m / 1e3:.1f} km from the track of {flight.name}",

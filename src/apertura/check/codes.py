@@ -1,4 +1,4 @@
-"""Whether the code symbols are what the waveform says."""
+"""Whether what was transmitted is what the waveform says: code symbols, or the samples of a pulse."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,15 +7,19 @@ import numpy as np
 
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
+from apertura.settings import OfdmWaveform
 
 
 def check_codes(inspected: Inspected) -> Iterator[CampaignError]:
-    """Yield a problem unless the codes are complex, one per subcarrier, finite and not zero."""
+    """Yield a problem unless codes are complex, one per subcarrier, finite, not zero; or a pulse as long as stated."""
     waveform = inspected.waveform
     if waveform is None:
         return
-    path = inspected.campaign.codes_file
+    path = inspected.campaign.sent_file
     if not path.is_file() or path.stat().st_size == 0:
+        return
+    if not isinstance(waveform, OfdmWaveform):
+        yield from inspected.unsent
         return
     found = _found(path, waveform.subcarriers)
     if found:

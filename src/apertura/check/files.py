@@ -11,7 +11,7 @@ from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest import RECORDERS
 from apertura.paths import inside
-from apertura.settings import CONFIG, FLIGHTS, Flight, OfdmWaveform
+from apertura.settings import CONFIG, FLIGHTS, Flight, SampledWaveform
 
 _AHEAD_S = 5.0
 
@@ -25,8 +25,9 @@ def check_files(inspected: Inspected) -> Iterator[CampaignError]:
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
     lookups += [partial(campaign.pattern_files, pair) for flight in campaign.image_flights for pair in flight.pairs]
-    if isinstance(campaign.settings.waveform, OfdmWaveform):
-        lookups.append(lambda: {"waveform.codes": campaign.codes_file})
+    waveform = campaign.settings.waveform
+    if isinstance(waveform, SampledWaveform):
+        lookups.append(lambda: {f"waveform.{waveform.file_key}": campaign.sent_file})
     for lookup in lookups:
         try:
             named = lookup()
@@ -39,7 +40,7 @@ def check_files(inspected: Inspected) -> Iterator[CampaignError]:
 
 def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
     """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
-    if not isinstance(campaign.settings.waveform, OfdmWaveform):
+    if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
             yield from _found(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
         return

@@ -15,13 +15,14 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.ingest import PHASE_HISTORIES, open_recording, read_track
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from apertura.ingest.recording import Recording
     from apertura.load.ground import Ground
+    from apertura.load.transmitted import Transmitted
     from apertura.scene.grid import SceneGrid
 
 T = TypeVar("T")
@@ -41,10 +42,29 @@ class Inspected:
     campaign: Campaign
 
     @property
-    def waveform(self) -> OfdmWaveform | None:
+    def waveform(self) -> SampledWaveform | None:
         """What was transmitted; None: phase history, without recordings and logs."""
         stated = self.campaign.settings.waveform
-        return stated if isinstance(stated, OfdmWaveform) else None
+        return stated if isinstance(stated, SampledWaveform) else None
+
+    @property
+    def sent(self) -> "Transmitted | None":
+        """What was transmitted; None without samples, or where the file is not what the waveform says."""
+        return self._sent[0]
+
+    @property
+    def unsent(self) -> list[CampaignError]:
+        """What is wrong with the file."""
+        return self._sent[1]
+
+    @cached_property
+    def _sent(self) -> "tuple[Transmitted | None, list[CampaignError]]":
+        from apertura.load.transmitted import transmitted
+
+        try:
+            return (transmitted(self.campaign, self.waveform) if self.waveform else None), []
+        except CampaignError as problem:
+            return None, [problem]
 
     @property
     def keys(self) -> tuple[Key, ...]:

@@ -12,14 +12,14 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.settings import CONFIG, Flight, LeverArms, OfdmWaveform
+from apertura.settings import CONFIG, Flight, LeverArms, SampledWaveform
 
 _TAGS = 256  # of a pair at which distances are taken
 _POINTS = 9  # along each side of the scene
 _CURVATURE = 0.99  # of a straight path: ground under a scene of unknown height bends away from the track
 _MOSTLY = 0.9  # of the distance: then it is one of heights
 _CHECK = (
-    "Check scene.crs and scene.bounds_m (easting before northing), the place in the logs, waveform.cyclic_prefix_s and "
+    "Check scene.crs and scene.bounds_m (easting before northing), the place in the logs, waveform.{key} and "
     "nodes.<node>.path_offset_m."
 )
 _HORIZON_M = 4.12e3
@@ -53,8 +53,10 @@ def check_nodes_apart(inspected: Inspected) -> Iterator[CampaignError]:
 def check_distance(inspected: Inspected) -> Iterator[CampaignError]:
     """Yield image flights from which no echo of the scene arrives inside the cyclic prefix of any pulse."""
     waveform = inspected.waveform
-    for flight in inspected.campaign.image_flights if waveform and inspected.grid else ():
-        pairs = [(node, _reach(inspected, flight, node, waveform)) for node in flight.nodes] if waveform else []
+    if waveform is None or inspected.grid is None:
+        return
+    for flight in inspected.campaign.image_flights:
+        pairs = [(node, _reach(inspected, flight, node, waveform)) for node in flight.nodes]
         far = [(f"{flight.transmitter}-{node}", *found) for node, found in pairs if found and found[1] > found[2]]
         if not far:
             continue
@@ -63,8 +65,8 @@ def check_distance(inspected: Inspected) -> Iterator[CampaignError]:
             f"the scene lies {_length(distance_m)} from the track of {flight.name} {', '.join(row[0] for row in far)}: "
             f"no echo travels less than {_length(path_m)}",
             where=f"{CONFIG}: scene",
-            expected=f"a total path of at most {_length(limit_m)}, what waveform.cyclic_prefix_s holds",
-            remedy=_too_high(inspected, distance_m) or likely_place(inspected) or _CHECK,
+            expected=f"a total path of at most {_length(limit_m)}, what waveform.{waveform.delay_key} holds",
+            remedy=_too_high(inspected, distance_m) or likely_place(inspected) or _CHECK.format(key=waveform.delay_key),
         )
 
 
@@ -82,7 +84,7 @@ def _too_high(inspected: Inspected, distance_m: float) -> str:
 
 
 def _reach(
-    inspected: Inspected, flight: Flight, node: str, waveform: OfdmWaveform
+    inspected: Inspected, flight: Flight, node: str, waveform: SampledWaveform
 ) -> tuple[float, float, float] | None:
     """Return distance from track to scene, shortest total path and the longest that the prefix holds, metres.
 
@@ -104,14 +106,14 @@ def _reach(
     arms_m = sum(float(np.linalg.norm(list(point), axis=1).max()) for point in (_points(arm) for arm in arms))
     calibration = inspected.campaign.settings.calibration
     search_m = calibration.search_m if calibration else 0.0
-    return distance_m, float(paths), SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m + 2 * arms_m + search_m
+    return distance_m, float(paths), SPEED_OF_LIGHT_M_S * waveform.longest_delay_s - beyond_m + 2 * arms_m + search_m
 
 
 def _points(arms: LeverArms) -> list[tuple[float, float, float]]:
     return [arms.radar_tx, arms.radar_rx, arms.sidelink]
 
 
-def pair_aperture(inspected: Inspected, flight: Flight, node: str, waveform: OfdmWaveform) -> Aperture | None:
+def pair_aperture(inspected: Inspected, flight: Flight, node: str, waveform: SampledWaveform) -> Aperture | None:
     """Return where the logs put both nodes of a pair at some of its pulses, lever arms left out; None without logs."""
     key, other = (flight.name, flight.transmitter), (flight.name, node)
     if not {key, other} <= inspected.tracks.keys() & inspected.recordings.keys():

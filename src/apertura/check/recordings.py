@@ -8,7 +8,7 @@ from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest.recording import Recording
 from apertura.paths import inside
-from apertura.settings import CONFIG, OfdmWaveform
+from apertura.settings import CONFIG, OfdmWaveform, SampledWaveform
 
 _SAME = 1e-9
 """Carriers and rates that differ by less, relative to what the config states, are the same."""
@@ -74,19 +74,21 @@ def _named(recording: Recording, node: str, *, secondary: bool) -> Iterator[Camp
         )
 
 
-def _long_enough(recording: Recording, waveform: OfdmWaveform) -> Iterator[CampaignError]:
+def _long_enough(recording: Recording, waveform: SampledWaveform) -> Iterator[CampaignError]:
     if recording.framing is not None:
         return
-    prefix, window = (
-        round(seconds * waveform.sample_rate_hz)
-        for seconds in (waveform.cyclic_prefix_s, 1 / waveform.subcarrier_spacing_hz)
-    )
     length = int(np.min(recording.captures.length))
-    if length < prefix + window:
+    if isinstance(waveform, OfdmWaveform):
+        parts = (
+            f"cyclic prefix ({waveform.prefix_samples}) and one period of "
+            f"1/subcarrier_spacing_hz ({waveform.dft_samples})"
+        )
+    else:
+        parts = "lead_s, pulse_s and listen_s of the waveform"
+    if length < waveform.needed_samples:
         yield CampaignError(
             f"captures of {length} samples",
             where=recording.files[0],
-            expected=f"at least {prefix + window}: cyclic prefix ({prefix}) and one period of "
-            f"1/subcarrier_spacing_hz ({window})",
+            expected=f"at least {waveform.needed_samples}: {parts}",
             remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
         )

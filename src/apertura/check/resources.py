@@ -65,7 +65,7 @@ def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
 
 def disk_bytes(inspected: Inspected) -> dict[str, int]:
     """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
-    campaign, waveform = inspected.campaign, inspected.waveform
+    campaign, sent = inspected.campaign, inspected.sent
     raw = sum(
         _RAW_BYTES * len(recording.captures.start)
         for key, recording in inspected.recordings.items()
@@ -76,11 +76,11 @@ def disk_bytes(inspected: Inspected) -> dict[str, int]:
         pixels = 0
     echo = images = 0
     for flight in campaign.flights:
-        sent = inspected.recordings.get((flight.name, flight.transmitter))
-        pulses = len(sent.captures.time) if sent and sent.framing is None else 0
+        recorded = inspected.recordings.get((flight.name, flight.transmitter))
+        pulses = len(recorded.captures.time) if recorded and recorded.framing is None else 0
         for pair in flight.pairs:
-            if waveform and not _made(inspected, "echo", flight.name, pair):
-                echo += round(_ECHO_SHARE * 8 * pulses * waveform.subcarriers)
+            if sent and not _made(inspected, "echo", flight.name, pair):
+                echo += round(_ECHO_SHARE * 8 * pulses * sent.numerology.numbers.size)
             if flight.kind == "image" and not _made(inspected, "image", flight.name, pair):
                 images += _PIXEL_BYTES * pixels
     return {"raw": raw, "echo": echo, "images": images}

@@ -2,6 +2,8 @@
 
 The symbol repeats itself after 1/Δf and lasts longer than that, so the beginning of a capture comes again at its
 end: turned by the carrier offset, and slid by the sampling offset. No code and no delay need be known.
+A pulse that is sent once repeats nothing: its clock is not measured, and division needs none (docs/theory/waveforms.md,
+"Clock").
 """
 
 from collections.abc import Iterable
@@ -104,12 +106,14 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     Raises
     ------
     ValueError
-        If captures hold too little of the repetition.
+        If captures hold too little of the repetition, or what was sent does not repeat itself.
 
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
     """
+    if not numerology.repeats:
+        raise ValueError("a pulse that is sent once repeats nothing: not measured, and division needs no clock")
     period_s = 1 / numerology.spacing_hz
     frequency_hz, parts = _repetition(groups, numerology)
     phase, slope, centre_hz = _phase_and_slope(parts.sum(0), frequency_hz, start=(0.0, 0.0))

@@ -52,7 +52,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     transfer
         (pulse, subcarrier) complex64, the code removed; echoes lie in the first `prefix_cells` of 1/B.
     prefix_cells
-        Cells of 1/B inside the cyclic prefix.
+        Cells of 1/B inside the cyclic prefix, or inside the longest delay of a pulse sent once.
 
     Notes
     -----
@@ -68,17 +68,13 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     pulses, cells = transfer.shape
     outside = slice(prefix_cells + _GUARD_CELLS, cells - _GUARD_CELLS)
     if not prefix_cells or outside.stop - outside.start < _FEWEST_CELLS:
-        return CodeEvidence(
-            None, f"{prefix_cells} of {cells} delay cells lie inside the prefix: nothing to compare with"
-        )
+        return CodeEvidence(None, f"{prefix_cells} of {cells} delay cells may hold echoes: nothing to compare with")
     profile = fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
     scattered, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
     for run in [run for run in _RUNS if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         scattered = max(scattered, scatter)
-        line = (
-            f"the strongest echo inside the prefix, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
-        )
+        line = f"the strongest echo held whole, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
         if level >= needed:
             return CodeEvidence(True, line)
     if scattered > _SPREAD_SIGMAS:

@@ -17,7 +17,7 @@ _PULSES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Numerology:
-    """How a receiver samples an OFDM symbol.
+    """How a receiver samples what was sent: an OFDM symbol that repeats itself, or a pulse that is sent once.
 
     Attributes
     ----------
@@ -29,6 +29,9 @@ class Numerology:
         T_cp·f_s, where the DFT window begins.
     dft_samples
         f_s/Δf, the length of the DFT window.
+    longest_samples
+        Of a pulse sent once: delay up to which captures hold its echoes whole. None: a symbol, which repeats itself
+        after 1/Δf, and whose echoes are held up to the prefix.
     """
 
     carrier_hz: float
@@ -36,6 +39,7 @@ class Numerology:
     numbers: NDArray[np.int64]
     prefix_samples: int
     dft_samples: int
+    longest_samples: int | None = None
 
     @property
     def spacing_hz(self) -> float:
@@ -53,9 +57,15 @@ class Numerology:
         return np.asarray(self.carrier_hz + self.numbers * self.spacing_hz, np.float64)
 
     @property
-    def prefix_cells(self) -> int:
-        """Delay cells of 1/B inside the cyclic prefix."""
-        return round(self.prefix_samples * self.numbers.size / self.dft_samples)
+    def repeats(self) -> bool:
+        """Whether what was sent comes again after 1/Δf."""
+        return self.longest_samples is None
+
+    @property
+    def delay_cells(self) -> int:
+        """Delay cells of 1/B in which echoes are held whole: those inside the cyclic prefix, of a symbol."""
+        samples = self.prefix_samples if self.longest_samples is None else self.longest_samples
+        return round(samples * self.numbers.size / self.dft_samples)
 
 
 def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:

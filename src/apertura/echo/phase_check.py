@@ -68,7 +68,7 @@ def phase_stability(
     time_s
         (pulse,) float64, when each was sent, seconds; triples of pulses with others missing between them are left out.
     prefix_cells
-        Cells of 1/B inside the cyclic prefix.
+        Cells of 1/B inside the cyclic prefix, or inside the longest delay of a pulse sent once.
 
     Notes
     -----

@@ -125,6 +125,10 @@ METHODS: Mapping[str, Callable[..., Complexes]] = {
 """Cheapest first."""
 
 
+DIVIDING = "divide", "wiener"
+"""Those that take out what was sent, whatever its spectrum; the others take the sidelink for one path of a flat one."""
+
+
 def edges(method: str, state: SidelinkState) -> dict[str, str]:
     """Return the edges that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
 

@@ -20,7 +20,7 @@ from apertura.echo.demodulate import Numerology, demodulate
 from apertura.echo.phase_check import phase_stability
 from apertura.echo.resampling import Complexes, Floats, correct_clock
 from apertura.echo.second_path import second_path_flags
-from apertura.echo.sidelink import METHODS, choose, edges
+from apertura.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.echo.sidelink_state import SidelinkState, measure_blocks
 from apertura.progress import progress
 
@@ -58,15 +58,15 @@ class Transfer:
     saturation: Saturation
 
 
-def transfer_by_code(read: Read, codes: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
+def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
     """Return what a node received of its own pulses, whose clock is the transmitter's.
 
     Parameters
     ----------
     read
         Reads `radar`.
-    codes, numerology
-        (subcarrier,) complex64 as transmitted, and the grid of the symbol.
+    inverse, numerology
+        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
     time_s
         (capture,) float64, when each was sent, seconds of any origin.
 
@@ -79,12 +79,12 @@ def transfer_by_code(read: Read, codes: Complexes, numerology: Numerology, *, ti
     >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
     >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
     >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
-    >>> measured = transfer_by_code(lambda some: {"radar": iq[some]}, np.full(8, 2, np.complex64), numerology,
-    ...                             time_s=np.zeros(1))
+    >>> measured = transfer_by_code(lambda some: {"radar": iq[some]}, np.full(8, 0.5, np.complex64),
+    ...                             numerology, time_s=np.zeros(1))
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
-    saturation, inverse = Saturation(), 1 / codes
+    saturation = Saturation()
 
     def demodulated(radar: Samples) -> Complexes:
         return demodulate(as_complex(radar), numerology) * inverse
@@ -96,8 +96,8 @@ def transfer_by_code(read: Read, codes: Complexes, numerology: Numerology, *, ti
 
     some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
     sample = np.concatenate([demodulated(read(block)["radar"]) for block in blocks_of(some)])
-    code = own_code(sample, prefix_cells=numerology.prefix_cells)
-    phase = phase_stability(sample, time_s[some], prefix_cells=numerology.prefix_cells)
+    code = own_code(sample, prefix_cells=numerology.delay_cells)
+    phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
     flags = {**code.flags, **(phase.flags if phase else {})}
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
@@ -105,7 +105,7 @@ def transfer_by_code(read: Read, codes: Complexes, numerology: Numerology, *, ti
 
 def transfer_by_sidelink(
     read: Read,
-    codes: Complexes,
+    inverse: Complexes,
     numerology: Numerology,
     *,
     symbol_samples: int,
@@ -120,10 +120,10 @@ def transfer_by_sidelink(
     ----------
     read
         Reads `radar` and `sidelink`.
-    codes, numerology
-        (subcarrier,) complex64 as transmitted, and the grid of the symbol.
+    inverse, numerology
+        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
     symbol_samples
-        (T_cp + T)·f_s: nothing beyond is used.
+        (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
     sidelink_m
         (capture,) float64, distance between the antennas of the sidelink, metres; the path that comes off every echo.
     method
@@ -143,16 +143,17 @@ def transfer_by_sidelink(
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
     flight, the state of the sidelink on all.
     """
-    receiver = _Receiver.measured(read, 1 / codes, numerology, symbol_samples, len(sidelink_m), accuracy_db)
+    receiver = _Receiver.measured(read, inverse, numerology, symbol_samples, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
         state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
+    unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     residual = baseline_residual(delay_m, sidelink_m)
     suspect = detect_wrong_association(residual)
     flags = {
-        **receiver.flags,
+        **unclocked,
         **state.flags,
         **edges(chosen, state),
         **second_path_flags(state, cell_m=cell_m),
@@ -187,7 +188,7 @@ class _Receiver:
     clock: ClockOffset | None  # to be corrected
     cfo_hz: Floats
     report: dict[str, Any]
-    flags: dict[str, str]
+    clock_flags: dict[str, str]
 
     @classmethod
     def measured(

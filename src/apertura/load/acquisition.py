@@ -12,12 +12,12 @@ from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.echo.association import Association, associate
 from apertura.echo.captures import Read
-from apertura.echo.demodulate import Numerology, subcarrier_numbers
+from apertura.echo.demodulate import Numerology
 from apertura.errors import CampaignError
 from apertura.ingest.sample_file import SampleFile
 from apertura.load.node_log import NodeLog, shortest_wave
+from apertura.load.transmitted import Transmitted
 from apertura.paths import inside
-from apertura.settings import OfdmWaveform
 from apertura.store import open_stage
 
 
@@ -74,7 +74,8 @@ class Acquisition(NodeLog):
             raise CampaignError(
                 f"captures of {length} samples",
                 where=self.recording,
-                expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz",
+                expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or lead_s, "
+                "pulse_s and listen_s",
                 remedy="Correct the waveform in config/config.yaml or record longer captures.",
             )
         start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
@@ -90,20 +91,20 @@ class Acquisition(NodeLog):
         return read
 
 
-def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmWaveform) -> Acquisition:
+def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitted) -> Acquisition:
     """Return the finished raw and track stages of a node.
 
     Raises
     ------
     CampaignError
-        If it was recorded at another carrier or sample rate than `waveform`.
+        If it was recorded at another carrier or sample rate than what was sent.
     """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
     files = Path("raw") / flight / node
     recording, log = (_read_from(stage, files) for stage in (raw, track))
     for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
-        asked = getattr(waveform, key)
+        asked = getattr(sent.waveform, key)
         if abs(recorded - asked) > 1e-9 * asked:
             raise CampaignError(
                 f"recorded with {key} {recorded:.6f}",
@@ -114,7 +115,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, waveform: OfdmW
     path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
     samples = SampleFile(path, len(raw.attrs["channels"]))
     _check_same(campaign, raw)
-    settings, numerology = campaign.settings.nodes[node], numerology_of(waveform)
+    settings, numerology = campaign.settings.nodes[node], sent.numerology
     wave_m = shortest_wave(numerology.frequency_hz)
     return Acquisition(node, settings, track, log, wave_m, raw, samples, files, recording, numerology)
 
@@ -134,17 +135,6 @@ def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
 def _read_from(stage: xr.Dataset, files: Path) -> str:
     """Return the node's own files that a stage was read from; a preamble lies elsewhere."""
     return " and ".join(name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}."))
-
-
-def numerology_of(waveform: OfdmWaveform) -> Numerology:
-    """Return how receivers sample a waveform's symbol."""
-    return Numerology(
-        waveform.carrier_hz,
-        waveform.sample_rate_hz,
-        subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is),
-        prefix_samples=round(waveform.cyclic_prefix_s * waveform.sample_rate_hz),
-        dft_samples=round(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz),
-    )
 
 
 def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:

@@ -12,7 +12,7 @@ from apertura.load.pair import OpenPair
 from apertura.load.scene import OpenScene
 from apertura.quality.budget import BudgetLine, expected, noise_loss, offset_line, position_lines
 from apertura.quality.path_errors import Effect, PointPaths
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
 
@@ -59,9 +59,8 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
         if "snr_db" in sidelink:
             lines += _sidelink(sidelink, subcarriers=len(pair.frequency_hz))
-    if isinstance(campaign.settings.waveform, OfdmWaveform):
-        lasting_s = campaign.settings.waveform.cyclic_prefix_s + campaign.settings.waveform.symbol_s / 2
-        effect = paths.of_offset(lasting_s * paths.rate_m_s)
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        effect = paths.of_offset(campaign.settings.waveform.middle_s * paths.rate_m_s)
         lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
     return [*lines, *_between_epochs(paths, pair)]
 
@@ -85,7 +84,7 @@ def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
     if pair.left is not None:
         return [BudgetLine("positions", "what the refined tracks leave", pair.left)]
-    sidelink = not pair.monostatic and isinstance(campaign.settings.waveform, OfdmWaveform)
+    sidelink = not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
     return position_lines(paths, pair.positions, sidelink=sidelink)
 
 

@@ -15,13 +15,15 @@ from apertura.echo.association_edges import tag_jitter_s
 from apertura.echo.captures import Pulses, Saturation, blocks_of
 from apertura.echo.demodulate import remove_path
 from apertura.echo.missing_pulses import missing_flags
+from apertura.echo.pulse_filter import cut_pulses
+from apertura.echo.sidelink import DIVIDING
 from apertura.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.load.acquisition import Acquisition, common_pulses
 from apertura.load.node_log import Times
 from apertura.load.positions import Placed, place
 from apertura.load.segments import keep_segments
-from apertura.load.transmitted import symbol_samples
-from apertura.settings import OfdmWaveform, Processing
+from apertura.load.transmitted import Transmitted
+from apertura.settings import Processing, PulseWaveform
 
 Complexes = NDArray[np.complex64]
 
@@ -78,20 +80,17 @@ def _rows(count: int) -> tuple[str, Pulses]:
 def pair_echo(
     tx: Acquisition,
     rx: Acquisition,
-    codes: NDArray[np.complex64],
-    waveform: OfdmWaveform,
+    sent: Transmitted,
     processing: Processing,
     calibration: dict[str, Any] | None,
 ) -> PairEcho:
     """Return the echo of a pair from what its nodes recorded; path offsets are the calibration's, or the config's."""
-    pulses = common_pulses(tx, rx, prf_hz=waveform.prf_hz)
+    pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     paired = np.flatnonzero(~pulses.outlier)
     placed = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
     paired = paired[placed.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
-    measured, sidelink_m = _transfer(
-        (tx, rx), pulses.rx_index[paired], at, codes, waveform=waveform, processing=processing
-    )
+    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing)
     at = at[measured.kept]
     offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
     beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
@@ -109,7 +108,7 @@ def pair_echo(
             "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", at)),
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
-            "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m),
+            "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * sent.waveform.longest_delay_s - beyond_m),
             **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
             **_axes((tx, rx), at),
             **_sidelink_vector((tx, rx), at),
@@ -150,9 +149,7 @@ def _transfer(
     nodes: tuple[Acquisition, Acquisition],
     captures: NDArray[np.int64],
     at: Times,
-    codes: NDArray[np.complex64],
-    *,
-    waveform: OfdmWaveform,
+    sent: Transmitted,
     processing: Processing,
 ) -> tuple[Transfer, NDArray[np.float64]]:
     """Return what some captures, sent `at` the transmitter's tags, measured, and the sidelink's length (m); 0 without.
@@ -162,20 +159,33 @@ def _transfer(
     tx, rx = nodes
     if tx.name == rx.name:
         read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
-        measured = transfer_by_code(read, codes, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
-        return measured, np.zeros(len(at))
+        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
+        return _of_what_was_sent(measured, sent), np.zeros(len(at))
     length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
-        codes,
+        sent.inverse,
         rx.numerology,
-        symbol_samples=symbol_samples(waveform),
+        symbol_samples=sent.waveform.capture_samples,
         sidelink_m=length_m,
         method=processing.sidelink,
         accuracy_db=processing.asked_db,
         where=str(rx.files),
     )
-    return measured, length_m[measured.kept]
+    return _of_what_was_sent(measured, sent), length_m[measured.kept]
+
+
+def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
+    """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
+    flags, waveform = dict(sent.flags), sent.waveform
+    if measured.report.get("sidelink", {}).get("method") in DIVIDING:
+        flags.pop("waveform_sidelobes", None)  # whatever the pulse is like, it is in both channels
+    if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
+        held = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
+        cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
+        flags |= cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **held)
+    report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
+    return replace(measured, flags={**measured.flags, **flags}, report=report)
 
 
 def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import window_weights
-from apertura.echo.demodulate import subcarrier_numbers
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.imaging.stages import phase_history_of
@@ -23,9 +22,10 @@ from apertura.load.positions import position_error
 from apertura.load.recorded import recorded_echo
 from apertura.load.scene import Flown
 from apertura.load.segments import inside_segments, keep_segments
+from apertura.load.transmitted import transmitted
 from apertura.quality.budget import NodePositions
 from apertura.quality.path_errors import Effect
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 from apertura.store import manifest_of, open_stage
 
 
@@ -95,7 +95,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
         echo = open_stage(campaign.stage("echo", flight, pair), "echo")
     if echo is None:
-        if isinstance(waveform, OfdmWaveform):
+        if isinstance(waveform, SampledWaveform):
             return _expected(campaign, flight, pair, waveform)
         echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
@@ -119,10 +119,9 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     )
 
 
-def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform) -> OpenPair:
+def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform) -> OpenPair:
     """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
-    numbers = subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is)
-    frequency = np.asarray(waveform.carrier_hz + numbers * waveform.subcarrier_spacing_hz, np.float64)
+    frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
     last = min(log.track.time.values[-1] for log in (tx, rx))
@@ -138,7 +137,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: OfdmWaveform
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
         beyond_m -= offset.sidelink + float(length_m.min())
     weight = window_weights(campaign.settings.processing.window, len(frequency))
-    limit_m = SPEED_OF_LIGHT_M_S * waveform.cyclic_prefix_s - beyond_m
+    limit_m = SPEED_OF_LIGHT_M_S * waveform.longest_delay_s - beyond_m
     known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     return OpenPair(
         flight,

@@ -1,25 +1,148 @@
-"""What was transmitted: the code symbols, and what was sent before each symbol."""
+"""What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign import Campaign
+from apertura.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.echo.framing import Framing
+from apertura.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
 from apertura.errors import CampaignError
 from apertura.ingest.npy import read_npy
-from apertura.settings import OfdmWaveform
+from apertura.settings import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
 
 MOST_SYMBOLS = 1 << 24
 """Code symbols of a waveform."""
+
+MOST_PULSE_SAMPLES = 1 << 22
+"""Of a pulse, and of a capture."""
 
 MOST_CHIPS = 1 << 20
 """Chips of a preamble."""
 
 MOST_LEAD_SAMPLES = 1 << 26
 """Samples before a symbol."""
+
+_FEWEST_BINS = 16  # of a band
+_LEAST_INSIDE = 0.01  # of the pulse's energy, in the band
+
+
+@dataclass(frozen=True, eq=False)
+class Transmitted:
+    """What was sent, as the road of an echo takes it: whatever the kind of waveform, nothing after it asks for more.
+
+    Attributes
+    ----------
+    waveform
+        As the config states it.
+    numerology
+        Grid of the frequencies that echoes are measured at.
+    inverse
+        (subcarrier,) complex64 that takes what was sent out of an echo.
+    report, flags
+        What was decided of it, and edges crossed.
+    """
+
+    waveform: SampledWaveform
+    numerology: Numerology
+    inverse: NDArray[np.complex64]
+    report: dict[str, Any] = field(default_factory=dict)
+    flags: dict[str, str] = field(default_factory=dict)
+
+
+def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
+    """Return what was transmitted, as a waveform says it of the campaign's file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, or not what the waveform says.
+    """
+    if isinstance(waveform, OfdmWaveform):
+        inverse = 1 / read_codes(campaign.sent_file, waveform.subcarriers)
+        return Transmitted(waveform, symbol_numerology(waveform), inverse)
+    if isinstance(waveform, PulseWaveform):
+        return _pulse_sent(campaign.sent_file, waveform)
+    raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
+
+
+def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
+    """Return how receivers sample an OFDM symbol."""
+    return Numerology(
+        waveform.carrier_hz,
+        waveform.sample_rate_hz,
+        subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is),
+        prefix_samples=waveform.prefix_samples,
+        dft_samples=waveform.dft_samples,
+    )
+
+
+def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
+    """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
+    length = waveform.capture_samples
+    lead = waveform.lead_s * waveform.sample_rate_hz
+    spectrum = pulse_spectrum(read_pulse(path, waveform), lead=lead, length=length)
+    power = np.abs(spectrum) ** 2
+    if waveform.band_hz is None:
+        first, last = occupied_band(power)
+    else:
+        spacing_hz = waveform.sample_rate_hz / length
+        first = int(np.ceil(waveform.band_hz[0] / spacing_hz - 1e-6))
+        last = min(int(np.floor(waveform.band_hz[1] / spacing_hz + 1e-6)), first + length - 1)
+    numbers = np.arange(first, last + 1)
+    inside = float(power[numbers % length].sum() / power.sum())
+    if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
+        raise CampaignError(
+            f"{max(numbers.size, 0)} bins of {waveform.sample_rate_hz / length:g} Hz hold {inside:.2g} of its energy",
+            where=path,
+            expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
+            remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
+        )
+    chosen = pulse_filter(spectrum[numbers % length], asked=waveform.filter)
+    longest = length - round((waveform.lead_s + waveform.pulse_s) * waveform.sample_rate_hz)
+    numerology = Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, 0, length, longest)
+    band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
+    report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
+    return Transmitted(waveform, numerology, chosen.inverse, report, chosen.flags)
+
+
+def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
+    """Return a transmitted pulse, (sample,) complex128.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, is not as long as waveform.pulse_s, silent, or not finite.
+    """
+    count = round(waveform.pulse_s * waveform.sample_rate_hz)
+    expected = f"({count},) complex or ({count}, 2) integers, as {CONFIG}: waveform.pulse_s times sample_rate_hz"
+    remedy = "Use the samples that were transmitted, or correct the waveform."
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+    stored = read_npy(path, kinds="ci", most=2 * MOST_PULSE_SAMPLES, expected=expected, remedy=remedy)
+    if waveform.capture_samples > MOST_PULSE_SAMPLES:
+        raise CampaignError(
+            f"captures of {waveform.capture_samples} samples",
+            where=f"{CONFIG}: waveform",
+            expected=f"no more than {MOST_PULSE_SAMPLES} in lead_s, pulse_s and listen_s",
+            remedy="Shorten listen_s to the longest delay of the scene.",
+        )
+    pairs = stored.dtype.kind == "i" and stored.shape == (count, 2)
+    if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
+        raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
+    pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        level = np.abs(pulse)
+    lost = int((~np.isfinite(level)).sum())
+    if lost or not level.max() > 0:
+        found = f"{lost} samples that are no number" if lost else "silence: every sample is zero"
+        raise CampaignError(found, where=path, expected=expected, remedy=remedy)
+    return np.asarray(pulse / level.max(), np.complex128)
 
 
 def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
@@ -47,11 +170,6 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
             remedy=remedy,
         )
     return codes
-
-
-def symbol_samples(waveform: OfdmWaveform) -> int:
-    """Return how many samples cyclic prefix and symbol last: (T_cp + T)·f_s."""
-    return round((waveform.cyclic_prefix_s + waveform.symbol_s) * waveform.sample_rate_hz)
 
 
 def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> Framing:

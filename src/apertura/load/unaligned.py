@@ -13,7 +13,7 @@ from apertura.ingest import read_phase_history
 from apertura.ingest.times import FIRST
 from apertura.load.node_log import NodeLog, raw_log, shortest_wave
 from apertura.refinement.motion import Logged, Recorded
-from apertura.settings import OfdmWaveform
+from apertura.settings import SampledWaveform
 from apertura.store import manifest_of, open_stage
 
 _SECOND = np.timedelta64(1, "s")
@@ -71,7 +71,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         If the node has no log, or its echoes are not there yet.
     """
     stated_ns, applied_ns = campaign.clock(flight, node).offset_ns, 0
-    if isinstance(campaign.settings.waveform, OfdmWaveform):
+    if isinstance(campaign.settings.waveform, SampledWaveform):
         path = campaign.stage("echo", flight, f"{node}-{node}")
         if not manifest_of(path).is_file():
             raise CampaignError(

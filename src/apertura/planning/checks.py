@@ -45,7 +45,9 @@ def check_geometry(job: Job) -> dict[str, str]:
         flags["pulses_sparse"] = f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous"
     unseen = _unseen(aperture, job.points_m, job.path_limit_m)
     if unseen:
-        flags["beyond_cyclic_prefix"] = f"{100 * unseen:.0f} % of the scene is in no pulse's cyclic prefix"
+        flags["beyond_cyclic_prefix"] = (
+            f"{100 * unseen:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
+        )
     return flags
 
 

@@ -11,7 +11,13 @@ from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
 from apertura.settings.section import Name, Section
 from apertura.settings.segments import SEGMENTS, Segment, read_segments
-from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Waveform
+from apertura.settings.waveform import (
+    OfdmWaveform,
+    PhaseHistoryWaveform,
+    PulseWaveform,
+    SampledWaveform,
+    Waveform,
+)
 
 __all__ = [
     "CLOCKS",
@@ -31,6 +37,8 @@ __all__ = [
     "PathOffsets",
     "PhaseHistoryWaveform",
     "Processing",
+    "PulseWaveform",
+    "SampledWaveform",
     "Scene",
     "Section",
     "Segment",

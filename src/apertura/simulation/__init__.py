@@ -17,11 +17,11 @@ from apertura.simulation.specification import (
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
-    WaveformSpecification,
     read_specification,
     specification_text,
 )
 from apertura.simulation.trajectory import GaussianBeam, Straight, Track, Waypoints, Wobble
+from apertura.simulation.waveforms import PulseSpecification, WaveformSpecification
 from apertura.validation import validated
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "Origin",
     "Plate",
     "PointTarget",
+    "PulseSpecification",
     "SimulatedFlight",
     "SimulatedNode",
     "Straight",
@@ -54,7 +55,7 @@ def simulate(
     *,
     targets: Sequence[Target] | None = None,
     tracks: Mapping[str, Track] | None = None,
-    waveform: WaveformSpecification | None = None,
+    waveform: WaveformSpecification | PulseSpecification | None = None,
     impairments: Mapping[str, Impairments] | None = None,
     seed: int | Generator = 1,
 ) -> Path:

@@ -33,10 +33,6 @@ from apertura.simulation.synthesis import samples
 from apertura.simulation.trajectory import phase_centre
 
 _LOG_MARGIN_S = 2.0
-_WAVEFORM_KEYS = (
-    "carrier_hz", "carrier_is", "subcarriers", "subcarrier_spacing_hz", "symbol_s", "cyclic_prefix_s", "sample_rate_hz",
-    "prf_hz",
-)  # fmt: skip
 _PULSES_AT_ONCE = 16
 
 
@@ -70,8 +66,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     scene, bounds = specification.scene, specification.scene.bounds(specification.origin)
     document = {
         "campaign": specification.campaign,
-        "waveform": {"kind": "ofdm", "codes": "raw/codes.npy"}
-        | {key: getattr(specification.waveform, key) for key in _WAVEFORM_KEYS},
+        "waveform": specification.waveform.section(campaign.waveform),
         "nodes": {name: _node_section(node) for name, node in specification.nodes.items()},
         "scene": {
             "crs": scene.crs,
@@ -90,7 +85,8 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     table = "\n".join(("flight\tkind\ttransmitter\tnodes", *rows)) + "\n"
     (root / "config" / "flights.tsv").write_text(table, encoding="utf-8")
     _write_segments(root, specification)
-    np.save(root / "raw" / "codes.npy", campaign.waveform.codes.astype(np.complex64))
+    name, sent = campaign.waveform.sent
+    np.save(root / "raw" / name, sent)
 
 
 def _write_segments(root: Path, specification: CampaignSpecification) -> None:

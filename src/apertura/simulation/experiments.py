@@ -14,9 +14,9 @@ from apertura.simulation.specification import (
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
-    WaveformSpecification,
 )
 from apertura.simulation.trajectory import Straight, Wobble
+from apertura.simulation.waveforms import WaveformSpecification
 
 PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")
 EXPERIMENT_ORIGIN = Origin(48.42255, 9.95509, 620.0)

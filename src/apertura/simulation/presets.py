@@ -22,9 +22,9 @@ from apertura.simulation.specification import (
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
-    WaveformSpecification,
 )
 from apertura.simulation.trajectory import Straight, Wobble
+from apertura.simulation.waveforms import WaveformSpecification
 
 DEMO_ORIGIN = EXPERIMENT_ORIGIN  # flat ground by the Danube
 _DEMO_WAVEFORM = WaveformSpecification(1024, 1.2e9, 400e3, 3.125e-6, 0.78125e-6, 1.024e9, 20.0)

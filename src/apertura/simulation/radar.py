@@ -78,6 +78,35 @@ class TransmitWaveform:
         """Samples of a triggered capture: prefix and symbol."""
         return round(self.duration_s * self.sample_rate_hz)
 
+    @property
+    def mean_power(self) -> float:
+        """E|s|² of codes of unit modulus."""
+        return float(len(self.codes))
+
+    @property
+    def noise_at_unit_snr(self) -> float:
+        """E|n|² of samples whose noise in one bin of the DFT equals an echo of amplitude 1."""
+        return float(self.dft_samples)
+
+    @property
+    def sent(self) -> tuple[str, NDArray[np.complex64]]:
+        """Name and content of the file of what was sent."""
+        return "codes.npy", self.codes.astype(np.complex64)
+
+    def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the samples of a capture between which paths are present, (path,) each.
+
+        Parameters
+        ----------
+        arrival
+            (path,) float64, when the pulse arrives, in samples of the capture, ascending.
+        rate_hz
+            At which the receiver samples.
+        """
+        # from its first sample up to, not including, its end; a millionth of a sample is rounding
+        first, end = (np.ceil(arrival + extra - 1e-6).astype(int) for extra in (0.0, self.duration_s * rate_hz))
+        return first, end
+
 
 def qpsk_codes(count: int, generator: Generator) -> NDArray[np.complex128]:
     """Return `count` random QPSK code symbols of unit modulus.

@@ -104,7 +104,7 @@ def receive(
             draw.start_s,
             cfo_hz=impairments.clock.cfo_hz,
             sfo_hz=impairments.clock.sfo_hz,
-            noise_variance=0.0 if snr_db is None else waveform.dft_samples * power / 10 ** (snr_db / 10),
+            noise_variance=0.0 if snr_db is None else waveform.noise_at_unit_snr * power / 10 ** (snr_db / 10),
         )
         for name, (paths, power, ripple, snr_db) in heard.items()
     }
@@ -131,7 +131,7 @@ def full_scale(channel: Channel, adc: Adc) -> float:
 
     The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it.
     """
-    power = spectral_power(channel.waveform, channel.paths, channel.response) * len(channel.waveform.codes)
+    power = spectral_power(channel.waveform, channel.paths, channel.response) * channel.waveform.mean_power
     rms = np.sqrt((power + channel.noise_variance) / 2)
     return float(rms * 10 ** (adc.backoff_db / 20))
 

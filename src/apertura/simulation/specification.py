@@ -18,47 +18,13 @@ from apertura.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
 from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Floats, Impairments, RadarPoint
-from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
+from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
+from apertura.simulation.waveforms import TransmittedSpecification
 from apertura.validation import validated
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
-
-
-@dataclass(frozen=True, config=STRICT_KEYS)
-class WaveformSpecification:
-    """One OFDM symbol per pulse; docs/theory/simulate.md, eq. 3."""
-
-    subcarriers: int = Field(gt=1, description="number of subcarriers N")
-    carrier_hz: float = Field(gt=0, description="RF frequency of subcarrier n = 0, Hz")
-    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz")
-    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s")
-    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s")
-    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
-    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
-    carrier_is: Literal["band_start", "band_centre"] = Field(
-        default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
-    )
-    code: Literal["qpsk", "newman"] = Field(default="qpsk", description="random QPSK, or Newman's flat symbol")
-
-    @model_validator(mode="after")
-    def _dft_fits(self) -> Self:
-        length = self.sample_rate_hz / self.subcarrier_spacing_hz
-        if abs(length - round(length)) > 1e-6 * length or self.subcarriers > round(length):
-            raise ValueError(
-                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f}, the DFT length, must be an integer "
-                f"not below subcarriers={self.subcarriers}"
-            )
-        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
-            raise ValueError(f"symbol_s={self.symbol_s:g} is shorter than 1/subcarrier_spacing_hz")
-        return self
-
-    def drawn(self, generator: Generator) -> TransmitWaveform:
-        """Return the waveform with its code symbols."""
-        codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
-        sent = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code"}}
-        return TransmitWaveform(codes, **sent)
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
@@ -162,7 +128,7 @@ class CampaignSpecification:
 
     campaign: str = Field(description="name of the campaign")
     origin: Origin = Field(description="where east, north and up are counted from")
-    waveform: WaveformSpecification = Field(description="what is transmitted")
+    waveform: TransmittedSpecification = Field(description="what is transmitted")
     targets: tuple[Target, ...] = Field(description="what stands in the scene")
     nodes: Mapping[Name, SimulatedNode] = Field(min_length=1, description="one section per UAV")
     flights: tuple[SimulatedFlight, ...] = Field(description="who flies what, one after the other")
@@ -177,6 +143,11 @@ class CampaignSpecification:
         flown = {name for flight in self.flights for name in flight.tracks}
         if flown != set(self.nodes):
             raise ValueError(f"nodes are {', '.join(sorted(self.nodes))}, but tracks are of {', '.join(sorted(flown))}")
+        once = self.waveform.kind == "samples"
+        if once and (
+            self.synthesis == "periodic" or any(flight.continuous or flight.framing for flight in self.flights)
+        ):
+            raise ValueError("a pulse that is sent once needs synthesis: exact, and neither framing nor continuous")
         if not self.flights or len({flight.name for flight in self.flights}) < len(self.flights):
             raise ValueError("flights must be one or more, each with a name of its own")
         return self

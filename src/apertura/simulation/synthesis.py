@@ -131,8 +131,7 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     waveform, rate = channel.waveform, sampling_rate(channel)
     order = np.argsort(channel.paths.delay_s[pulse])
     arrival = (channel.paths.delay_s[pulse, order] - channel.start_s[pulse]) * rate
-    # a path is present from its first sample up to, not including, its end; a millionth of a sample is rounding
-    first, end = (np.ceil(arrival + extra - 1e-6).astype(int) for extra in (0.0, waveform.duration_s * rate))
+    first, end = waveform.presence(arrival, rate)
     differs = np.diff(first) + np.diff(end) > 0
     spectra = _cumulative_spectra(channel, pulse, order, np.flatnonzero(differs) + 1)
     groups = np.concatenate([[0], np.cumsum(np.append(order.size > 0, differs))])  # complete among the first paths

@@ -10,7 +10,7 @@ from apertura.lineage import result_of
 from apertura.load.acquisition import open_acquisition
 from apertura.load.echo import PairEcho, pair_echo
 from apertura.load.recorded import recorded_echo
-from apertura.load.transmitted import read_codes
+from apertura.load.transmitted import transmitted
 from apertura.provenance import merged
 from apertura.settings import PhaseHistoryWaveform
 from apertura.steps.calibration import calibrated, calibration_spec
@@ -28,12 +28,12 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         files = [campaign.root / name for name in lineage.result.sources]
         formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
     else:
-        files = [campaign.codes_file]
-        codes = read_codes(files[0], waveform.subcarriers)
+        files = [campaign.sent_file]
+        sent = transmitted(campaign, waveform)
         tx, rx = pair.split("-")
-        nodes = {node: open_acquisition(campaign, flight, node, waveform) for node in dict.fromkeys((tx, rx))}
+        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
-        formed = pair_echo(nodes[tx], nodes[rx], codes, waveform, campaign.settings.processing, calibration)
+        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration)
     formed = formed.within(campaign, flight, pair)
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:

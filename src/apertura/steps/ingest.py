@@ -10,9 +10,9 @@ from apertura.errors import CampaignError
 from apertura.ingest import open_recording
 from apertura.ingest.recording import Recording
 from apertura.lineage import result_of
-from apertura.load.transmitted import read_framing, symbol_samples
+from apertura.load.transmitted import read_framing
 from apertura.paths import inside
-from apertura.settings import OfdmWaveform
+from apertura.settings import CONFIG, PulseWaveform, SampledWaveform
 from apertura.steps.stamping import stamped
 from apertura.store import save_stage
 
@@ -52,8 +52,15 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     from apertura.echo.continuous import trigger_captures
 
     waveform, described = campaign.settings.waveform, recording.framing or {}
-    if not isinstance(waveform, OfdmWaveform):
-        raise TypeError("a recording of samples needs an OFDM waveform")
+    if not isinstance(waveform, SampledWaveform):
+        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+    if isinstance(waveform, PulseWaveform) and waveform.lead_s:
+        raise CampaignError(
+            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
+            where=CONFIG,
+            expected="0: its captures are cut where the pulse begins",
+            remedy="Set waveform.lead_s to 0.",
+        )
     framing = read_framing(
         _preamble(recording, campaign),
         described,
@@ -62,7 +69,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     )
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
-    samples, length = recording.samples.channel(recording.channels.index(channel)), symbol_samples(waveform)
+    samples, length = recording.samples.channel(recording.channels.index(channel)), waveform.capture_samples
     captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate)
     if not captures.start.size:
         raise CampaignError(

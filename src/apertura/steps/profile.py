@@ -21,7 +21,7 @@ from apertura.load.plan import weighing
 from apertura.load.scene import OpenScene, open_scene
 from apertura.provenance import merged
 from apertura.scene.clearance import check_antennas
-from apertura.settings import CONFIG
+from apertura.settings import CONFIG, SampledWaveform
 from apertura.steps.stamping import stamped
 from apertura.store import blocks_of_rows, finish, open_stage, write_blocks, writing
 
@@ -34,7 +34,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     check_antennas(scene.grid, scene.terrain, aperture, where=where)
     beams = weighing(campaign, open_pair(campaign, flight, pair, echo=source), scene)
     window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams)
-    _check_prefix(window.farthest_m, source.path_limit.values, where=where)
+    _check_held(window.farthest_m, source.path_limit.values, campaign, where=where)
     _check_unambiguous(window)
     asked = campaign.settings.processing.window
     zeros = np.broadcast_to(np.complex64(0), (len(aperture), window.samples))
@@ -70,16 +70,21 @@ def _compressed(
         yield range_compress(history, scene.grid, scene.terrain, window=here).samples
 
 
-def _check_prefix(farthest: NDArray[np.float64], limit: NDArray[np.float64], *, where: str) -> None:
+def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
+    """Raise CampaignError where echoes arrive too late for captures to hold them whole."""
+    waveform = campaign.settings.waveform
+    key, held_by = "path_limit", "the recorded delays"
+    if isinstance(waveform, SampledWaveform):
+        key, held_by = waveform.delay_key, waveform.held_by
     beyond = np.flatnonzero(farthest > limit)
     if beyond.size:
         pulse = int((farthest - limit).argmax())
         raise CampaignError(
-            f"at {beyond.size} pulses echoes of the scene arrive after the cyclic prefix, worst at pulse {pulse}: "
+            f"at {beyond.size} pulses echoes of the scene arrive after {held_by}, worst at pulse {pulse}: "
             f"total path {farthest[pulse]:.1f} m",
             where=where,
-            expected=f"at most {limit[pulse]:.1f} m (c·cyclic_prefix_s less the path offsets)",
-            remedy="Make scene.bounds_m smaller, or check path_offset_m and cyclic_prefix_s.",
+            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
+            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",
         )
 
 

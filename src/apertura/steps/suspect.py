@@ -13,14 +13,14 @@ from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.focus.inputs import PhaseHistory
 from apertura.imaging.sharpness import gathered
-from apertura.load.acquisition import Acquisition, numerology_of, open_acquisition
+from apertura.load.acquisition import Acquisition, open_acquisition
 from apertura.load.echo import pair_echo
 from apertura.load.refined import open_refined
 from apertura.load.scene import OpenScene, open_scene
 from apertura.load.suspects import Evidence, Suspicion, evidence_of, seen_from, some_pulses, suspicions
-from apertura.load.transmitted import read_codes
+from apertura.load.transmitted import Transmitted, transmitted
 from apertura.scene.grid import SceneGrid
-from apertura.settings import OfdmWaveform
+from apertura.settings import OfdmWaveform, SampledWaveform
 from apertura.steps.calibration import calibrated
 from apertura.store import open_stage
 
@@ -52,9 +52,10 @@ def hypotheses(
         what, kind, and gain_db: how much more of the echoes gathers at one place.
     """
     waveform = campaign.settings.waveform
-    if not isinstance(waveform, OfdmWaveform):
+    if not isinstance(waveform, SampledWaveform):
         return []
-    logged = {node: open_acquisition(campaign, flight, node, waveform) for node in campaign.flight(flight).nodes}
+    sent = transmitted(campaign, waveform)
+    logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     found = [
         _evidence(logged, pair, open_stage(campaign.stage("echo", flight, pair), "echo"), window)
@@ -66,7 +67,7 @@ def hypotheses(
     scene = open_scene(campaign)
     now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
     named: list[tuple[float, Suspicion]] = []
-    for suspicion in chain(suspicions(nodes, found), _other_echoes(campaign, flight, nodes, found)):
+    for suspicion in chain(suspicions(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent)):
         grid = _around(scene, _moved(scene.grid, brightest, found, suspicion.histories), cell_m)
         try:
             then = gathered(suspicion.histories, grid, scene.level.height_m + suspicion.height_m)
@@ -84,35 +85,38 @@ def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, win
 
 
 def _other_echoes(
-    campaign: Campaign, flight: str, nodes: Mapping[str, Acquisition], found: Sequence[Evidence]
+    campaign: Campaign,
+    flight: str,
+    nodes: Mapping[str, Acquisition],
+    found: Sequence[Evidence],
+    *,
+    sent: Transmitted,
 ) -> Iterator[Suspicion]:
     """Yield what only another reading of the samples shows: channels swapped, the other end of the band as carrier."""
-    waveform = campaign.settings.waveform
-    if not isinstance(waveform, OfdmWaveform):
-        return
     calibration = {one.pair: calibrated(campaign, flight, one.pair) for one in found}
 
-    def formed(one: Evidence, nodes: Mapping[str, Acquisition], waveform: OfdmWaveform) -> PhaseHistory:
+    def formed(one: Evidence, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
         tx, rx = (nodes[name] for name in one.pair.split("-"))
-        codes = read_codes(campaign.codes_file, waveform.subcarriers)
-        echo = pair_echo(tx, rx, codes, waveform, campaign.settings.processing, calibration[one.pair])
+        echo = pair_echo(tx, rx, sent, campaign.settings.processing, calibration[one.pair])
         some = echo.at(some_pulses(echo.dataset))
         return evidence_of(nodes, one.pair, some, campaign.settings.processing.window).history
 
-    other = "band_centre" if waveform.carrier_is == "band_start" else "band_start"
-    changed = waveform.model_copy(update={"carrier_is": other})
-    placed = {name: replace(node, numerology=numerology_of(changed)) for name, node in nodes.items()}
-    with suppress(CampaignError):
-        yield Suspicion(
-            f"waveform.carrier_is is {other}", "carrier_is", tuple(formed(one, placed, changed) for one in found)
-        )
+    waveform = sent.waveform
+    if isinstance(waveform, OfdmWaveform):
+        other = "band_centre" if waveform.carrier_is == "band_start" else "band_start"
+        changed = transmitted(campaign, waveform.model_copy(update={"carrier_is": other}))
+        placed = {name: replace(node, numerology=changed.numerology) for name, node in nodes.items()}
+        with suppress(CampaignError):
+            yield Suspicion(
+                f"waveform.carrier_is is {other}", "carrier_is", tuple(formed(one, placed, changed) for one in found)
+            )
     for name, node in nodes.items():
         names = node.raw.attrs["channels"]
         swapped = {**nodes, name: replace(node, raw=node.raw.assign_attrs(channels=names[::-1]))}
         with suppress(CampaignError):
             if len(names) == 2:
                 histories = (
-                    formed(one, swapped, waveform) if one.pair.endswith(f"-{name}") else one.history for one in found
+                    formed(one, swapped, sent) if one.pair.endswith(f"-{name}") else one.history for one in found
                 )
                 yield Suspicion(f"the channels of {name} are swapped", "channels", tuple(histories))
 

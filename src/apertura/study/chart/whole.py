@@ -17,7 +17,7 @@ import numpy as np
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.lineage import STUDY, result_of
-from apertura.settings import Flight
+from apertura.settings import Flight, SampledWaveform
 from apertura.steps import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene, terrain
 from apertura.store import record_files
 from apertura.study.chart.whole_picture import Whole, draw_whole
@@ -88,7 +88,7 @@ def _applies(campaign: Campaign, name: str) -> bool:
     if "terrain" in _SETTINGS[name]:
         return campaign.settings.scene.dem is not None
     receivers = any(len(set(pair.split("-"))) > 1 for pair in campaign.image_flights[0].pairs)
-    return "sidelink" not in _SETTINGS[name] or (receivers and campaign.settings.waveform.kind == "ofdm")
+    return "sidelink" not in _SETTINGS[name] or (receivers and isinstance(campaign.settings.waveform, SampledWaveform))
 
 
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
@@ -134,7 +134,7 @@ def _carried(campaign: Campaign) -> _Run:
 
 
 def _echoes(campaign: Campaign, flight: Flight) -> None:
-    if campaign.settings.waveform.kind == "ofdm":
+    if isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
             ingest.ingest(campaign, flight.name, node)
     for pair in flight.pairs:

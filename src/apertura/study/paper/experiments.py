@@ -14,8 +14,8 @@ from apertura.focus.inputs import PhaseHistory
 from apertura.imaging.stages import phase_history_of
 from apertura.load.acquisition import open_acquisition
 from apertura.load.results import OpenCampaign, open_campaign
-from apertura.load.transmitted import read_codes
-from apertura.settings import OfdmWaveform
+from apertura.load.transmitted import transmitted
+from apertura.settings import SampledWaveform
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
 from apertura.study.paper_scene import Complexes
 
@@ -49,13 +49,13 @@ class Experiment:
         """
         campaign = self.opened.campaign
         waveform = campaign.settings.waveform
-        if not isinstance(waveform, OfdmWaveform):
+        if not isinstance(waveform, SampledWaveform):
             raise TypeError("the paper's experiments are recordings of samples")
-        receiver = open_acquisition(campaign, FLIGHT, BISTATIC.split("-")[1], waveform)
-        codes = read_codes(campaign.root / waveform.codes, waveform.subcarriers)
+        sent = transmitted(campaign, waveform)
+        receiver = open_acquisition(campaign, FLIGHT, BISTATIC.split("-")[1], sent)
         every = np.arange(len(receiver.raw.time))
         time_s = receiver.log_seconds(receiver.raw.time.values)
-        measured = transfer_by_code(receiver.reader(["radar"], every), codes, receiver.numerology, time_s=time_s)
+        measured = transfer_by_code(receiver.reader(["radar"], every), sent.inverse, receiver.numerology, time_s=time_s)
         return replace(self.history(BISTATIC), transfer=measured.form(every))
 
 

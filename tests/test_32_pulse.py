@@ -1,0 +1,278 @@
+"""A pulse sent once: its captures are a linear convolution, which one DFT as long as they are undoes."""
+
+import numpy as np
+import pytest
+import yaml
+
+from apertura.campaign import Campaign
+from apertura.echo.captures import blocks_of
+from apertura.echo.demodulate import Numerology, demodulate
+from apertura.echo.pulse_filter import cut_pulses, occupied_band, pulse_filter, pulse_spectrum
+from apertura.echo.transfer import transfer_by_sidelink
+from apertura.errors import CampaignError
+from apertura.load.transmitted import read_pulse, transmitted
+from apertura.settings import PulseWaveform, validated
+from apertura.simulation.pulse import TransmitPulse, pulse_samples
+from apertura.simulation.radar import Paths
+from apertura.simulation.synthesis import Channel, samples
+
+RATE = 256e6
+SIZES = {"bandwidth_hz": 128e6, "pulse_s": 2e-6, "sample_rate_hz": RATE}
+NAMES = ["chirp", "pn", "golay"]
+HALF_BAND = 0.25  # of the sampled band: what codes of two samples per chip and a chirp over half the rate fill
+LENGTH = 900
+
+
+def numerology_of(numbers, longest):
+    return Numerology(1.2e9, RATE, numbers, 0, LENGTH, longest)
+
+
+def middle_band(length=LENGTH, share=HALF_BAND):
+    half = int(share * length)
+    return np.arange(-half, half + 1)
+
+
+def delayed(pulse, delay_samples, lead=0.0, *, carrier_hz=1.2e9, length=LENGTH):
+    """A capture of one echo, by the definition: the samples as band-limited functions of time, summed."""
+    time = np.arange(length)[:, None] - np.arange(len(pulse)) - delay_samples - lead
+    return (np.sinc(time) @ pulse) * np.exp(-2j * np.pi * carrier_hz * delay_samples / RATE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("lead", [0, 33.25])
+def test_a_dft_of_the_whole_capture_divided_by_the_pulse_gives_every_echo_its_delay(name, lead):
+    """H_k = Y_k/S_k: amplitude and phase of each path at f = carrier + k·f_s/L, wherever the capture begins."""
+    pulse = pulse_samples(name, **SIZES)
+    numbers = middle_band()
+    numerology = numerology_of(numbers, LENGTH - len(pulse) - 34)
+    delays, levels = (12.0, 200.4), (1.0, 0.5j)
+    capture = sum(level * delayed(pulse, delay, lead) for delay, level in zip(delays, levels, strict=True))
+    spectrum = pulse_spectrum(pulse, lead=lead, length=LENGTH)[numbers % LENGTH]
+    measured = demodulate(capture[None].astype(np.complex64), numerology)[0] / spectrum
+    expected = sum(
+        level * np.exp(-2j * np.pi * numerology.frequency_hz * delay / RATE)
+        for delay, level in zip(delays, levels, strict=True)
+    )
+    strong = np.abs(spectrum) > 0.3 * np.sqrt(np.mean(np.abs(spectrum) ** 2))
+    assert strong.mean() > 0.8
+    assert np.abs(measured - expected)[strong].max() < 0.02
+
+
+def test_an_echo_that_the_capture_does_not_hold_to_its_end_is_not_exact():
+    pulse = pulse_samples("chirp", **SIZES)
+    numbers = middle_band()
+    spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[numbers % LENGTH]
+    errors = []
+    for delay in (LENGTH - len(pulse), LENGTH - len(pulse) + 100):
+        capture = delayed(pulse, delay)[None].astype(np.complex64)
+        measured = demodulate(capture, numerology_of(numbers, 0))[0] / spectrum
+        expected = np.exp(-2j * np.pi * numerology_of(numbers, 0).frequency_hz * delay / RATE)
+        errors.append(np.sqrt(np.mean(np.abs(measured - expected) ** 2)))
+    assert errors[0] < 0.03
+    assert errors[1] > 0.3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_simulated_captures_are_the_pulse_delayed(name):
+    pulse = pulse_samples(name, **SIZES)
+    wave = TransmitPulse.of(
+        pulse, carrier_hz=1.2e9, sample_rate_hz=RATE, prf_hz=1e3, lead_s=0.1e-6, listen_s=1e-6, band_hz=(-64e6, 64e6)
+    )
+    delays = np.array([[20.3, 150.0, 5000.0, -2000.0]])
+    paths = Paths(delays / RATE, np.array([[1.0, 0.3j, 1.0, 1.0]]), np.zeros((1, 4)))
+    channel = Channel(wave, paths, np.ones(len(wave.codes)), np.zeros(1), np.zeros(1))
+    expected = sum(
+        level * delayed(pulse, delay, 25.6, length=wave.capture_samples)
+        for delay, level in (
+            (20.3, 1.0),
+            (150.0, 0.3j),
+        )  # what comes after the capture, or ends before it, is not heard
+    )
+    assert np.abs(samples(channel, None)[0] - expected).max() < 0.01
+    carried = samples(
+        Channel(wave, paths.at(slice(None)), np.ones(len(wave.codes)), np.zeros(1), np.zeros(1), sfo_hz=1e-6), None
+    )
+    assert np.abs(carried[0] - expected).max() < 0.01  # by the road of a clock that is off
+
+
+@pytest.mark.parametrize(("name", "widest"), [("chirp", 0.26), ("pn", 0.48), ("golay", 0.48)])
+def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
+    pulse = pulse_samples(name, **SIZES)
+    first, last = occupied_band(np.abs(pulse_spectrum(pulse, lead=0, length=LENGTH)) ** 2)
+    assert -widest * LENGTH < first < -0.23 * LENGTH
+    assert 0.23 * LENGTH < last < widest * LENGTH
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("asked", ["inverse", "matched"])
+def test_the_filter_loses_what_it_says(name, asked):
+    """Noise through the filter, against N·SNR of the matched one."""
+    pulse = pulse_samples(name, **SIZES)
+    spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[middle_band() % LENGTH]
+    chosen = pulse_filter(spectrum, asked=asked)
+    rng = np.random.default_rng(1)
+    noise = (rng.normal(size=(4000, spectrum.size, 2)) @ [1, 1j]) / np.sqrt(2)
+    best = (np.abs(spectrum) ** 2).sum()
+    reached = np.abs((spectrum * chosen.inverse).sum()) ** 2 / np.mean(np.abs((noise * chosen.inverse).sum(1)) ** 2)
+    assert 10 * np.log10(best / reached) == pytest.approx(chosen.report["loss_db"], abs=0.15)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_inverse_leaves_the_sidelobes_of_the_window_and_matched_those_of_the_pulse(name):
+    numbers = middle_band()
+    spectrum = pulse_spectrum(pulse_samples(name, **SIZES), lead=0, length=LENGTH)[numbers % LENGTH]
+    window = np.hanning(spectrum.size)
+    highest = {}
+    for asked in ("inverse", "matched"):
+        response = np.abs(
+            np.fft.ifft(window * spectrum * pulse_filter(spectrum, asked=asked).inverse, 16 * len(window))
+        )
+        highest[asked] = 20 * np.log10(response[38:-38].max() / response[0])
+    assert highest["inverse"] == pytest.approx(-31.5, abs=1.5)
+    if name != "chirp":
+        assert highest["matched"] > -24
+
+
+def test_auto_takes_matched_for_a_flat_spectrum_inverse_for_an_uneven_one_and_matched_for_one_with_gaps():
+    rng = np.random.default_rng(1)
+    flat = np.exp(2j * np.pi * rng.random(500))
+    uneven = flat * (1 + 0.3 * np.cos(np.arange(500) / 20))
+    gaps = flat * np.where(np.arange(500) % 2, 1.0, 1e-3)
+    assert [pulse_filter(one, asked="auto").report["filter"] for one in (flat, uneven, gaps)] == [
+        "matched",
+        "inverse",
+        "matched",
+    ]
+    assert pulse_filter(flat, asked="auto").flags == pulse_filter(uneven, asked="auto").flags == {}
+    assert "waveform_sidelobes" in pulse_filter(gaps, asked="auto").flags
+    weak = flat * np.where(np.arange(500) % 2, 1.0, 0.14)
+    assert pulse_filter(weak, asked="auto").report["filter"] == "matched"
+    line = pulse_filter(weak, asked="inverse").flags["waveform_noise"]
+    assert line == "inverse loses 11.2 dB of the signal to noise ratio: 50% of the band lies 10 dB below its mean"
+    with pytest.raises(ValueError, match="no energy"):
+        pulse_filter(np.zeros(8), asked="auto")
+
+
+@pytest.mark.parametrize("cfo_hz", [0.0, 3e4])
+def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
+    """A carrier that is off moves both spectra alike; of their ratio only 2π·CFO·(delay difference) is left."""
+    pulse = pulse_samples("pn", **SIZES)
+    numbers = middle_band()
+    turn = np.exp(-2j * np.pi * cfo_hz / RATE * np.arange(LENGTH))
+    delays = {"radar": 120.3, "sidelink": 10.0}
+    iq = {}
+    for name, delay in delays.items():
+        capture = 2000 * delayed(pulse, delay) * turn
+        iq[name] = np.stack([capture.real, capture.imag], -1).round().astype(np.int16)[None].repeat(40, 0)
+    spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[numbers % LENGTH]
+    numerology = numerology_of(numbers, LENGTH - len(pulse))
+    measured = transfer_by_sidelink(
+        lambda some: {name: one[some] for name, one in iq.items()},
+        pulse_filter(spectrum, asked="inverse").inverse,
+        numerology,
+        symbol_samples=LENGTH,
+        sidelink_m=np.full(40, 11.7),
+        method="divide",
+        accuracy_db=-60.0,
+        where="here",
+    )
+    formed = np.concatenate([measured.form(some) for some in blocks_of(np.arange(40))])[0]
+    after_s = (delays["radar"] - delays["sidelink"]) / RATE
+    expected = np.exp(-2j * np.pi * (numerology.frequency_hz + cfo_hz) * after_s)
+    coherent = np.abs(np.vdot(expected, formed)) / np.sqrt((np.abs(formed) ** 2).sum() * formed.size)
+    assert coherent > 0.998
+    assert abs(np.angle(np.vdot(expected, formed))) < 0.005
+    assert "clock_unmeasured" not in measured.flags
+    assert measured.report["clock"]["reason"].startswith("a pulse that is sent once repeats nothing")
+
+
+def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_counted():
+    held = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
+    assert cut_pulses(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
+    assert "2 of 3 pulses" in cut_pulses(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_cut"]
+
+
+PULSE = {
+    "kind": "samples",
+    "carrier_hz": 1.2e9,
+    "sample_rate_hz": 256e6,
+    "prf_hz": 100.0,
+    "pulse_s": 1e-6,
+    "listen_s": 1e-6,
+}
+
+
+def settings(**more):
+    document = {"campaign": "c", "waveform": PULSE | more, "nodes": {"uav1": {}}}
+    return validated(document, where="config.yaml")
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"band_hz": [-64e6, 129e6]}, "beyond, it aliases"),
+        ({"band_hz": [64e6, -64e6]}, "must rise"),
+        ({"listen_s": 0.02}, "longer than 1/prf_hz"),
+        ({"filter": "wiener"}, "waveform.filter"),
+        ({"pulse_s": 0.0}, "waveform.pulse_s"),
+    ],
+)
+def test_what_a_pulse_cannot_be_is_told(changed, told):
+    with pytest.raises(CampaignError, match=told):
+        settings(**changed)
+
+
+@pytest.mark.parametrize(
+    ("stored", "told"),
+    [
+        (None, "no such file"),
+        (np.ones(255, np.complex64), r"complex64 of shape \(255,\)"),
+        (np.ones(257, np.complex64), r"complex64 of shape \(257,\)"),
+        (np.ones(256), "shape"),
+        (np.ones((256, 3), np.int16), "int16 of shape"),
+        (np.full(256, np.nan, np.complex64), "256 samples that are no number"),
+        (np.full(256, 1.5e308 * (1 + 1j)), "256 samples that are no number"),
+        (np.zeros((256, 2), np.int16), "silence"),
+    ],
+)
+def test_a_file_that_is_not_the_pulse_is_told(tmp_path, stored, told):
+    path = tmp_path / "pulse.npy"
+    if stored is not None:
+        np.save(path, stored)
+    with pytest.raises(CampaignError, match=told):
+        read_pulse(path, PulseWaveform(**PULSE))
+
+
+def test_pairs_of_integers_are_the_same_pulse_as_complex_numbers(tmp_path):
+    pulse = np.exp(1j * np.arange(256) ** 2 / 100)
+    np.save(tmp_path / "one.npy", pulse.astype(np.complex64))
+    np.save(tmp_path / "two.npy", np.stack([pulse.real, pulse.imag], -1).__mul__(32000).round().astype(np.int16))
+    one, two = (read_pulse(tmp_path / f"{name}.npy", PulseWaveform(**PULSE)) for name in ("one", "two"))
+    assert np.abs(one - two).max() < 1e-4
+
+
+def campaign_with(root, pulse, **waveform):
+    (root / "config").mkdir()
+    (root / "raw").mkdir()
+    document = {"campaign": "c", "waveform": PULSE | waveform, "nodes": {"uav1": {}}}
+    (root / "config" / "config.yaml").write_text(yaml.safe_dump(document))
+    (root / "config" / "flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1\n")
+    np.save(root / "raw" / "pulse.npy", pulse.astype(np.complex64))
+    return Campaign.load(root)
+
+
+def test_a_band_without_the_pulse_is_told(tmp_path):
+    pulse = np.exp(1j * np.pi * 40e6 / 1e-6 * ((np.arange(256) - 128) / 256e6) ** 2)
+    campaign = campaign_with(tmp_path, pulse, band_hz=[90e6, 120e6])
+    with pytest.raises(CampaignError, match="of its energy"):
+        transmitted(campaign, campaign.settings.waveform)
+
+
+def test_what_was_sent_has_the_band_of_the_pulse_and_all_of_the_capture(tmp_path):
+    pulse = np.exp(1j * np.pi * 100e6 / 1e-6 * ((np.arange(256) - 128) / 256e6) ** 2)
+    campaign = campaign_with(tmp_path, pulse, lead_s=0.25e-6)
+    sent = transmitted(campaign, campaign.settings.waveform)
+    assert sent.numerology.dft_samples == 64 + 256 + 256
+    assert sent.numerology.longest_samples == 256
+    assert sent.numerology.frequency_hz[[0, -1]] == pytest.approx([1.15e9, 1.25e9], abs=3e6)
+    assert sent.report["filter"] == "inverse"

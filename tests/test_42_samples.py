@@ -1,0 +1,205 @@
+"""Campaigns whose waveform is a pulse given by its samples: from the recording to images, as with OFDM."""
+
+import json
+
+import numpy as np
+import pytest
+from folders import edit_config, run_steps
+
+from apertura.campaign import Campaign
+from apertura.check import problems
+from apertura.echo.compression import window_weights
+from apertura.errors import CampaignError
+from apertura.load.budget import budget_of
+from apertura.load.pair import open_pair
+from apertura.load.scene import open_scene
+from apertura.quality.point_targets import find_peak
+from apertura.resources import Resources
+from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
+from apertura.simulation.impairments import Timing
+from apertura.simulation.specification import specification_text
+from apertura.steps import echo, ingest
+from apertura.steps.suspect import hypotheses
+from apertura.store import open_stage
+
+PAIRS = "uav1-uav1", "uav1-uav2"
+TARGETS = (PointTarget((0.0, 0.0, 0.0)), PointTarget((-4.0, -4.0, 0.0)), PointTarget((4.0, 4.0, 0.0)))
+SIZES = {"carrier_hz": 1.4048e9, "listen_s": 0.5e-6, "sample_rate_hz": 1.024e9, "prf_hz": 20.0, "lead_s": 0.1e-6}
+PULSES = {
+    "chirp": PulseSpecification("chirp", bandwidth_hz=409.6e6, pulse_s=1e-6, **SIZES),
+    "pn": PulseSpecification("pn", bandwidth_hz=512e6, pulse_s=1e-6, band_hz=(-204.8e6, 204.8e6), **SIZES),
+}
+
+
+@pytest.fixture(scope="module", params=PULSES)
+def imaged(request, tmp_path_factory):
+    """Two nodes with noise, clocks of their own, missed triggers, random phases and starts; three targets."""
+    root = tmp_path_factory.mktemp(request.param) / "campaign"
+    simulate(root, preset("demo", pulses=150), waveform=PULSES[request.param], targets=TARGETS)
+    return run_steps(root, exports=False)
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    """Six pulses of a chirp, not yet ingested."""
+    return simulate(tmp_path / "campaign", preset("demo", pulses=6), waveform=PULSES["chirp"], targets=TARGETS)
+
+
+def targets(campaign):
+    """Pixels of the targets."""
+    grid = open_scene(campaign).grid
+    truth = json.loads((campaign.root / "truth.json").read_text())["targets"]
+    return grid, [tuple(float(value) for value in grid.pixel_of(one["x"], one["y"])) for one in truth]
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_every_target_of_a_pulse_focuses_within_a_centimetre(imaged, pair):
+    image = open_stage(imaged.stage("image", "f01", pair), "image").image.values
+    grid, places = targets(imaged)
+    assert len(places) == 3
+    for row, column in places:
+        peak = find_peak(image, round(row), round(column))
+        assert grid.spacing_m * np.hypot(peak.row - row, peak.column - column) < 0.01
+
+
+def test_pairs_of_a_pulse_cohere_by_the_sidelink(imaged):
+    images = [open_stage(imaged.stage("image", "f01", pair), "image").image.values for pair in PAIRS]
+    _, places = targets(imaged)
+    for row, column in places:
+        one, other = (find_peak(image, round(row), round(column)).value for image in images)
+        assert abs(np.angle(one * np.conj(other))) < 0.15
+
+
+@pytest.fixture(scope="module", params=PULSES)
+def alone(request, tmp_path_factory):
+    """Echoes of one target, without noise."""
+    root = tmp_path_factory.mktemp(f"{request.param}-alone") / "campaign"
+    quiet = {"uav1": Impairments(), "uav2": Impairments(timing=Timing(half_width_s=20e-9))}
+    simulate(root, preset("demo", pulses=20), waveform=PULSES[request.param], targets=TARGETS[:1], impairments=quiet)
+    campaign = Campaign.load(root)
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+    for pair in PAIRS:
+        echo.echo(campaign, "f01", pair)
+    return campaign
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_range_profiles_of_a_pulse_have_the_sidelobes_of_the_window_at_every_delay(alone, pair):
+    stage = open_stage(alone.stage("echo", "f01", pair), "echo")
+    place = preset("demo").origin.ecef(np.zeros(3))
+    path = sum(np.linalg.norm(stage[leg].values - place, axis=1) for leg in ("tx_position", "rx_position"))
+    turn = np.exp(2j * np.pi * np.outer(path / 299792458, stage.frequency.values))
+    mean = (stage.transfer.values * turn).mean(0)
+    level = np.abs(np.fft.ifft(mean * window_weights("hann", mean.size), 16 * mean.size))
+    assert level[0] > 0.999 * level.max()
+    assert 20 * np.log10(level[38:-38].max() / level[0]) == pytest.approx(-31.5, abs=1.0)
+
+
+def test_the_echo_says_which_filter_and_why(imaged):
+    for pair in PAIRS:
+        attrs = open_stage(imaged.stage("echo", "f01", pair), "echo").attrs
+        assert attrs["waveform"]["filter"] == "inverse"
+        assert attrs["waveform"]["loss_db"] < 4.5
+        assert attrs["code"]["carried"] is True
+        assert attrs["flags"] == {}
+
+
+def test_what_the_logs_promise_is_what_the_echo_has(tiny):
+    campaign = Campaign.load(tiny)
+    promised = [open_pair(campaign, "f01", pair) for pair in PAIRS]
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+    for pair, before in zip(PAIRS, promised, strict=True):
+        echo.echo(campaign, "f01", pair)
+        formed = open_pair(campaign, "f01", pair)
+        np.testing.assert_allclose(before.frequency_hz, formed.frequency_hz, rtol=1e-12)
+        assert before.path_limit_m == pytest.approx(formed.path_limit_m, abs=0.05)
+        offset_m = open_stage(campaign.stage("echo", "f01", pair), "echo").attrs["stated_offset_m"]
+        if pair == "uav1-uav1":
+            assert formed.path_limit_m == pytest.approx(299792458 * 0.5e-6 - offset_m, abs=1e-6)
+
+
+def test_a_point_moves_while_the_pulse_lasts_and_no_longer(imaged):
+    """Stop and go: half of 1 µs, at a few decimetres of path per second."""
+    lines = {line.cause: line for line in budget_of(imaged, open_pair(imaged, "f01", PAIRS[0]), open_scene(imaged))}
+    assert 0 < lines["stop and go"].effect.shift_m < 1e-6
+
+
+def test_no_hypothesis_improves_what_is_right(imaged):
+    grid, places = targets(imaged)
+    x, y = grid.map_at(*places[0])
+    assert hypotheses(imaged, "f01", brightest=(float(x), float(y)), cell_m=0.3) == []
+
+
+def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
+    assert problems(tiny) == []
+    asked = Resources(Campaign.load(tiny))["echo"]
+
+    class Wildcards:
+        flight, pair = "f01", "uav1-uav2"
+
+    assert 400 < asked.mem_mb(Wildcards(), 1) < 1500
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"listen_s": 0.6e-6}, "lead_s, pulse_s and listen_s of the waveform"),
+        ({"pulse_s": 0.9e-6}, "complex64 of shape (1024,)"),
+        ({"pulse": "raw/other.npy"}, "no such file"),
+        ({"band_hz": [400e6, 500e6]}, "of its energy"),
+        ({"carrier_hz": 1.2e9}, "waveform.carrier_hz"),
+        ({"listen_s": 0.02e-6}, "what waveform.listen_s holds"),
+    ],
+)
+def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, changed, told):
+    edit_config(tiny, lambda document: document["waveform"].update(changed))
+    lines = [str(problem) for problem in problems(tiny)]
+    assert any(told in line for line in lines), lines
+
+
+@pytest.mark.parametrize(("late_s", "cut"), [(0.05e-6, False), (0.25e-6, True), (-0.6e-6, True)])
+def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_path, late_s, cut):
+    """They begin 0.1 µs before it, less what the recorder is late by, and end 0.5 µs after it."""
+    root, timing = tmp_path / "campaign", {"uav2": Impairments(timing=Timing(offset_s=late_s))}
+    simulate(root, preset("demo", pulses=20), waveform=PULSES["pn"], targets=TARGETS, impairments=timing)
+    campaign = Campaign.load(root)
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+    echo.echo(campaign, "f01", "uav1-uav2")
+    assert ("pulse_cut" in open_stage(campaign.stage("echo", "f01", "uav1-uav2"), "echo").attrs["flags"]) is cut
+
+
+def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(tiny):
+    for node in ("uav1", "uav2"):
+        ingest.ingest(Campaign.load(tiny), "f01", node)
+    edit_config(tiny, lambda document: document["waveform"].update(listen_s=0.7e-6))
+    with pytest.raises(CampaignError, match="lead_s, pulse_s and listen_s"):
+        echo.echo(Campaign.load(tiny), "f01", "uav1-uav2")
+
+
+def test_a_recording_that_never_stopped_begins_with_the_pulse(tmp_path):
+    """Where the trigger says; a lead would be taken for a part of the delay."""
+    root = simulate(tmp_path / "campaign", preset("continuous", pulses=2))
+    waveform = {"kind": "samples", "carrier_hz": 1.2e9, "sample_rate_hz": 64e6, "prf_hz": 1000.0}
+    waveform |= {"pulse_s": 4e-6, "listen_s": 2e-6, "lead_s": 1e-6}
+    edit_config(root, lambda document: document.update(waveform=waveform))
+    with pytest.raises(CampaignError, match=r"waveform.lead_s is 1e-06, and uav1.sigmf-meta never stopped"):
+        ingest.ingest(Campaign.load(root), "f01", "uav1")
+
+
+def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
+    whole = preset("demo", pulses=3)
+    changed = type(whole)(**{**vars(whole), "waveform": PULSES["pn"]})
+    (tmp_path / "spec.yaml").write_text(specification_text(changed))
+    assert read_specification(tmp_path / "spec.yaml") == changed
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [({"bandwidth_hz": 2e9}, "beyond sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
+)
+def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
+    with pytest.raises(ValueError, match=told):
+        PulseSpecification(**({"pulse": "chirp", "bandwidth_hz": 400e6, "pulse_s": 1e-6, **SIZES} | changed))
