@@ -25,8 +25,8 @@ from apertura.simulation.trajectory import Waypoints
 FIRST_S, LAST_S = 5.6, 11.6
 """The leg of the flight that is imaged, from the log's first epoch."""
 
-GROUND_M = 8.0
-"""Below the middle of the flight."""
+BESIDE_M = -8.0, -14.0, -8.0
+"""From the middle of the flight to the middle of the scene: north, east, up."""
 
 
 def replay(log: Path, campaign: Path) -> None:
@@ -34,7 +34,9 @@ def replay(log: Path, campaign: Path) -> None:
     track = read_track(log, node="uav1")
     position, time = track.position.values, track.time.values
     began = time[0] + np.timedelta64(round(FIRST_S * 1e9), "ns")
-    origin = Origin(*geodetic_from_ecef(position.mean(axis=0)) - [0, 0, GROUND_M])
+    middle = position.mean(axis=0)
+    north, east, up = BESIDE_M
+    origin = Origin(*geodetic_from_ecef(middle + ned_axes(middle) @ [north, east, -up]))
     centre = origin.ecef(np.zeros(3))
     north, east, down = ((position - centre) @ ned_axes(centre)).T
     places = tuple(map(tuple, np.stack([east, north, -down], axis=-1).tolist()))
@@ -42,8 +44,8 @@ def replay(log: Path, campaign: Path) -> None:
     waveform = WaveformSpecification(512, 1.2e9, 400e3, 3.125e-6, 0.625e-6, 409.6e6, 100.0)
     pulses = round((LAST_S - FIRST_S) * waveform.prf_hz)
     flight = SimulatedFlight("f01", "uav1", {"uav1": flown}, pulses, start_utc=str(began))
-    targets = tuple(PointTarget(place) for place in ((-9.0, -7.0, 0.0), (-12.0, -4.0, 0.0), (-8.0, -11.0, 0.0)))
-    grid = ImageGrid("EPSG:32632", half_width_m=14.0, spacing_m=0.1)
+    targets = tuple(PointTarget(place) for place in ((0.0, 0.0, 0.0), (-2.0, 3.0, 0.0), (3.0, -2.0, 0.0)))
+    grid = ImageGrid("EPSG:32632", half_width_m=5.0, spacing_m=0.05)
     node = {"uav1": SimulatedNode(attitude="none")}
     made = CampaignSpecification("px4 flight, replayed", origin, waveform, targets, node, (flight,), grid)
     simulate(campaign, made, seed=1)
