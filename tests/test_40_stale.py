@@ -14,7 +14,7 @@ from apertura.check import stale
 from apertura.check.stale import damaged_results, stale_lines, stale_results
 from apertura.digests import Sources, digest_of
 from apertura.errors import CampaignError
-from apertura.lineage import results_of
+from apertura.lineage import ON_DEMAND, results_of
 from apertura.lock import hold
 from apertura.steps.summary import print_summary
 
@@ -52,9 +52,9 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 20 + 2
+    assert len(results) == 20 + 4
     for name, result in results:
-        if name in {"speed_accuracy", "whole"}:  # made when they are asked for
+        if name in ON_DEMAND:
             continue
         recorded = json.loads((finished_tiny.root / result.manifest).read_text())
         assert set(recorded) == {"files", "sources", "settings", "code"}

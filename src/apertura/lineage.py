@@ -15,7 +15,21 @@ from apertura.provenance import canonical_json, code_sha256, sha256_text
 from apertura.settings import SampledWaveform
 
 STUDY = "study"
-"""Folder of results that are made when they are asked for, and not with the images."""
+"""Folder of what is measured when it is asked for."""
+
+ON_DEMAND = frozenset({"cphd", "speed_accuracy", "whole"})
+"""Results that are made when they are asked for, and not with the images."""
+
+
+def on_demand(manifest: str) -> bool:
+    """Return whether a manifest is that of a result made when it is asked for.
+
+    Examples
+    --------
+    >>> on_demand("results/f01/a-b/cphd.manifest.json"), on_demand("results/f01/a-b/echo.manifest.json")
+    (True, False)
+    """
+    return manifest.rpartition("/")[2].removesuffix(".manifest.json") in ON_DEMAND
 
 
 @dataclass(frozen=True)
@@ -76,8 +90,8 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     result
         A key of `RESULTS`.
     *where
-        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export), flight (calibration,
-        refined_track, assessment, fused), nothing (the others).
+        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd), flight
+        (calibration, refined_track, assessment, fused), nothing (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -104,7 +118,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield "refined_track", flight.name
         yield from ((stage, flight.name, pair) for stage in ("image", "layers") for pair in flight.pairs)
         yield "assessment", flight.name
-        yield from (("export", flight.name, pair) for pair in flight.pairs)
+        yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield from (("speed_accuracy",), ("whole",))
@@ -211,6 +225,11 @@ def _export(campaign: Campaign, flight: str, pair: str) -> Result:
     return Result(campaign.manifest("export", flight, pair), sources, {"campaign": campaign.settings.campaign})
 
 
+def _cphd(campaign: Campaign, flight: str, pair: str) -> Result:
+    sources = (campaign.manifest("echo", flight, pair), campaign.manifest("scene"))
+    return Result(campaign.manifest("cphd", flight, pair), sources, {"campaign": campaign.settings.campaign})
+
+
 def _fused(campaign: Campaign, flight: str) -> Result:
     images = [campaign.manifest("image", flight, pair) for pair in campaign.flight(flight).pairs]
     sources = (*images, campaign.manifest("assessment", flight), campaign.manifest("cube"), campaign.manifest("scene"))
@@ -257,6 +276,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "assessment": _assessment,
     "cube": _cube,
     "export": _export,
+    "cphd": _cphd,
     "fused": _fused,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,

@@ -33,7 +33,9 @@ class RawFolder:
         if isinstance(self.settings.waveform, SampledWaveform):
             recorded = {path.suffix: path for path in self.recording_files(flight, node)}
             return {**recorded, "track": self.track_file(flight, node)}
-        history = {f"history.{path.name}": path for path in self.history_files(flight, node)}
+        folder = self.root / "raw" / flight
+        files = self.history_files(flight, node)
+        history = {f"history.{path.relative_to(folder).as_posix()}": path for path in files}
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
     def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
@@ -44,14 +46,16 @@ class RawFolder:
         return tuple(self._raw_file(flight, node, suffix) for suffix in row)
 
     def history_files(self, flight: str, node: str) -> list[Path]:
-        """Return the files of a node's phase history, in the order of their names."""
+        """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
         suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
-        found = sorted((self.root / "raw" / flight).glob(f"{node}*{suffix}"))
-        own = [path.name for path in found if path.name[len(node)] == "." and not _is_log(path, node)]
+        folder = self.root / "raw" / flight
+        named = [path for path in sorted(folder.glob(f"{node}*{suffix}")) if path.name[len(node)] == "."]
+        found = [file for path in named if not _is_log(path, node) for file in _files(path)]
+        own = [path.relative_to(folder).as_posix() for path in found]
         if not own:
             raise CampaignError(
                 "no such file",
-                where=self.root / "raw" / flight / f"{node}.*{suffix}",
+                where=folder / f"{node}.*{suffix}",
                 expected=f"the phase history of node {node} in flight {flight}",
                 remedy=f"Copy the {suffix} files there, named <node>{suffix} or <node>.<anything>{suffix}.",
             )
@@ -95,3 +99,9 @@ class RawFolder:
 
 def _is_log(path: Path, node: str) -> bool:
     return path.name.startswith(f"{node}.track.")
+
+
+def _files(path: Path) -> list[Path]:
+    """Return a file itself, or those of a folder; links are among them, to be refused."""
+    inside_it = sorted(path.rglob("*")) if path.is_dir() and not path.is_symlink() else [path]
+    return [file for file in inside_it if file.is_symlink() or not file.is_dir()]

@@ -111,6 +111,7 @@ DEMANDS: Mapping[str, Demand] = {
     "image": _IMAGE,
     "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
     "cube": Demand(500, pixel_bytes=50, pixel_s=10),
+    "cphd": Demand(500, pulse_bytes=500, recorded_s=120),
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
@@ -156,6 +157,8 @@ class Resources:
         first = flights[0]
         images = 1 if pair or node else sum(len(one.pairs) for one in flights)
         nodes = [node] if node else dict.fromkeys(pair.split("-") if pair else first.participants)
+        if not isinstance(campaign.settings.waveform, OfdmWaveform):  # all that is recorded lies with the receivers
+            nodes = [node for node in nodes if node in first.nodes]
         recorded = [self._recorded(first.name, name) for name in nodes]
         pulses = max((pulses for _, pulses in recorded), default=0)
         rows, columns = self._shape

@@ -119,6 +119,12 @@ def cube(campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def cphd(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Write the calibrated transfer functions of a pair for other processors, phase_history.cphd."""
+    _run("apertura.steps.cphd:cphd", campaign, flight, pair)
+
+
+@app.command()
 def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
     _run("apertura.steps.export:export", campaign, flight, pair)

@@ -18,7 +18,7 @@ from apertura.atomic import remove
 from apertura.campaign import Campaign
 from apertura.check import print_problems
 from apertura.check.stale import forms_results, stale_lines, stale_results
-from apertura.lineage import STUDY
+from apertura.lineage import on_demand
 from apertura.lock import hold
 from apertura.paths import shipped
 from apertura.progress import RUN
@@ -110,7 +110,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     stale = stale_results(campaign, paranoid=paranoid)
     if show == "steps":
         print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
-    overtaken = [manifest for manifest in stale if not manifest.startswith(f"results/{STUDY}/")]
+    overtaken = [manifest for manifest in stale if not on_demand(manifest)]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
     command = _command(root, cores, [*profiles_found(arguments), *forced])
     if forms:

@@ -8,7 +8,20 @@ from typing import Any
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
-from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, ulog_fields
+from apertura.ingest import (
+    ardupilot,
+    cphd,
+    cphd_fields,
+    dataflash_fields,
+    hdf5_history,
+    history_layout,
+    open_recording,
+    phase_history,
+    px4_ulog,
+    read_track,
+    ulog_fields,
+    zarr_history,
+)
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
@@ -85,23 +98,41 @@ def _preamble(path: Path) -> Any:
 
 
 def _history(path: Path) -> Any:
-    """As `read_afrl_mat`, in this process: whoever calls it lets it die."""
+    return joined([path], [_alone(read_fields, path)], pair="a-a")
+
+
+def _cphd(path: Path) -> Any:
+    fields = cphd.of_channel(path, _alone(cphd_fields.read_fields, path), None)
+    return phase_history.joined([cphd.history(path, fields, pair="a-b")], pair="a-b", expected="a CPHD file")
+
+
+def _hdf5(path: Path) -> Any:
+    fields = _alone(hdf5_history.read_fields, path)
+    return phase_history.joined([history_layout.history(path, fields)], pair="a-b", expected="an HDF5 file")
+
+
+def _zarr(path: Path) -> Any:
+    folder, data = path.parents[1], path.read_bytes()
+    if not (folder / "zarr.json").is_file():
+        seeds.zarr_folder(folder)
+        path.write_bytes(data)
+    fields = _alone(zarr_history.read_fields, folder)
+    return phase_history.joined([history_layout.history(folder, fields)], pair="a-b", expected="a zarr folder")
+
+
+def _alone(read: Callable[[Path], Any], path: Path) -> Any:
+    """As `read_isolated`, in this process: whoever calls it lets it die."""
     try:
-        fields = read_fields(path)
+        return read(path)
     except Exception as error:  # of whatever kind: there it is the last line of a process
-        raise CampaignError(str(error), path, "a MATLAB file", "Copy it again.") from error
-    return joined([path], [fields], pair="a-a")
+        raise CampaignError(shown(str(error), 300), path, "a file of its format", "Copy it again.") from error
 
 
 def _autopilot(fields_of: Any, track_of: Any) -> Callable[[Path], Any]:
     """As a reader of an autopilot's log, in this process: whoever calls it lets it die."""
 
     def read(path: Path) -> Any:
-        try:
-            fields = fields_of(path)
-        except Exception as error:  # of whatever kind: there it is the last line of a process
-            raise CampaignError(shown(error, 300), path, "a log", "Copy it again.") from error
-        return track_of(fields, node="uav1", options=AS_IT_SAYS, where=path)
+        return track_of(_alone(fields_of, path), node="uav1", options=AS_IT_SAYS, where=path)
 
     return read
 
@@ -150,6 +181,13 @@ _SIGMF = (
 _MAPPED = LogOptions(
     start_utc="2025-05-14",
     columns={"time_s": "t", "latitude_deg": "lat", "longitude_deg": "lon", "height_m": "alt"},
+)
+_CPHD = (
+    "<CPHD </ CPHD/1.0.1 XML_BLOCK_SIZE := PVP_BLOCK_BYTE_OFFSET SIGNAL_BLOCK_BYTE_OFFSET -1 99999999999999999999 \x0c "
+    "<Offset> <Format> CI4 F8 <!DOCTYPE <!ENTITY &x; SYSTEM <SGN> TOA BISTATIC MONOSTATIC \x7f\xf0\x00\x00"
+)
+_ZARR = (
+    f"{_JSON} blosc zstd sharding_indexed numcodecs.pickle complex64 float64 r16 shape chunk_shape 99999999999999999999"
 )
 _TIMES = "2025-05-14T09:30:60Z 9999-12-31 0001-01-01T00:00:00+23:59 now NaT 2025-W20-3 T Z , ; : / - ."
 _DATAFLASH = "FMT, GPS, GPA, ATT, PARM, FMTU, UNIT, MULT, TimeUS,I,Status QBBIHBcLLeffffB QZaMn , ,,,, 128 1e999 nan"
@@ -261,6 +299,9 @@ PARSERS: dict[str, Parser] = {
     "afrl.mat": Parser(
         "a.x.mat", seeds.matlab, _history, (), "MATLAB\x00 IM MI fp freq r0 x\x9c \x0e\x00 \x0f\x00", True
     ),
+    "cphd": Parser("b.cphd", seeds.cphd, _cphd, (), _CPHD, True),
+    "history.h5": Parser("b.h5", seeds.hdf5, _hdf5, (), "\x89HDF TREE SNOD HEAP GCOL OHDR FRHP transfer units", True),
+    "history.zarr": Parser("b.zarr/transfer/zarr.json", seeds.zarr_arrays, _zarr, _JSON_TREE, _ZARR, True),
     "dem.tif": Parser("dem.tif", seeds.dems, _dem, (), _TIFF),
     "geoid.gtx": Parser("egm96.gtx", seeds.gtx_grids, _geoid),
     "geoid.tif": Parser("egm96.tif", seeds.tif_grids, _geoid, (), _TIFF),

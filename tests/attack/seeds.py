@@ -6,11 +6,15 @@ import struct
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import h5py
 import numpy as np
 import rasterio
+import zarr
 from rasterio.transform import from_origin
 from scipy.io import savemat
 
+from apertura.export.cphd import write_cphd
+from apertura.export.cphd_collection import Collection
 from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.ingest.pulson import MESSAGE
 from apertura.settings.template import config_template, flights_template
@@ -259,6 +263,73 @@ def matlab() -> list[bytes]:
         savemat(target, {"data": data}, do_compression=packed)
         files.append(target.getvalue())
     return files
+
+
+RECORDED = {
+    "transfer": np.exp(1j * np.arange(30).reshape(6, 5)).astype(np.complex64),
+    "frequency": 9.3e9 + 1e7 * np.arange(5),
+    "time": 1_747_215_000_000_000_000 + 10_000_000 * np.arange(6),
+    "tx_position": np.array([4177000.0, 855000.0, 4728000.0]) + np.arange(6)[:, None],
+    "rx_position": np.array([4177000.0, 855000.0, 4728009.0]) + np.arange(6)[:, None],
+    "reference_delay": np.linspace(6.6e-6, 6.7e-6, 6),
+}
+"""A phase history, as stage echo has it."""
+
+TIME_UNITS = {"units": "nanoseconds since 1970-01-01"}
+
+
+def cphd() -> list[bytes]:
+    """Return a bistatic pair as CPHD, with and without a parameter of our own."""
+    place = RECORDED["tx_position"][0] - [500.0, 200.0, 300.0]
+    parts = RECORDED["time"].astype("datetime64[ns]"), RECORDED["tx_position"], RECORDED["rx_position"]
+    files = []
+    for limit_m in (np.inf, 5000.0):
+        collection = Collection(
+            "c f01 a-b",
+            "a-b",
+            *parts,
+            RECORDED["frequency"],
+            np.full(6, limit_m),
+            place,
+            place,
+            np.eye(3),
+            (-5.0, -5.0, 5.0, 5.0),
+            0.5,
+            {"APERTURA_FRAME": "ecef"},
+        )
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "b.cphd"
+            write_cphd(path, collection, [RECORDED["transfer"]])
+            files.append(path.read_bytes())
+    return files
+
+
+def hdf5() -> list[bytes]:
+    """Return a phase history in HDF5, as it is and compressed."""
+    files = []
+    for packed in (None, "gzip"):
+        target = io.BytesIO()
+        with h5py.File(target, "w") as file:
+            file.attrs["frame"] = "ecef"
+            for name, values in RECORDED.items():
+                file.create_dataset(name, data=values, compression=packed)
+            file["time"].attrs.update(TIME_UNITS)
+        files.append(target.getvalue())
+    return files
+
+
+def zarr_folder(folder: Path) -> None:
+    """Write a phase history as a zarr folder."""
+    group = zarr.open_group(folder, mode="w", zarr_format=3, attributes={"frame": "ecef"})
+    for name, values in RECORDED.items():
+        group.create_array(name, data=values, attributes=TIME_UNITS if name == "time" else {})
+
+
+def zarr_arrays() -> list[bytes]:
+    """Return the metadata of the samples of such a folder."""
+    with TemporaryDirectory() as folder:
+        zarr_folder(Path(folder) / "b.zarr")
+        return [(Path(folder) / "b.zarr/transfer/zarr.json").read_bytes()]
 
 
 def _tiff(heights: np.ndarray, place: rasterio.Affine, crs: str, **more: object) -> bytes:

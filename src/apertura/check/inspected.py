@@ -93,6 +93,24 @@ class Inspected:
         return self._tracks[1]
 
     @cached_property
+    def unread_history(self) -> list[CampaignError]:
+        """What is wrong with the phase history of the first pair, where its frame is known from nothing else."""
+        flights = self.campaign.image_flights
+        if self.frame or not flights:
+            return []
+        from apertura.load.recorded import recorded_echo
+
+        try:
+            self.campaign.history_files(flights[0].name, flights[0].nodes[0])
+        except CampaignError:  # for 'files' to name
+            return []
+        try:
+            recorded_echo(self.campaign, flights[0].name, flights[0].pairs[0])
+        except CampaignError as problem:
+            return [problem]
+        return []
+
+    @cached_property
     def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
         return self._each(self.campaign.recording_files, lambda files, _: open_recording(files))
 

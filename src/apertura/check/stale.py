@@ -12,7 +12,7 @@ from apertura.atomic import date
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.errors import CampaignError
-from apertura.export import COVERAGE, exports_in
+from apertura.export import COVERAGE, PHASE_HISTORY, exports_in
 from apertura.lineage import Result, results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
@@ -137,6 +137,7 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
 
 _PRODUCTS = {
     "coverage": COVERAGE,
+    "cphd": (PHASE_HISTORY,),
     **{
         name: tuple(row.file for row in exports_in(kind))
         for name, kind in {"export": "pair", "fused": "fused", "layers": "layers"}.items()

@@ -87,6 +87,9 @@ EXPORTS: tuple[Export, ...] = (
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
 
+PHASE_HISTORY = "phase_history.cphd"
+"""Transfer functions of a pair; as large as its echo, and so written for those who ask for it."""
+
 COVERAGE = ("coverage.png", "coverage.geojson")
 """What shows the whole campaign."""
 

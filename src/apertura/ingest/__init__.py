@@ -53,7 +53,10 @@ class HistoryFormat(NamedTuple):
     suffix: str
     """Of <node>.*, or of <node> itself."""
     reader: str
-    """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs."""
+    """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs.
+
+    Of a folder paths are all its files.
+    """
     described: bool = False
     """Whether the reader also takes described=, the section `waveform` of the config."""
     frame: str = ""
@@ -63,6 +66,9 @@ class HistoryFormat(NamedTuple):
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "afrl_mat": HistoryFormat(".mat", "apertura.ingest.afrl:read_afrl_mat", frame="local"),
     "pulson": HistoryFormat(".out", "apertura.ingest.pulson:read_pulson"),
+    "cphd": HistoryFormat(".cphd", "apertura.ingest.cphd:read_cphd", described=True),
+    "hdf5": HistoryFormat(".h5", "apertura.ingest.hdf5_history:read_hdf5_history"),
+    "zarr": HistoryFormat(".zarr", "apertura.ingest.zarr_history:read_zarr_history"),
 }
 """waveform.format → how it is read."""
 

@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
+from apertura.ingest import phase_history
 from apertura.ingest.isolated import UnreadableError, read_isolated
+from apertura.ingest.phase_history import LARGEST, History, largest_by_row, refused
 
-_LARGEST = {"fp": 1e30, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7}
-"""What a field may hold: samples whose squares float32 still adds, Hz, m."""
+_EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite"
+
+_LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7}
+"""What a field may hold: as a sample may, Hz, m."""
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 
@@ -63,28 +67,27 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
     CampaignError
         If fields do not fit each other, hold NaN or values that no radar has, or frequencies differ between files.
     """
+    histories, pulse = [], 0
     for path, fields in zip(paths, passes, strict=True):
         _check(fields, path)
-    first = passes[0]["freq"]
-    for path, fields in zip(paths, passes, strict=True):
-        if fields["freq"].shape != first.shape or np.abs(fields["freq"] - first).max() > 1e-6 * abs(first[0]):
-            raise _error("other frequencies than the first file", path)
-    antenna = np.concatenate([np.stack([f["x"], f["y"], f["z"]], -1) for f in passes])
-    reference = 2 * np.concatenate([f["r0"] for f in passes]) / SPEED_OF_LIGHT_M_S
-    transfer = np.concatenate([f["fp"].T for f in passes])
-    pulses = np.arange(len(transfer))
-    return xr.Dataset(
-        {
-            "time": ("pulse", _EPOCH + pulses * np.timedelta64(1, "s")),
-            "tx_position": (("pulse", "axis"), antenna),
-            "rx_position": (("pulse", "axis"), antenna.copy()),
-            "transfer": (("pulse", "subcarrier"), transfer),
-            "frequency": ("subcarrier", _even(first, paths[0])),
-            "reference_delay": ("pulse", reference),
-            "path_limit": ("pulse", np.full(len(pulses), np.inf)),
-        },
-        attrs={"frame": "local", "pair": pair, "flags": {}},
-    )
+        antenna = np.stack([fields["x"], fields["y"], fields["z"]], -1)
+        pulses = np.arange(pulse, pulse + len(antenna))
+        pulse += len(antenna)
+        histories.append(
+            History(
+                path,
+                _EPOCH + pulses * np.timedelta64(1, "s"),
+                antenna,
+                antenna.copy(),
+                fields["fp"].T,
+                fields["freq"],
+                reference_delay=2 * fields["r0"] / SPEED_OF_LIGHT_M_S,
+                path_limit=np.full(len(antenna), np.inf),
+                used=np.ones(len(antenna), bool),
+                frame="local",
+            )
+        )
+    return phase_history.joined(histories, pair=pair, expected=_EXPECTED)
 
 
 def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
@@ -96,30 +99,11 @@ def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
             path,
         )
     for name, values in fields.items():
-        bad = np.argwhere(~np.isfinite(values))
-        if bad.size:
-            raise _error(f"{name} is not a number at index {bad[0].tolist()} ({len(bad)} in all)", path)
-        largest = float(np.abs(values).max())
-        if largest > _LARGEST[name]:
-            raise _error(f"{name} reaches {largest:.3g}", path)
+        largest_by_row(name, values, _LARGEST[name], lambda found: _error(found, path))
     silent = np.flatnonzero(~fields["fp"].any(axis=0))
     if silent.size:
         raise _error(f"pulse {int(silent[0])} holds only zeros ({silent.size} in all)", path)
 
 
-def _even(frequency: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """Return equal steps through `frequency`, which the files round to float32."""
-    even = np.linspace(frequency[0], frequency[-1], frequency.size)
-    step = even[1] - even[0] if even.size > 1 else 0.0
-    if step <= 0 or frequency[0] <= 0 or np.abs(even - frequency).max() > 1e-2 * step:
-        raise _error("frequencies that do not rise in equal steps", path)
-    return even
-
-
 def _error(found: str, path: Path) -> CampaignError:
-    return CampaignError(
-        found,
-        where=path,
-        expected="a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite",
-        remedy="Copy the file again or take it out of the folder.",
-    )
+    return refused(found, path, _EXPECTED)

@@ -49,8 +49,12 @@ class PairEcho:
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
         """Return the echo of a recorder that hands over transfer functions."""
-        history = echo.transfer.values
-        return cls(echo.drop_vars("transfer").assign(row=_rows(len(history))), history.__getitem__, Saturation())
+        history = echo.transfer
+
+        def form(rows: Pulses) -> Complexes:
+            return np.asarray(history[rows].values)
+
+        return cls(echo.drop_vars("transfer").assign(row=_rows(len(history))), form, Saturation())
 
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo inside the segments of its pair."""

@@ -7,9 +7,11 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
+from apertura.geometry.geodesy import LOCAL
 from apertura.ingest import read_phase_history
 from apertura.load.node_log import raw_log, shortest_wave
 from apertura.load.positions import place, stated_error
+from apertura.settings import CONFIG
 
 
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
@@ -18,7 +20,8 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     Raises
     ------
     CampaignError
-        If positions travel neither with the samples nor in a flight log, or do in both.
+        If positions travel neither with the samples nor in a flight log, or do in both; or if the scene is in another
+        frame than theirs.
     """
     tx, rx = pair.split("-")
     files = campaign.history_files(flight, rx)
@@ -32,9 +35,21 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         raise CampaignError(found, files[0], expected, "Take one away." if logged else "Copy the flight log there.")
     if logged:
         return _placed_by_logs(campaign, flight, (tx, rx), history)
+    _check_frame(campaign.settings.scene.crs, history.attrs["frame"])
     nodes = campaign.settings.nodes
     known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
     return history.assign_attrs(positions=known)
+
+
+def _check_frame(crs: str, frame: str) -> None:
+    local = frame == LOCAL
+    if local != (crs == LOCAL):
+        raise CampaignError(
+            f"{crs} for phase history with positions {'in metres of a frame of its own' if local else 'on Earth'}",
+            where=f"{CONFIG}: scene.crs",
+            expected=LOCAL if local else "an EPSG code, or auto",
+            remedy="Correct scene.crs.",
+        )
 
 
 def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:

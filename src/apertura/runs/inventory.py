@@ -6,7 +6,7 @@ from pathlib import Path
 
 from apertura.campaign import Campaign
 from apertura.check.stale import stale_results
-from apertura.lineage import STUDY, results_of
+from apertura.lineage import on_demand, results_of
 from apertura.runs.removal import in_bytes
 
 _HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
@@ -51,7 +51,7 @@ def states(campaign: Campaign) -> dict[Place, dict[str, list[str]]]:
     for name, result in results_of(campaign):
         there = (campaign.root / result.manifest).is_file()
         place = Path(result.manifest).parent.parts[1:]
-        if there or result.manifest in stale or place != (STUDY,):  # studies are made when they are asked for
+        if there or result.manifest in stale or not on_demand(result.manifest):
             state = "stale" if result.manifest in stale else "finished" if there else "missing"
             found[place][state].append("export" if name == "fused" else name)
     return dict(found)

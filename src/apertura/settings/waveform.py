@@ -211,12 +211,20 @@ class PhaseHistoryWaveform(Section):
         json_schema_extra={"enum": [*PHASE_HISTORIES]},
     )
 
+    channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
+
     @field_validator("format")
     @classmethod
     def _format_is_known(cls, name: str) -> str:
         if name not in PHASE_HISTORIES:
             raise ValueError(f"no such format; choose {', '.join(PHASE_HISTORIES)}")
         return name
+
+    @model_validator(mode="after")
+    def _channels_are_of_cphd(self) -> Self:
+        if self.channel is not None and self.format != "cphd":
+            raise ValueError(f"channel={self.channel!r} is of format cphd, and not of {self.format}")
+        return self
 
 
 Waveform = Annotated[OfdmWaveform | PulseWaveform | PhaseHistoryWaveform, Field(discriminator="kind")]

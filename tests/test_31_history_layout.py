@@ -1,0 +1,210 @@
+"""Phase history in HDF5 and zarr: what was written comes back, and what is not of the layout is refused."""
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+from folders import complaint, require_files
+
+from apertura.campaign import Campaign
+from apertura.contracts import check
+from apertura.errors import CampaignError
+from apertura.ingest import read_phase_history
+
+PULSES, SUBCARRIERS = 9, 16
+SUFFIX = {"hdf5": ".h5", "zarr": ".zarr"}
+FORMATS = pytest.mark.parametrize("kind", SUFFIX)
+
+
+def arrays():
+    """What a radar recorded; single precision is as good."""
+    rng = np.random.default_rng(5)
+    samples = rng.standard_normal((PULSES, SUBCARRIERS)) + 1j * rng.standard_normal((PULSES, SUBCARRIERS))
+    place = np.array([4177000.0, 855000.0, 4728000.0])
+    return {
+        "transfer": samples.astype(np.complex64),
+        "frequency": 1.2e9 + 1e5 * np.arange(SUBCARRIERS),
+        "time": np.datetime64("2025-05-14T09:30:00", "ns").astype(np.int64) + 10_000_000 * np.arange(PULSES),
+        "tx_position": place + np.arange(PULSES)[:, None],
+        "rx_position": place - np.arange(PULSES)[:, None],
+        "reference_delay": np.linspace(1e-6, 1.1e-6, PULSES),
+        "path_limit": np.full(PULSES, 900.0),
+    }
+
+
+def write(path, fields, *, frame="ecef", units="nanoseconds since 1970-01-01"):
+    """Write a file or a folder by its suffix."""
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file.attrs["frame"] = frame
+            for name, values in fields.items():
+                file[name] = values
+            if "time" in file:
+                file["time"].attrs["units"] = units
+        return path
+    group = zarr.open_group(path, mode="w", zarr_format=3, attributes={"frame": frame})
+    for name, values in fields.items():
+        group.create_array(name, data=values, attributes={"units": units} if name == "time" else {})
+    return path
+
+
+def files_of(path):
+    return [file for file in sorted(path.rglob("*")) if file.is_file()] if path.is_dir() else [path]
+
+
+def read(kind, *paths):
+    files = [file for path in paths for file in files_of(path)]
+    return read_phase_history(kind, files, pair="a-b")
+
+
+@FORMATS
+def test_what_was_written_comes_back(tmp_path, kind):
+    fields = arrays()
+    echo = check(read(kind, write(tmp_path / f"b{SUFFIX[kind]}", fields)), "echo")
+    assert echo.attrs == {"frame": "ecef", "pair": "a-b", "flags": {}}
+    np.testing.assert_array_equal(echo.time.values, fields.pop("time").astype("datetime64[ns]"))
+    np.testing.assert_allclose(echo.frequency.values, fields.pop("frequency"), rtol=1e-15)
+    for name, values in fields.items():
+        np.testing.assert_array_equal(echo[name].values, values, err_msg=name)
+
+
+@FORMATS
+def test_positions_may_be_left_to_flight_logs_and_no_limit_is_none(tmp_path, kind):
+    fields = {
+        name: values for name, values in arrays().items() if name not in {"tx_position", "rx_position", "path_limit"}
+    }
+    echo = read(kind, write(tmp_path / f"b{SUFFIX[kind]}", fields, frame=""))
+    assert "tx_position" not in echo
+    assert "frame" not in echo.attrs
+    assert np.isinf(echo.path_limit.values).all()
+
+
+def nan_at(name, *index):
+    fields = arrays()
+    fields[name] = fields[name].copy()
+    fields[name][index] = np.nan
+    return fields
+
+
+def without(name):
+    return {key: values for key, values in arrays().items() if key != name}
+
+
+@FORMATS
+@pytest.mark.parametrize(
+    ("fields", "how", "expected"),
+    [
+        (arrays(), {"frame": "wgs84"}, "frame 'wgs84', and neither 'ecef' nor 'local'"),
+        (arrays(), {"units": "seconds since 1970-01-01"}, "units 'seconds since 1970-01-01' of time"),
+        (without("reference_delay"), {}, "reference_delay"),
+        (without("rx_position"), {}, "tx_position alone"),
+        (nan_at("transfer", 3, 7), {}, "transfer is not a number at index [3, 7]"),
+        (nan_at("rx_position", 2, 1), {}, "rx_position is not a number at index [2, 1]"),
+        (nan_at("path_limit", 2), {}, "a path_limit that is not positive"),
+        (arrays() | {"time": arrays()["time"][::-1].copy()}, {}, "pulse 1 is not later than the one before it"),
+        (arrays() | {"time": arrays()["time"] * 1e-9}, {}, "time holds float64"),
+        (arrays() | {"transfer": arrays()["transfer"].real.copy()}, {}, "transfer holds float32"),
+        (
+            arrays() | {"rx_position": arrays()["rx_position"][:, :2].copy()},
+            {},
+            "rx_position holds float64 of shape (9, 2)",
+        ),
+        (arrays() | {"reference_delay": np.zeros(PULSES - 1)}, {}, "reference_delay has 8 along pulse"),
+        (
+            arrays() | {"frequency": np.geomspace(1e9, 2e9, SUBCARRIERS)},
+            {},
+            "frequencies that do not rise in equal steps",
+        ),
+        (arrays() | {"tx_position": np.ones((PULSES, 3))}, {}, "tx_position of pulse 0 is 2 m from the Earth's centre"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_not_of_the_layout_is_named(tmp_path, kind, fields, how, expected):
+    path = write(tmp_path / f"b{SUFFIX[kind]}", fields, **how)
+    message = complaint(lambda: read(kind, path))
+    assert message.startswith(f"{path}: ")
+    assert expected in message
+
+
+def test_silent_pulses_are_left_out_and_counted(tmp_path):
+    fields = arrays()
+    fields["transfer"][4] = 0
+    echo = read("hdf5", write(tmp_path / "b.h5", fields))
+    assert echo.sizes["pulse"] == PULSES - 1
+    assert echo.attrs["pulses"] == {"used": PULSES - 1, "dropped": 1, "reasons": {"silent": 1}}
+
+
+def test_an_array_that_lies_in_another_file_is_not_followed(tmp_path):
+    inner, other = tmp_path / "b.h5", tmp_path / "secret"
+    np.arange(PULSES, dtype=np.float64).tofile(other)
+    write(tmp_path / "whole.h5", arrays())
+    for keep in (
+        lambda file: file.create_dataset("reference_delay", (PULSES,), "f8", external=[(str(other), 0, 8 * PULSES)]),
+        lambda file: file.__setitem__(
+            "reference_delay", h5py.ExternalLink(str(tmp_path / "whole.h5"), "reference_delay")
+        ),
+        lambda file: file.__setitem__("reference_delay", h5py.SoftLink("/path_limit")),
+    ):
+        write(inner, without("reference_delay"))
+        with h5py.File(inner, "a") as file:
+            keep(file)
+        assert "reference_delay is no array in this file itself" in complaint(lambda: read("hdf5", inner))
+
+
+def test_a_codec_that_may_run_code_is_not_asked(tmp_path):
+    path = write(tmp_path / "b.zarr", arrays())
+    meta = json.loads((path / "time/zarr.json").read_text())
+    meta["codecs"].append({"name": "numcodecs.pickle", "configuration": {}})
+    (path / "time/zarr.json").write_text(json.dumps(meta))
+    assert "time is kept by codec 'numcodecs.pickle'" in complaint(lambda: read("zarr", path))
+    shards = {"name": "sharding_indexed", "configuration": {"codecs": [{"name": "evil"}], "index_codecs": []}}
+    (path / "time/zarr.json").write_text(json.dumps(meta | {"codecs": [shards]}))
+    assert "time is kept by codec 'evil'" in complaint(lambda: read("zarr", path))
+
+
+def test_a_zarr_folder_of_version_2_is_refused(tmp_path):
+    group = zarr.open_group(tmp_path / "b.zarr", mode="w", zarr_format=2, attributes={"frame": "ecef"})
+    for name, values in arrays().items():
+        group.create_array(name, data=values)
+    assert "no zarr.json in b.zarr" in complaint(lambda: read("zarr", tmp_path / "b.zarr"))
+
+
+def test_a_chunk_cut_short_is_refused(tmp_path):
+    path = write(tmp_path / "b.zarr", arrays())
+    chunk = next(file for file in (path / "transfer/c").rglob("*") if file.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(CampaignError, match=r"b\.zarr: not readable"):
+        read("zarr", path)
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    (tmp_path / "config").mkdir()
+    (tmp_path / "raw/f01").mkdir(parents=True)
+    (tmp_path / "config/config.yaml").write_text(
+        "campaign: c\nwaveform: {kind: phase_history, format: zarr}\nnodes: {a: {}, b: {}}\n"
+        "scene: {crs: 'EPSG:32632', bounds_m: [0, 0, 10, 10], spacing_m: 1.0}\n"
+    )
+    (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\ta\tb\n")
+    write(tmp_path / "raw/f01/b.pass.zarr", arrays())
+    return Campaign.load(tmp_path)
+
+
+def test_every_file_of_a_zarr_folder_is_one_of_the_recording(campaign):
+    require_files(campaign)
+    files = campaign.raw_files("f01", "b")
+    assert {"history.b.pass.zarr/zarr.json", "history.b.pass.zarr/time/c/0"} <= set(files)
+    assert read_phase_history("zarr", campaign.history_files("f01", "b"), pair="a-b").sizes["pulse"] == PULSES
+
+
+def test_a_zarr_folder_that_leads_out_of_the_campaign_is_refused(campaign, tmp_path_factory):
+    elsewhere, inside = tmp_path_factory.mktemp("elsewhere"), campaign.root / "raw/f01/b.pass.zarr"
+    shutil.move(inside / "time", elsewhere / "time")
+    (inside / "time").symlink_to(elsewhere / "time")
+    assert "leads through a symbolic link" in complaint(lambda: campaign.history_files("f01", "b"))
+    shutil.rmtree(inside)
+    inside.symlink_to(elsewhere)
+    assert "leads through a symbolic link" in complaint(lambda: campaign.history_files("f01", "b"))

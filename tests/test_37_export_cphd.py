@@ -1,0 +1,197 @@
+"""A pair's echo as CPHD: what the standard's own checker says of it, and the image that it gives when it comes back."""
+
+import shutil
+
+import numpy as np
+import pytest
+import sarkit.verification
+import yaml
+from folders import edit_config, make_images, settle_ground
+
+from apertura.campaign import Campaign
+from apertura.check import problems
+from apertura.check.stale import stale_results
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.export.cphd import write_cphd
+from apertura.export.cphd_collection import Collection
+from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
+from apertura.ingest import read_phase_history
+from apertura.lineage import on_demand, results_of
+from apertura.steps import cphd, echo
+from apertura.store import open_stage
+
+AT = np.array([48.0, 11.0, 600.0])
+
+
+def failures(path):
+    """What the checker finds wrong, errors and warnings."""
+    with path.open("rb") as stream:
+        checker = sarkit.verification.CphdConsistency.from_file(stream, thorough=True)
+        checker.check()
+    return {
+        name: [part["details"] for part in one["details"] if not part["passed"]]
+        for name, one in checker.failures().items()
+    }
+
+
+def reimported(campaign, flight, pair, target):
+    """A campaign that begins with the CPHD file of another's pair and images the same pixels, up to its image."""
+    tx, rx = pair.split("-")
+    file, scene = cphd.cphd(campaign, flight, pair), yaml.safe_load((campaign.root / "config/config.yaml").read_text())
+    (target / "config").mkdir(parents=True)
+    (target / "raw" / flight).mkdir(parents=True)
+    shutil.copyfile(file, target / "raw" / flight / f"{rx}.cphd")
+    config = {
+        "campaign": "again",
+        "waveform": {"kind": "phase_history", "format": "cphd"},
+        "nodes": {node: {} for node in dict.fromkeys((tx, rx))},
+        "scene": scene["scene"],
+        "processing": {"autofocus": "off", "accuracy_db": -90.0},
+    }
+    (target / "config/config.yaml").write_text(yaml.safe_dump(config))
+    (target / "config/flights.tsv").write_text(f"flight\tkind\ttransmitter\tnodes\n{flight}\timage\t{tx}\t{rx}\n")
+    again = Campaign.load(target)
+    echo.echo(again, flight, pair)
+    settle_ground(again)
+    make_images(again, flight)
+    return again
+
+
+def image_of(campaign, flight, pair):
+    return open_stage(campaign.stage("image", flight, pair), "image").image.values
+
+
+def difference_db(one, other):
+    return 20 * np.log10(np.abs(one - other).max() / np.abs(one).max())
+
+
+@pytest.fixture(scope="module")
+def gotcha(shared, tmp_path_factory):
+    """Two degrees of Gotcha, imaged as finely as it is compared."""
+    root = tmp_path_factory.mktemp("gotcha") / "campaign"
+    (root / "config").mkdir(parents=True)
+    (root / "raw/pass1").mkdir(parents=True)
+    for number, file in enumerate(sorted((shared / "gotcha_afrl").glob("*.mat")), 1):
+        shutil.copyfile(file, root / f"raw/pass1/radar.az{number:03d}.mat")
+    (root / "config/config.yaml").write_text(
+        "campaign: gotcha\nwaveform: {kind: phase_history, format: afrl_mat}\nnodes: {radar: {}}\n"
+        "scene: {crs: local, bounds_m: [-40.0, 10.0, 0.0, 50.0], spacing_m: 0.2}\n"
+        "processing: {autofocus: 'off', accuracy_db: -90.0}\n"
+    )
+    (root / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\npass1\timage\tradar\tradar\n")
+    campaign = Campaign.load(root)
+    echo.echo(campaign, "pass1", "radar-radar")
+    settle_ground(campaign)
+    make_images(campaign, "pass1")
+    return campaign
+
+
+def test_gotcha_through_cphd_gives_the_same_image_to_80_db(gotcha, tmp_path):
+    again = reimported(gotcha, "pass1", "radar-radar", tmp_path / "again")
+    assert failures(gotcha.result("pass1", "radar-radar", "phase_history.cphd")) == {}
+    one, other = (image_of(each, "pass1", "radar-radar") for each in (gotcha, again))
+    assert difference_db(one, other) < -80
+    echoes = [open_stage(each.stage("echo", "pass1", "radar-radar"), "echo") for each in (gotcha, again)]
+    assert echoes[1].attrs["frame"] == "local"
+    np.testing.assert_allclose(echoes[1].tx_position.values, echoes[0].tx_position.values, atol=2e-9)
+    np.testing.assert_array_equal(echoes[1].time.values, echoes[0].time.values)
+    # referred to the middle of the scene, and no more to its origin: the samples themselves differ
+    assert np.abs(np.diff([each.reference_delay.values for each in echoes], axis=0)).min() > 1e-8
+
+
+@pytest.fixture(scope="module")
+def fine_tiny(_tiny, tmp_path_factory):
+    """The tiny campaign's pairs, imaged as finely as they are compared."""
+    from folders import copy_writable, ingest_all
+
+    root = copy_writable(_tiny, tmp_path_factory.mktemp("tiny") / "campaign")
+    edit_config(root, lambda config: config.update(processing={"autofocus": "off", "accuracy_db": -90.0}))
+    campaign = Campaign.load(root)
+    ingest_all(campaign)
+    for pair in campaign.flight("f01").pairs:
+        echo.echo(campaign, "f01", pair)
+    settle_ground(campaign)
+    make_images(campaign, "f01")
+    return campaign
+
+
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_a_simulated_pair_through_cphd_gives_the_same_image_to_80_db(fine_tiny, tmp_path, pair):
+    again = reimported(fine_tiny, "f01", pair, tmp_path / "again")
+    assert failures(fine_tiny.result("f01", pair, "phase_history.cphd")) == {}
+    assert difference_db(image_of(fine_tiny, "f01", pair), image_of(again, "f01", pair)) < -80
+    one, other = (open_stage(each.stage("echo", "f01", pair), "echo") for each in (fine_tiny, again))
+    for name in ("time", "tx_position", "rx_position", "path_limit"):
+        np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
+
+
+def collection(pulses=6, **changes):
+    """A small monostatic flight about a place on Earth."""
+    place = ecef_from_geodetic(*AT)
+    north, east, down = ned_axes(place).T
+    track = place - 300.0 * down + 200.0 * east + 2.0 * np.arange(pulses)[:, None] * north
+    limit_m = np.full(pulses, 5000.0)
+    time = np.datetime64("2025-05-14T09:30:00.123456789", "ns") + np.arange(pulses) * np.timedelta64(10_000_001, "ns")
+    frequency = 1.2e9 + 1e5 * np.arange(64)
+    parts = {"time": time, "tx_m": track, "rx_m": track, "frequency_hz": frequency, "path_limit_m": limit_m}
+    ground = {"point_m": place, "origin_m": place, "axes": np.stack([east, north, -down])}
+    rest = {"area_m": (-5.0, -5.0, 5.0, 5.0), "spacing_m": 0.5, "parameters": {}}
+    return Collection("c f01 a-a", "a-a", **(parts | ground | rest | changes))
+
+
+def noise(count):
+    rng = np.random.default_rng(count)
+    return (rng.standard_normal((count, 64)) + 1j * rng.standard_normal((count, 64))).astype(np.complex64)
+
+
+def test_what_is_written_in_blocks_comes_back_to_the_bit(tmp_path):
+    flown, samples = collection(), noise(6)
+    write_cphd(tmp_path / "a.cphd", flown, (samples[part] for part in (slice(0, 1), slice(1, 5), slice(5, 6))))
+    assert failures(tmp_path / "a.cphd") == {}
+    echo = read_phase_history("cphd", [tmp_path / "a.cphd"], pair="a-a")
+    np.testing.assert_array_equal(echo.transfer.values, samples)
+    np.testing.assert_array_equal(echo.time.values, flown.time)
+    np.testing.assert_array_equal(echo.tx_position.values, flown.tx_m)
+    np.testing.assert_array_equal(echo.path_limit.values, flown.path_limit_m)
+    np.testing.assert_allclose(echo.reference_delay.values, flown.reference_delay_s, rtol=1e-15)
+
+
+def test_blocks_of_too_few_pulses_leave_no_file(tmp_path):
+    with pytest.raises(ValueError, match="5 pulses: must be 6"):
+        write_cphd(tmp_path / "a.cphd", collection(), [noise(5)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_swath_ends_where_echoes_leave_the_prefix(tmp_path):
+    """Without a prefix it is what the frequencies resolve at 1.25 times the sampling that it needs."""
+    first, last = collection(path_limit_m=np.full(6, np.inf)).swath_s
+    assert last == -first == pytest.approx(0.5 / 1.25 / 1e5)
+    flown = collection(path_limit_m=np.full(6, 900.0))
+    assert flown.swath_s == pytest.approx((first, (900.0 / SPEED_OF_LIGHT_M_S - flown.reference_delay_s).min()))
+    write_cphd(tmp_path / "a.cphd", flown, [noise(6)])
+    assert failures(tmp_path / "a.cphd") == {}
+
+
+def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tiny):
+    made = [result for name, result in results_of(fine_tiny) if name == "cphd"]
+    assert [on_demand(result.manifest) for result in made] == [True, True]
+    cphd.cphd(fine_tiny, "f01", "uav1-uav1")
+    stage = open_stage(fine_tiny.stage("echo", "f01", "uav1-uav1"), "echo")
+    assert stage.sizes["pulse"] == 40
+    assert stale_results(fine_tiny) == {}
+    path = fine_tiny.result("f01", "uav1-uav1", "phase_history.cphd")
+    path.write_bytes(path.read_bytes()[:-1])
+    assert stale_results(fine_tiny) == {made[0].manifest: "phase_history.cphd is not as it was written"}
+
+
+def test_a_scene_in_another_frame_than_the_file_is_refused_by_the_check(tmp_path):
+    (tmp_path / "config").mkdir()
+    (tmp_path / "raw/f01").mkdir(parents=True)
+    write_cphd(tmp_path / "raw/f01/a.cphd", collection(), [noise(6)])
+    config = "campaign: c\nwaveform: {kind: phase_history, format: cphd}\nnodes: {a: {}}\n"
+    scene = "scene: {crs: local, bounds_m: [-5, -5, 5, 5], spacing_m: 0.5}\n"
+    (tmp_path / "config/config.yaml").write_text(config + scene)
+    (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\ta\ta\n")
+    told = [str(problem) for problem in problems(tmp_path, without=["memory"])]
+    assert len(told) == 1
+    assert "local for phase history with positions on Earth; expected an EPSG code, or auto" in told[0]
