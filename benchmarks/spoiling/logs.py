@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign_files import write_csv_log
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from apertura.campaign_files import write_csv_log
 from apertura.simulation.scene import Origin
 
 Floats = NDArray[np.float64]

@@ -8,11 +8,12 @@ from typing import Any
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
-from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, ulog_fields
+from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, recording_files, ulog_fields
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
+from apertura.ingest.sigmf_collection import check_listed
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
 from apertura.load.transmitted import read_codes, read_framing
@@ -77,6 +78,19 @@ def _metadata(path: Path) -> Any:
 def _samples(path: Path) -> Any:
     recording = open_recording((_written(path.with_name("uav1.sigmf-meta"), seeds.sigmf_meta()[0]), path))
     return recording.cut(recording.captures, node="uav1")
+
+
+def _floats(path: Path) -> Any:
+    meta = seeds.sigmf_meta()[0].replace(b"ci16_le", b"cf32_le")
+    recording = open_recording((_written(path.with_name("uav1.sigmf-meta"), meta), path))
+    return recording.cut(recording.captures, node="uav1")
+
+
+def _collection(path: Path) -> Any:
+    _written(path.with_name("rx_0.sigmf-meta"), seeds.sigmf_meta()[0])
+    _written(path.with_name("rx_0.sigmf-data"), seeds.sigmf_data()[0])
+    files = recording_files(path.parent, "uav1")
+    return open_recording(files) if files[0].is_file() else check_listed(path.with_name("rx_0.sigmf-meta"))
 
 
 def _preamble(path: Path) -> Any:
@@ -144,7 +158,8 @@ _NPY = (
 )
 _TIFF = "II*\0 MM\0* II+\0 <VRTDataset /vsicurl/http://127.0.0.1/x <GDAL_WMS> \x00\x01\x00\x04 \x83\x0e \x87\xaf"
 _SIGMF = (
-    f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z"
+    f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z "
+    "core:header_bytes core:trailing_bytes core:dataset apertura:if_hz ri16_be cf64_le cu8"
 )
 _MAPPED = LogOptions(
     start_utc="2025-05-14",
@@ -174,6 +189,14 @@ PARSERS: dict[str, Parser] = {
     ),
     "sigmf-meta": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _metadata, _JSON_TREE, _SIGMF),
     "sigmf-data": Parser("uav1.sigmf-data", seeds.sigmf_data, _samples),
+    "sigmf-floats": Parser("uav1.sigmf-data", seeds.sigmf_floats, _floats),
+    "sigmf-collection": Parser(
+        "flight.sigmf-collection",
+        seeds.sigmf_collections,
+        _collection,
+        _JSON_TREE,
+        f"{_JSON} core:streams apertura:nodes name hash rx_0 ../rx_0",
+    ),
     "track.csv": Parser("uav1.track.csv", seeds.tracks, lambda path: read_track(path, node="uav1"), _CSV, _TIMES),
     "track.pos": Parser(
         "uav1.track.pos",
