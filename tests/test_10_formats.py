@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apertura.constants import GPS_UTC_LEAP_S
 from apertura.errors import CampaignError
 from apertura.ingest import PHASE_HISTORIES, TRACKS, read_track
 from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.log_options import LogOptions
 from apertura.ingest.real_samples import EDGE, SETTLING
 from apertura.ingest.sample_layout import SampleLayout
 from apertura.ingest.sigmf_collection import Collection
 from apertura.ingest.sigmf_meta import Capture, Framing, Global
 from apertura.ingest.track import FIXES
+from apertura.leap_seconds import gps_ahead_s
 from apertura.settings import Flight, read_flights, read_segments
 from apertura.settings.clocks import read_clocks
 
@@ -89,25 +90,35 @@ def test_a_table_of_the_config_has_the_columns_that_are_told_in_their_order(tmp_
     assert len(list(READERS[name](tmp_path / name))) == 1
 
 
-LOGGED = {"time_utc": "2025-05-14T09:30:0{}Z", "latitude_deg": "48", "longitude_deg": "9", "height_m": "60{}"}
+TIMES = {"time_utc": "2025-05-14T09:30:0{}", "time": "2025-05-14T09:30:0{}Z", "time_s": "{}"}
+PLACES = {
+    ("latitude_deg", "longitude_deg", "height_m"): ("48", "9", "60{}"),
+    ("x_m", "y_m", "z_m"): ("4200000", "660000", "474000{}"),
+    ("east_m", "north_m", "up_m"): ("1", "2", "{}"),
+}
 
 
-def test_a_csv_log_has_the_columns_that_are_told_and_needs_those_that_must_be_there(tmp_path):
-    columns = names("Columns of CSV")
-    cells = {name: LOGGED.get(name, "fix" if name == "quality" else "1.5") for name in columns}
+@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("place", PLACES)
+def test_a_csv_log_has_the_columns_that_are_told_and_needs_a_time_and_a_position(tmp_path, time, place):
+    told = names("Columns of CSV")
+    assert set(told) >= {*TIMES, *(name for group in PLACES for name in group)}
+    further = [name for name in told if name not in TIMES and not any(name in group for group in PLACES)]
+    cells = TIMES | dict(zip(place, PLACES[place], strict=True)) | dict.fromkeys(further, "1.5") | {"quality": "fix"}
 
     def read(of):
         lines = [",".join(cells[name].format(epoch) for name in of) for epoch in range(3)]
         (tmp_path / "a.csv").write_text("\n".join([",".join(of), *lines]) + "\n")
-        return read_track(tmp_path / "a.csv", node="a")
+        options = LogOptions(start_utc="2025-05-14T09:30:00" if time == "time_s" else None)
+        return read_track(tmp_path / "a.csv", node="a", options=options)
 
-    track = read(columns)
+    columns = [time, *place]
+    track = read([*further, *columns])
     assert {"position_std", "fix"} <= set(track)
     assert np.isfinite(track.attitude.values).all()
-    assert required("Columns of CSV") == set(LOGGED)
-    read(LOGGED)
-    for missing in LOGGED:
-        with pytest.raises(CampaignError, match=missing):
+    read(columns)
+    for missing in columns:
+        with pytest.raises(CampaignError, match=missing if missing != time else "time_utc"):
             read([name for name in columns if name != missing])
 
 
@@ -124,7 +135,7 @@ def test_every_kind_of_solution_is_told_with_its_number():
 
 
 def test_leap_seconds_and_columns_of_patterns_are_as_told(tmp_path):
-    assert f"({GPS_UTC_LEAP_S} since 2017)" in TEXT
+    assert f"({gps_ahead_s(np.datetime64('2017-01-01', 'ns'))} since 2017)" in TEXT
     part = TEXT[TEXT.index("## Beams") :]
     columns = re.search(r"columns `(\w+)`.*?`(angle_deg)`.*?`(gain_db)`", part, re.S).groups()
     rows = [f"{cut},{angle},0" for cut in ("azimuth", "elevation") for angle in (-9, 0, 9)]
