@@ -8,7 +8,15 @@ from typing import Any
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
-from apertura.ingest import ardupilot, dataflash_fields, open_recording, px4_ulog, read_track, recording_files, ulog_fields
+from apertura.ingest import (
+    ardupilot,
+    dataflash_fields,
+    open_recording,
+    px4_ulog,
+    read_track,
+    recording_files,
+    ulog_fields,
+)
 from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
