@@ -177,11 +177,6 @@ def test_time_tags_that_run_backwards_are_refused(tmp_path):
         recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 5), capture(5, 1)], **{"apertura:channels": ["radar"]})
 
 
-def test_another_datatype_is_refused(shared, tmp_path):
-    with pytest.raises(CampaignError, match="cf32_le"):
-        recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 0)], **{"core:datatype": "cf32_le"})
-
-
 def test_a_real_recording_of_another_maker_is_read(shared):
     folder = shared / "sigmf_nbiot"
     names = [folder / f"V16-beacon-NB-IoT-uplink.sigmf-{kind}" for kind in ("meta", "data")]

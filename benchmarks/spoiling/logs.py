@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign_files import write_csv_log
 from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from apertura.simulation.files import write_csv_log
 from apertura.simulation.scene import Origin
 
 Floats = NDArray[np.float64]
@@ -80,7 +80,7 @@ def write_log(path: Path, log: Log) -> None:
     """Write a log in the format that it was read from."""
     time = log.begun + np.rint(log.time_s * 1e9).astype("timedelta64[ns]")
     if log.attitude_deg is not None:
-        write_csv_log(path, time, log.geodetic, np.radians(log.attitude_deg))
+        write_csv_log(path, time.astype("datetime64[us]"), log.geodetic, np.radians(log.attitude_deg))
         return
     lines = list(log.header)
     for at, (latitude, longitude, height), rest in zip(

@@ -24,6 +24,8 @@ _PUBLIC = {
     "PhaseHistory": "apertura.focus.inputs",
     "Plane": "apertura.scene.terrain",
     "Profiles": "apertura.focus.inputs",
+    "RecordedFlight": "apertura.load.writing",
+    "RecordedNode": "apertura.load.writing",
     "SceneGrid": "apertura.scene.grid",
     "backproject": "apertura.imaging.backproject",
     "gradient": "apertura.imaging.gradient",
@@ -31,6 +33,7 @@ _PUBLIC = {
     "open_dem": "apertura.scene.dem_file",
     "range_compress": "apertura.imaging.range_profiles",
     "simulate": "apertura.simulation",
+    "write_campaign": "apertura.load.writing",
 }
 """Public name → module that defines it."""
 

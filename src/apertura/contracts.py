@@ -66,6 +66,13 @@ STAGES: Mapping[str, Stage] = {
             "channels": "names of the channels",
             "capture_samples": "samples of each capture",
             "sample_rate_hz": "complex samples per second",
+            "datatype": "of the numbers in the file, as SigMF names it",
+            "trailing_bytes": "at the end of the file that are no samples",
+            "mixing": "of real samples: if_hz, sample_rate_hz, restarts; null: they are complex",
+        },
+        {
+            "segment_start": Variable(("segment",), "int64", "1", "first samples behind bytes that are no samples"),
+            "segment_skipped": Variable(("segment",), "int64", "1", "how many such bytes the file holds before each"),
         },
     ),
     "track": Stage(

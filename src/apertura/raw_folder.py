@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, log_suffixes, read_track
+from apertura.ingest import PHASE_HISTORIES, log_suffixes, read_track, recording_files
 from apertura.paths import inside
 from apertura.settings import FLIGHTS, SampledWaveform, Settings
 
@@ -40,10 +40,8 @@ class RawFolder:
 
     def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
         """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
-        folder = self.root / "raw" / flight
-        begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
-        row = next(begun, next(iter(RECORDERS)))
-        return tuple(self._raw_file(flight, node, suffix) for suffix in row)
+        files = recording_files(self.root / "raw" / flight, node)
+        return tuple(self._raw_file(flight, node, path.name) for path in files)
 
     def history_files(self, flight: str, node: str) -> list[Path]:
         """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
@@ -84,9 +82,9 @@ class RawFolder:
     def _recorded(self, flight: str, name: str) -> Path:
         return inside(self.root, f"raw/{flight}/{name}", where=self.root)
 
-    def _raw_file(self, flight: str, node: str, suffix: str) -> Path:
-        """Return raw/<flight>/<node><suffix>, which must exist."""
-        path = self._recorded(flight, f"{node}{suffix}")
+    def _raw_file(self, flight: str, node: str, name: str) -> Path:
+        """Return raw/<flight>/<name>, which must exist."""
+        path = self._recorded(flight, name)
         if not path.is_file():
             raise CampaignError(
                 "no such file",

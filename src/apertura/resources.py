@@ -157,7 +157,7 @@ class Resources:
         first = flights[0]
         images = 1 if pair or node else sum(len(one.pairs) for one in flights)
         nodes = [node] if node else dict.fromkeys(pair.split("-") if pair else first.participants)
-        if not isinstance(campaign.settings.waveform, OfdmWaveform):  # all that is recorded lies with the receivers
+        if not isinstance(campaign.settings.waveform, SampledWaveform):  # all that is recorded lies with the receivers
             nodes = [node for node in nodes if node in first.nodes]
         recorded = [self._recorded(first.name, name) for name in nodes]
         pulses = max((pulses for _, pulses in recorded), default=0)

@@ -19,6 +19,7 @@ from apertura.ingest import (
     phase_history,
     px4_ulog,
     read_track,
+    recording_files,
     ulog_fields,
     zarr_history,
 )
@@ -27,6 +28,7 @@ from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
 from apertura.ingest.pulson import read_pulson
+from apertura.ingest.sigmf_collection import check_listed
 from apertura.load.results import OpenCampaign, assessment_of
 from apertura.load.scene import settled_scene
 from apertura.load.transmitted import read_codes, read_framing, read_pulse
@@ -91,6 +93,19 @@ def _metadata(path: Path) -> Any:
 def _samples(path: Path) -> Any:
     recording = open_recording((_written(path.with_name("uav1.sigmf-meta"), seeds.sigmf_meta()[0]), path))
     return recording.cut(recording.captures, node="uav1")
+
+
+def _floats(path: Path) -> Any:
+    meta = seeds.sigmf_meta()[0].replace(b"ci16_le", b"cf32_le")
+    recording = open_recording((_written(path.with_name("uav1.sigmf-meta"), meta), path))
+    return recording.cut(recording.captures, node="uav1")
+
+
+def _collection(path: Path) -> Any:
+    _written(path.with_name("rx_0.sigmf-meta"), seeds.sigmf_meta()[0])
+    _written(path.with_name("rx_0.sigmf-data"), seeds.sigmf_data()[0])
+    files = recording_files(path.parent, "uav1")
+    return open_recording(files) if files[0].is_file() else check_listed(path.with_name("rx_0.sigmf-meta"))
 
 
 def _preamble(path: Path) -> Any:
@@ -176,7 +191,8 @@ _NPY = (
 )
 _TIFF = "II*\0 MM\0* II+\0 <VRTDataset /vsicurl/http://127.0.0.1/x <GDAL_WMS> \x00\x01\x00\x04 \x83\x0e \x87\xaf"
 _SIGMF = (
-    f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z"
+    f"{_JSON} core:sample_start core:datetime apertura:frame apertura:channels core:num_channels 2025-01-01T00:00:60Z "
+    "core:header_bytes core:trailing_bytes core:dataset apertura:if_hz ri16_be cf64_le cu8"
 )
 _MAPPED = LogOptions(
     start_utc="2025-05-14",
@@ -225,6 +241,14 @@ PARSERS: dict[str, Parser] = {
     "scans.out": Parser("uav1.out", seeds.scans, lambda path: read_pulson([path], pair="uav1-uav1"), (), "\xf2\x01"),
     "sigmf-meta": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _metadata, _JSON_TREE, _SIGMF),
     "sigmf-data": Parser("uav1.sigmf-data", seeds.sigmf_data, _samples),
+    "sigmf-floats": Parser("uav1.sigmf-data", seeds.sigmf_floats, _floats),
+    "sigmf-collection": Parser(
+        "flight.sigmf-collection",
+        seeds.sigmf_collections,
+        _collection,
+        _JSON_TREE,
+        f"{_JSON} core:streams apertura:nodes name hash rx_0 ../rx_0",
+    ),
     "track.csv": Parser("uav1.track.csv", seeds.tracks, lambda path: read_track(path, node="uav1"), _CSV, _TIMES),
     "track.pos": Parser(
         "uav1.track.pos",

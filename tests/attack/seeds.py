@@ -1,5 +1,6 @@
 """Small valid files of every format that a campaign brings, as bytes; real ones are added where they are at hand."""
 
+import hashlib
 import io
 import json
 import struct
@@ -101,7 +102,7 @@ def scans() -> list[bytes]:
 
 
 def sigmf_meta() -> list[bytes]:
-    """Return metadata of triggered captures, of a recorder that ran through, and of another maker."""
+    """Return metadata of triggered captures, of recorders that ran through, with headers between, of another maker."""
     header = {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6, "core:num_channels": 2}
     captures = [
         {"core:sample_start": 6 * n, "core:frequency": 1.2e9, "core:datetime": f"2025-05-14T09:30:0{n}.25Z"}
@@ -110,10 +111,14 @@ def sigmf_meta() -> list[bytes]:
     counted = [{**capture, "apertura:frame": n} for n, capture in enumerate(captures)]
     framing = {"apertura:framing": {"preamble": "raw/preamble.npy", **DESCRIBED}}
     names = {"apertura:channels": ["radar", "sidelink"]}
+    headed = [{**capture, "core:sample_start": 5 * n, "core:header_bytes": 8} for n, capture in enumerate(captures)]
+    real_valued = {"core:datatype": "rf32_le", "apertura:if_hz": 2.5e5}
     documents = (
         {"global": header, "captures": captures, "annotations": []},
         {"global": {**header, **names}, "captures": counted},
         {"global": {**header, **names, **framing}, "captures": captures[:1]},
+        {"global": {**header, "core:trailing_bytes": 0, "core:dataset": "uav1.sigmf-data"}, "captures": headed},
+        {"global": {**header, **framing, **real_valued}, "captures": captures[:1]},
     )
     made = [json.dumps(document, indent=1).encode() for document in documents]
     return [*made, *real("sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-meta")]
@@ -122,6 +127,18 @@ def sigmf_meta() -> list[bytes]:
 def sigmf_data() -> list[bytes]:
     """Return samples of all channels."""
     return [np.arange(1, SAMPLES * CHANNELS * 2 + 1, dtype="<i2").tobytes()]
+
+
+def sigmf_floats() -> list[bytes]:
+    """Return as many samples of all channels as float32."""
+    return [np.arange(1, SAMPLES * CHANNELS * 2 + 1, dtype="<f4").tobytes()]
+
+
+def sigmf_collections() -> list[bytes]:
+    """Return collections that list the first recording of `sigmf_meta`, as a node's and as it is."""
+    streams = [{"name": "rx_0", "hash": hashlib.sha512(sigmf_meta()[0]).hexdigest()}]
+    body = {"core:version": "1.2.0", "core:streams": streams}
+    return [json.dumps({"collection": body | more}).encode() for more in ({"apertura:nodes": {"uav1": "rx_0"}}, {})]
 
 
 def tracks() -> list[bytes]:

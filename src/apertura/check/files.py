@@ -9,7 +9,7 @@ from pathlib import Path
 from apertura.campaign import Campaign
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
-from apertura.ingest import RECORDERS
+from apertura.ingest import recording_files
 from apertura.paths import inside
 from apertura.settings import CONFIG, FLIGHTS, Flight, SampledWaveform
 
@@ -47,7 +47,12 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
     for node in flight.participants:
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
-        for path in promised_recording(campaign.root / "raw" / flight.name, node):
+        try:
+            promised = recording_files(campaign.root / "raw" / flight.name, node)
+        except CampaignError as problem:  # metadata that name files
+            yield problem
+            promised = ()
+        for path in promised:
             try:
                 inside(campaign.root, campaign.relative(path), where=campaign.root)
             except CampaignError as problem:  # a link
@@ -55,12 +60,6 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
                 continue
             yield from _readable(path, expected, remedy)
         yield from _found(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
-
-
-def promised_recording(folder: Path, node: str) -> list[Path]:
-    """Return the files of a node's recording in the format that is begun there, else in the first known one."""
-    rows = [[folder / f"{node}{suffix}" for suffix in row] for row in RECORDERS]
-    return next((row for row in rows if any(path.is_file() for path in row)), rows[0])
 
 
 def _found(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:

@@ -1,12 +1,15 @@
 """Whether the headers of recordings fit the waveform and the pairs."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest.recording import Recording
+from apertura.load.mixing import check_mixing
+from apertura.load.transmitted import transmitted
 from apertura.paths import inside
 from apertura.settings import CONFIG, OfdmWaveform, SampledWaveform
 
@@ -18,7 +21,12 @@ def check_recordings(inspected: Inspected) -> Iterator[CampaignError]:
     """Yield recordings that do not open, or were recorded at another carrier or sample rate than the waveform's."""
     yield from inspected.unopened
     waveform = inspected.waveform
-    for recording in inspected.recordings.values() if waveform else ():
+    if waveform is None:
+        return
+    sent = None
+    with suppress(CampaignError):  # of the file of what was sent other checks tell
+        sent = transmitted(inspected.campaign, waveform)
+    for recording in inspected.recordings.values():
         keys = (("sample_rate_hz", "core:sample_rate"), ("carrier_hz", "core:frequency"))
         recorded = recording.sample_rate_hz, recording.frequency_hz
         for (key, name), value in zip(keys, recorded, strict=True):
@@ -30,6 +38,11 @@ def check_recordings(inspected: Inspected) -> Iterator[CampaignError]:
                     expected=f"{asked:.6f}, as {CONFIG}: waveform.{key}",
                     remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
                 )
+        try:
+            if sent is not None:
+                check_mixing(recording.samples, sent.numerology, where=recording.files[0])
+        except CampaignError as problem:
+            yield problem
         preamble = recording.framing["preamble"] if recording.framing else None
         if not preamble:
             continue

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-Samples = NDArray[np.int16]
+Samples = NDArray[np.int16 | np.float32]
 Pulses = NDArray[np.int64]
 
 Read = Callable[[Pulses], Mapping[str, Samples]]
-"""Numbers of captures, ascending → channel → (capture, sample, 2) int16, I and Q from the start of the prefix."""
+"""Numbers of captures, ascending → channel → (capture, sample, 2), I and Q from the start of the prefix."""
 
 AT_ONCE = 64
 """Captures in work at a time: the caches hold them."""
@@ -72,11 +72,11 @@ class Saturation:
         self._samples: dict[str, int] = {}
 
     def count(self, iq: Mapping[str, Samples]) -> None:
-        """Count some captures, channel → (capture, sample, 2) int16."""
+        """Count some captures, channel → (capture, sample, 2)."""
         for name, samples in iq.items():
             self._samples[name] = self._samples.get(name, 0) + samples.size
             extremes = self._extremes.setdefault(name, [_Extreme(+1), _Extreme(-1)])
-            for extreme, value in zip(extremes, (int(samples.max()), int(samples.min())), strict=True):
+            for extreme, value in zip(extremes, (samples.max().item(), samples.min().item()), strict=True):
                 extreme.count(samples, value)
 
     @property
@@ -101,9 +101,9 @@ class _Extreme:
     """The largest or, with `sign` -1, the smallest value so far, and how often it occurred."""
 
     def __init__(self, sign: int) -> None:
-        self.sign, self.value, self.times = sign, -sign * (1 << 16), 0
+        self.sign, self.value, self.times = sign, -sign * np.inf, 0
 
-    def count(self, samples: Samples, value: int) -> None:
+    def count(self, samples: Samples, value: float) -> None:
         if self.sign * value < self.sign * self.value:
             return
         known = self.times if value == self.value else 0

@@ -7,19 +7,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.echo.captures import Samples as Captured
 from apertura.echo.framing import Framing
 from apertura.echo.trigger import find_preambles
 
 _SAMPLES_AT_ONCE = 2**18
-_BITS = 16
 
 
 class Samples(Protocol):
-    """(sample, 2) int16, I and Q: an array, or what reads slices of one from a file."""
+    """(sample, 2), I and Q: an array, or what reads slices of one from a file."""
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, span: slice, /) -> NDArray[np.int16]: ...
+    def __getitem__(self, span: slice, /) -> Captured: ...
 
 
 @dataclass(frozen=True)
@@ -42,16 +42,18 @@ class TriggeredCaptures:
 
 
 def trigger_captures(
-    samples: Samples, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float
+    samples: Samples, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float, sample_bits: int = 32
 ) -> TriggeredCaptures:
     """Return the symbols of a continuous recording that follow a preamble and end inside it.
 
     Parameters
     ----------
     samples
-        (sample, 2) int16, I and Q of the trigger's channel; read in blocks.
+        (sample, 2), I and Q of the trigger's channel; read in blocks.
     framing, symbol_samples, false_alarms_per_s
         As for `find_preambles`.
+    sample_bits
+        Of a sample of one channel as it was recorded.
     """
     detections = [
         detection
@@ -68,11 +70,11 @@ def trigger_captures(
         "false_alarms_per_s": false_alarms_per_s,
         "snr_db": round(float(np.median([one.snr_db for one in detections])), 2) if detections else None,
         "duty_cycle": duty_cycle,
-        "mean_rate_bit_s": 2 * framing.sample_rate_hz * _BITS * duty_cycle,  # I and Q of one channel
+        "mean_rate_bit_s": framing.sample_rate_hz * sample_bits * duty_cycle,  # of one channel
     }
     return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
 
 
-def _blocks(samples: Samples) -> Iterator[NDArray[np.int16]]:
+def _blocks(samples: Samples) -> Iterator[Captured]:
     for start in range(0, len(samples), _SAMPLES_AT_ONCE):
         yield samples[start : start + _SAMPLES_AT_ONCE]

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.echo.captures import Samples
+
 ABSENT = -1
 """Frame number of a pulse whose payload was not read."""
 
@@ -53,13 +55,13 @@ class Framing:
         """Return (sample,) complex64, the preamble as it arrives without delay."""
         return np.asarray(np.repeat(self.preamble, self.chip_samples) * self._carrier(0, len(self.preamble)))
 
-    def read_counter(self, samples: NDArray[np.int16]) -> int:
+    def read_counter(self, samples: Samples) -> int:
         """Return the frame number of a capture that starts with its preamble, -1 where a bit is not certain.
 
         Parameters
         ----------
         samples
-            (sample, 2) int16, at least preamble and payload.
+            (sample, 2), at least preamble and payload.
 
         Examples
         --------

@@ -173,7 +173,7 @@ def transfer_by_sidelink(
 
 
 def as_complex(iq: Samples) -> Complexes:
-    """Return (…, 2) int16 I and Q as complex64."""
+    """Return (…, 2) I and Q as complex64."""
     return np.ascontiguousarray(iq, np.float32).view(np.complex64)[..., 0]
 
 

@@ -9,10 +9,11 @@ from scipy import fft
 
 from apertura.echo.framing import Framing
 
-Samples = NDArray[np.int16]
+Samples = NDArray[np.int16 | np.float32]
 Complexes = NDArray[np.complex64]
 
 _SMALLEST_TRANSFORM = 2**16
+_SILENT = 1e-10  # of the energy of a window, under a preamble: rounding of its transform
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def find_preambles(
     Parameters
     ----------
     blocks
-        (sample, 2) int16 each, I and Q of the trigger's channel, one after the other, of any length.
+        (sample, 2) each, I and Q of the trigger's channel, one after the other, of any length.
     framing
         What was sent before each symbol.
     symbol_samples
@@ -104,7 +105,8 @@ def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[in
         matches = fft.ifft(fft.fft(window, size) * matched)[:fitting]
         energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
         under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
-        yield first, np.asarray(_power(matches) / np.maximum(under, 1e-6), np.float32)
+        silence = np.float32(_SILENT * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit
+        yield first, np.asarray(_power(matches) / np.maximum(under, silence), np.float32)
 
 
 def _power(samples: Complexes) -> NDArray[np.float32]:

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 RECORDERS: Mapping[tuple[str, ...], str] = {(".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf:open_sigmf"}
 """Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
+FINDERS: Mapping[tuple[str, ...], str] = {
+    (".sigmf-meta", ".sigmf-data"): "apertura.ingest.sigmf_collection:find_sigmf",
+}
+"""Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
+
 
 class LogFormat(NamedTuple):
     """How a flight log is recognised, and read."""
@@ -73,6 +78,22 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
 """waveform.format → how it is read."""
 
 
+def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
+    """Return the files of a node's recording in the format that is begun in a folder, else in the first known one.
+
+    Raises
+    ------
+    CampaignError
+        If metadata that name files cannot be read.
+    """
+    begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
+    row = next(begun, next(iter(RECORDERS)))
+    if row in FINDERS:
+        found: tuple[Path, ...] = pkgutil.resolve_name(FINDERS[row])(folder, node)
+        return found
+    return tuple(folder / f"{node}{suffix}" for suffix in row)
+
+
 def open_recording(files: Sequence[Path]) -> "Recording":
     """Open a recording; metadata and sizes are checked, samples are not read.
 
@@ -82,7 +103,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
         In the order of a row of `RECORDERS`.
     """
     names = [file.name for file in files]
-    row = next(row for row in RECORDERS if len(row) == len(names) and all(map(str.endswith, names, row)))
+    row = next(row for row in RECORDERS if len(row) == len(names) and names[0].endswith(row[0]))
     opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
     return opened
 

@@ -99,13 +99,16 @@ class Recording:
             If a capture holds only zeros, or the file ends before the last.
         """
         self._check_alive(captures)
+        layout, segments = self.samples.layout.kept()
         return xr.Dataset(
             {
+                **segments,
                 "start": ("pulse", captures.start),
                 "time": ("pulse", captures.time),
                 "frame": ("pulse", captures.frame),
             },
             attrs={
+                **layout,
                 "node": node,
                 "samples": str(self.samples.path),
                 "channels": self.channels,

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.echo.association import Association, associate
-from apertura.echo.captures import Read
+from apertura.echo.captures import Read, Samples
 from apertura.echo.demodulate import Numerology
 from apertura.errors import CampaignError
 from apertura.ingest.sample_file import SampleFile
+from apertura.ingest.sample_layout import SampleLayout
+from apertura.load.mixing import check_mixing
 from apertura.load.node_log import NodeLog, shortest_wave
 from apertura.load.transmitted import Transmitted
 from apertura.paths import inside
@@ -80,11 +82,13 @@ class Acquisition(NodeLog):
             )
         start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
 
-        def read(captures: NDArray[np.int64]) -> dict[str, NDArray[np.int16]]:
+        def read(captures: NDArray[np.int64]) -> dict[str, Samples]:
             iq = self.samples.captures(start[captures], length)
-            pairs = iq.view(np.int32)[..., 0]  # I and Q move together: one by one they cost more than their transform
+            # I and Q move together: one by one they cost more than their transform
+            both = np.dtype(f"i{2 * iq.itemsize}")
+            pairs = iq.view(both)[..., 0]
             return {
-                name: np.ascontiguousarray(pairs[:, :, place])[..., None].view(np.int16)
+                name: np.ascontiguousarray(pairs[:, :, place])[..., None].view(iq.dtype)
                 for name, place in places.items()
             }
 
@@ -113,9 +117,10 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
                 remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
             )
     path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
-    samples = SampleFile(path, len(raw.attrs["channels"]))
+    samples = SampleFile(path, len(raw.attrs["channels"]), SampleLayout.of(raw))
     _check_same(campaign, raw)
     settings, numerology = campaign.settings.nodes[node], sent.numerology
+    check_mixing(samples, numerology, where=recording)
     wave_m = shortest_wave(numerology.frequency_hz)
     return Acquisition(node, settings, track, log, wave_m, raw, samples, files, recording, numerology)
 
@@ -134,7 +139,8 @@ def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
 
 def _read_from(stage: xr.Dataset, files: Path) -> str:
     """Return the node's own files that a stage was read from; a preamble lies elsewhere."""
-    return " and ".join(name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}."))
+    own = [name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}.")]
+    return " and ".join(own or stage.attrs["inputs"])  # a collection may give other names
 
 
 def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:

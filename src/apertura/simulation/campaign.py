@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.atomic import replacement
-from apertura.errors import CampaignError
+from apertura.campaign_files import new_folder, write_config, write_csv_log, write_recording
 from apertura.geometry.geodesy import geodetic_from_ecef
 from apertura.simulation.continuous import continuous_blocks, recording_start_s
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.files import flight_truth, targets_truth, write_csv_log, write_pos_log, write_recording
+from apertura.simulation.files import flight_truth, targets_truth, write_pos_log
 from apertura.simulation.impairments import Adc
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.periodic import periodic_samples
@@ -44,16 +42,7 @@ def write_campaign(directory: Path, specification: CampaignSpecification, genera
     CampaignError
         If the folder holds something already.
     """
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise CampaignError(
-            "something is there already",
-            where=directory,
-            expected="a new or empty folder for the simulated campaign",
-            remedy="Remove it or choose another name.",
-        )
-    with replacement(directory) as root:
-        (root / "config").mkdir(parents=True)
-        (root / "raw").mkdir()
+    with new_folder(directory) as root:
         campaign = draw_campaign(specification, generator)
         _write_config(root, campaign)
         truth = _write_flights(root, campaign, generator)
@@ -76,14 +65,11 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             "height_datum": "ellipsoid",
         },
     }
-    text = yaml.safe_dump(document, sort_keys=False)
-    (root / "config" / "config.yaml").write_text(text, encoding="utf-8")
-    rows = [
-        "\t".join((flight.name, flight.kind, flight.transmitter, ",".join(flight.tracks)))
-        for flight in specification.flights
-    ]
-    table = "\n".join(("flight\tkind\ttransmitter\tnodes", *rows)) + "\n"
-    (root / "config" / "flights.tsv").write_text(table, encoding="utf-8")
+    write_config(
+        root,
+        document,
+        [(flight.name, flight.kind, flight.transmitter, flight.tracks) for flight in specification.flights],
+    )
     _write_segments(root, specification)
     name, sent = campaign.waveform.sent
     np.save(root / "raw" / name, sent)
@@ -143,7 +129,7 @@ def _write_samples(
             recording.channels, time_s, adc, generator, framing=framing, first_frame=flight.first_frame
         )
         begun = np.array([recording_start_s(recording.channels["radar"]) + draw.tag_error_s[0]])
-        captures: list[tuple[int, np.datetime64, int | None]] = [(0, _utc(flight, begun)[0], None)]
+        captures: list[tuple[int, np.datetime64, int | None]] = [(0, _to_us(_utc(flight, begun))[0], None)]
     else:
         kept = np.flatnonzero(draw.kept)
         tags = _utc(flight, time_s + draw.start_s + draw.tag_error_s)
@@ -151,11 +137,11 @@ def _write_samples(
         blocks = _captures(recording, adc, kept, generator, periodic=periodic)
         frames = [framing.counted(flight.first_frame + int(pulse)) if framing else None for pulse in kept]
         starts = range(0, len(kept) * waveform.capture_samples, waveform.capture_samples)
-        captures = list(zip(starts, tags[kept], frames, strict=True))
-    described = {}
+        captures = list(zip(starts, _to_us(tags[kept]), frames, strict=True))
+    described: dict[str, Any] = {"core:hw": "simulated direct-RF node"}
     if framing:  # what a trigger must know
         known = {"preamble": f"raw/{flight.name}/preamble.npy", "centre_hz": framing.centre_hz(waveform)}
-        described = {"apertura:framing": asdict(framing) | known}
+        described["apertura:framing"] = asdict(framing) | known
     write_recording(
         stem,
         blocks,
@@ -190,7 +176,8 @@ def _write_log(stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight) -> 
     time_s = np.arange(np.floor(-_LOG_MARGIN_S * rate_hz), np.ceil((last_s + _LOG_MARGIN_S) * rate_hz) + 1) / rate_hz
     geodetic = geodetic_from_ecef(phase_centre(campaign.specification.origin, path, time_s))
     if node.log_format == "csv":
-        write_csv_log(stem.with_name(f"{stem.name}.track.csv"), _utc(flight, time_s), geodetic, path.attitude(time_s))
+        logged = stem.with_name(f"{stem.name}.track.csv")
+        write_csv_log(logged, _to_us(_utc(flight, time_s)), geodetic, path.attitude(time_s))
     else:
         system = "GPST" if node.log_format == "pos" else "UTC"
         write_pos_log(stem.with_name(f"{stem.name}.track.pos"), _utc(flight, time_s), geodetic, system=system)
@@ -198,3 +185,8 @@ def _write_log(stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight) -> 
 
 def _utc(flight: SimulatedFlight, time_s: NDArray[np.float64]) -> NDArray[np.datetime64]:
     return np.asarray(np.datetime64(flight.start_utc, "ns") + np.rint(time_s * 1e9).astype("timedelta64[ns]"))
+
+
+def _to_us(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
+    """Return times as recorders and flight controllers write them, to microseconds."""
+    return times.astype("datetime64[us]")

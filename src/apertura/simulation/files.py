@@ -1,8 +1,6 @@
-"""The files of a simulated campaign: SigMF recordings, flight logs, and the truth for those who judge it."""
+"""What a simulated campaign has beside files like any other: RTKLIB logs, and the truth for those who judge it."""
 
-import hashlib
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,90 +28,8 @@ age(s)  ratio
 _POS_QUALITY = "   1  18   0.0050   0.0050   0.0100   0.0000   0.0000   0.0000   0.00  100.0"
 
 
-def write_recording(
-    stem: Path,
-    blocks: Iterable[NDArray[np.int16]],
-    captures: Sequence[tuple[int, np.datetime64, int | None]],
-    *,
-    channels: Sequence[str],
-    sample_rate_hz: float,
-    frequency_hz: float,
-    extra: dict[str, Any],
-) -> None:
-    """Write `stem`.sigmf-data and `stem`.sigmf-meta.
-
-    Parameters
-    ----------
-    stem
-        raw/<flight>/<node>; the file name is the node's name.
-    blocks
-        (sample, channel, 2) int16 counts of I and Q, in order; never held all at once.
-    captures
-        Of each trigger the first sample, the node's own UTC tag (datetime64[ns]) and the frame number sent, if any.
-    frequency_hz
-        RF frequency at baseband zero.
-    extra
-        More keys of the `apertura` namespace for the global object.
-
-    Notes
-    -----
-    Source: SigMF specification 1.2.
-    """
-    digest = hashlib.sha512()
-    with stem.with_name(f"{stem.name}.sigmf-data").open("wb") as stream:
-        for block in blocks:
-            data = np.ascontiguousarray(block, "<i2").tobytes()
-            digest.update(data)
-            stream.write(data)
-    header = {
-        "core:datatype": "ci16_le",
-        "core:sample_rate": sample_rate_hz,
-        "core:version": "1.2.5",
-        "core:num_channels": len(channels),
-        "core:sha512": digest.hexdigest(),
-        "core:description": f"{stem.parent.name} {stem.name}",
-        "core:hw": "simulated direct-RF node",
-        "core:extensions": [{"name": "apertura", "version": "0.1.0", "optional": True}],
-        "apertura:channels": list(channels),
-        "apertura:node": stem.name,
-        **extra,
-    }
-    segments = [
-        {
-            "core:sample_start": start,
-            "core:frequency": frequency_hz,
-            "core:datetime": f"{np.datetime_as_string(time_utc, 'us')}Z",
-            **({} if frame is None else {"apertura:frame": frame}),
-        }
-        for start, time_utc, frame in captures
-    ]
-    meta = {"global": header, "captures": segments, "annotations": []}
-    stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
-
-
-def write_csv_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, attitude_rad: Floats) -> None:
-    """Write a flight controller's log as .csv.
-
-    Parameters
-    ----------
-    time_utc
-        (epoch,) datetime64[ns], UTC.
-    geodetic
-        (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
-    attitude_rad
-        (epoch, 3) float64: roll, pitch, yaw (clockwise from north).
-    """
-    lines = ["time_utc,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,yaw_deg"]
-    turned = np.degrees(attitude_rad)
-    turned[:, 2] %= 360
-    for time, (latitude, longitude, height), (roll, pitch, yaw) in zip(time_utc, geodetic, turned, strict=True):
-        place = f"{latitude:.11f},{longitude:.11f},{height:.5f}"
-        lines.append(f"{np.datetime_as_string(time, 'us')}Z,{place},{roll:.4f},{pitch:.4f},{yaw:.4f}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
 def write_pos_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, *, system: str = "GPST") -> None:
-    """Write an RTKLIB solution, .pos, of the first columns of `write_csv_log`, in `system` GPST or UTC.
+    """Write an RTKLIB solution, .pos, of latitude, longitude and ellipsoidal height, in `system` GPST or UTC.
 
     Notes
     -----

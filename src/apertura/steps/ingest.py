@@ -70,7 +70,8 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
     samples, length = recording.samples.channel(recording.channels.index(channel)), waveform.capture_samples
-    captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate)
+    bits = 8 * recording.samples.sample_bytes // len(recording.channels)
+    captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)
     if not captures.start.size:
         raise CampaignError(
             f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",

@@ -1,0 +1,143 @@
+"""docs/formats.md says what the code reads: every key, column, format and kind, and no other."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apertura.errors import CampaignError
+from apertura.ingest import PHASE_HISTORIES, TRACKS, read_track
+from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.log_options import LogOptions
+from apertura.ingest.real_samples import EDGE, SETTLING
+from apertura.ingest.sample_layout import SampleLayout
+from apertura.ingest.sigmf_collection import Collection
+from apertura.ingest.sigmf_meta import Capture, Framing, Global
+from apertura.ingest.track import FIXES
+from apertura.leap_seconds import gps_ahead_s
+from apertura.settings import Flight, read_flights, read_segments
+from apertura.settings.clocks import read_clocks
+
+TEXT = (Path(__file__).parents[1] / "docs/formats.md").read_text(encoding="utf-8")
+
+
+def table(after):
+    """Return the rows of the first table behind a text, as lists of cells."""
+    part = TEXT[TEXT.index(after) :]
+    block = re.search(r"^\|.*\n\|[-|]+\n((?:\|.*\n)+)", part, re.M)[1]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
+
+
+def names(after):
+    """Return what the first column quotes."""
+    return [name for row in table(after) for name in re.findall(r"`([^`]+)`", row[0])]
+
+
+def required(after):
+    return {name for row in table(after) if row[1] == "yes" for name in re.findall(r"`([^`]+)`", row[0])}
+
+
+@pytest.mark.parametrize(
+    ("model", "after"),
+    [(Global, "Global object:"), (Capture, "Each of the captures:"), (Collection, "### Collections")],
+)
+def test_every_key_of_sigmf_that_is_read_is_told_and_no_other(model, after):
+    read = {field.alias: field.is_required() for field in model.model_fields.values()}
+    assert sorted(names(after)) == sorted(read)
+    assert required(after) == {alias for alias, must in read.items() if must}
+
+
+def test_every_key_of_framing_is_told():
+    assert names("A frame is preamble") == list(Framing.model_fields)
+
+
+def test_the_datatypes_that_are_told_are_those_that_are_read():
+    told = re.search(r"^Datatypes: .*?\. ", TEXT, re.M | re.S)[0]
+    kinds = set(re.findall(r"`([iuf]\d+)`", told))
+    read = set()
+    for kind in {f"{letter}{bits}" for letter in "iuf" for bits in (8, 16, 32, 64)}:
+        for order in ("", "_le", "_be"):
+            try:
+                assert SampleLayout(f"c{kind}{order}").stored.itemsize * 8 == int(kind[1:])
+            except ValueError:
+                continue
+            read.add(kind)
+            assert (order == "") is (kind[1:] == "8")
+    assert kinds == read
+    assert f"{SETTLING} samples" in TEXT
+    assert f"{100 * EDGE:g} % of the rate" in TEXT
+
+
+ROWS = {
+    "flights.tsv": {"flight": "f01", "kind": "image", "transmitter": "a", "nodes": "a,b"},
+    "segments.tsv": {"flight": "f01", "pair": "a-b", "start": "2025-05-14T09:30:00", "end": "2025-05-14T09:31:00"},
+    "clocks.tsv": {"flight": "f01", "node": "a", "offset_s": "1", "drift_ppm": "", "std_s": ""},
+}
+READERS = {
+    "flights.tsv": lambda path: read_flights(path, nodes=["a", "b"]),
+    "segments.tsv": lambda path: read_segments(path, flights=[Flight("f01", "image", "a", ("a", "b"))]),
+    "clocks.tsv": lambda path: read_clocks(path, flights=[Flight("f01", "image", "a", ("a", "b"))]),
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_table_of_the_config_has_the_columns_that_are_told_in_their_order(tmp_path, name):
+    columns = names(f"`{name}`")
+    assert set(columns) == set(ROWS[name])
+    line = "\t".join(ROWS[name][column] for column in columns)
+    (tmp_path / name).write_text("\t".join(columns) + f"\n{line}\n")
+    assert len(list(READERS[name](tmp_path / name))) == 1
+
+
+TIMES = {"time_utc": "2025-05-14T09:30:0{}", "time": "2025-05-14T09:30:0{}Z", "time_s": "{}"}
+PLACES = {
+    ("latitude_deg", "longitude_deg", "height_m"): ("48", "9", "60{}"),
+    ("x_m", "y_m", "z_m"): ("4200000", "660000", "474000{}"),
+    ("east_m", "north_m", "up_m"): ("1", "2", "{}"),
+}
+
+
+@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("place", PLACES)
+def test_a_csv_log_has_the_columns_that_are_told_and_needs_a_time_and_a_position(tmp_path, time, place):
+    told = names("Columns of CSV")
+    assert set(told) >= {*TIMES, *(name for group in PLACES for name in group)}
+    further = [name for name in told if name not in TIMES and not any(name in group for group in PLACES)]
+    cells = TIMES | dict(zip(place, PLACES[place], strict=True)) | dict.fromkeys(further, "1.5") | {"quality": "fix"}
+
+    def read(of):
+        lines = [",".join(cells[name].format(epoch) for name in of) for epoch in range(3)]
+        (tmp_path / "a.csv").write_text("\n".join([",".join(of), *lines]) + "\n")
+        options = LogOptions(start_utc="2025-05-14T09:30:00" if time == "time_s" else None)
+        return read_track(tmp_path / "a.csv", node="a", options=options)
+
+    columns = [time, *place]
+    track = read([*further, *columns])
+    assert {"position_std", "fix"} <= set(track)
+    assert np.isfinite(track.attitude.values).all()
+    read(columns)
+    for missing in columns:
+        with pytest.raises(CampaignError, match=missing if missing != time else "time_utc"):
+            read([name for name in columns if name != missing])
+
+
+@pytest.mark.parametrize(("formats", "section"), [(TRACKS, "## Flight logs"), (PHASE_HISTORIES, "## Phase history")])
+def test_every_format_is_told_with_its_suffixes(formats, section):
+    rows = {re.findall(r"`(\w+)`", row[0])[0]: row[1] for row in table(section)}
+    assert rows.keys() == formats.keys()
+    for name, row in formats.items():
+        assert set(re.findall(r"\.\w+", rows[name])) == set(row.suffixes if name in TRACKS else [row.suffix])
+
+
+def test_every_kind_of_solution_is_told_with_its_number():
+    assert {re.findall(r"`(\w+)`", row[0])[0]: int(row[1]) for row in table("| kind of solution")} == FIXES
+
+
+def test_leap_seconds_and_columns_of_patterns_are_as_told(tmp_path):
+    assert f"({gps_ahead_s(np.datetime64('2017-01-01', 'ns'))} since 2017)" in TEXT
+    part = TEXT[TEXT.index("## Beams") :]
+    columns = re.search(r"columns `(\w+)`.*?`(angle_deg)`.*?`(gain_db)`", part, re.S).groups()
+    rows = [f"{cut},{angle},0" for cut in ("azimuth", "elevation") for angle in (-9, 0, 9)]
+    (tmp_path / "horn.csv").write_text("\n".join([",".join(columns), *rows]) + "\n")
+    read_beam_pattern(tmp_path / "horn.csv")

@@ -1,0 +1,154 @@
+"""ap.write_campaign: what is given comes back, what is wrong is named, and nothing half-written is left."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sigmf
+from folders import complaint, contents
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import apertura as ap
+from apertura.campaign import Campaign
+from apertura.geometry.geodesy import geodetic_from_ecef
+from apertura.ingest import open_recording
+
+WAVEFORM = {
+    "kind": "ofdm",
+    "carrier_hz": 1.2e9,
+    "subcarriers": 8,
+    "subcarrier_spacing_hz": 1e6,
+    "symbol_s": 1e-6,
+    "cyclic_prefix_s": 0.5e-6,
+    "sample_rate_hz": 16e6,
+    "prf_hz": 1.0,
+}
+CONFIG = {"campaign": "c", "waveform": WAVEFORM, "nodes": {"uav1": {}, "uav2": {}}}
+CODES = np.ones(8)
+TAGS = ["2025-05-14T09:30:01", "2025-05-14T09:30:02.5", "2025-05-14T09:30:04"]
+NODE = ap.RecordedNode(
+    samples=np.arange(1, 3 * 24 * 2 + 1).reshape(3, 24, 1, 2).astype(np.int16),
+    time_utc=TAGS,
+    track=np.array([[48.0, 9.0, 600.0], [48.0, 9.001, 601.0]]),
+    track_utc=["2025-05-14T09:30:00", "2025-05-14T09:30:09"],
+)
+
+
+def write(folder, node=NODE, *, config=CONFIG, codes=CODES, **flight):
+    lines = {"transmitter": "uav1", "nodes": {"uav1": node}, **flight}
+    return ap.write_campaign(folder, config, {"f01": ap.RecordedFlight(**lines)}, sent=codes)
+
+
+def opened(folder):
+    campaign = Campaign.load(folder)
+    return open_recording(campaign.recording_files("f01", "uav1")), campaign.read_log("f01", "uav1")
+
+
+@pytest.mark.parametrize("dtype", ["int8", "int16", "int32", "float32", ">i2"])
+def test_samples_of_any_dtype_come_back_with_tags_frames_and_positions(tmp_path, dtype):
+    samples = (NODE.samples % 100).astype(dtype)
+    attitude = np.array([[1.0, 2.0, 359.0], [-1.0, -2.0, 1.0]])
+    made = write(tmp_path / "c", replace(NODE, samples=samples, frame=[7, 8, 10], attitude_deg=attitude))
+    recording, track = opened(made)
+    np.testing.assert_array_equal(recording.samples.captures(recording.captures.start, 24), samples)
+    np.testing.assert_array_equal(recording.captures.time, np.array(TAGS, "datetime64[ns]"))
+    assert recording.captures.frame.tolist() == [7, 8, 10]
+    np.testing.assert_allclose(geodetic_from_ecef(track.position.values), NODE.track, atol=1e-5)
+    np.testing.assert_allclose(np.degrees(track.attitude.values), attitude, atol=1e-4)
+    sigmf.fromfile(str(made / "raw/f01/uav1")).validate()
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(gaps=st.lists(st.integers(1, 10**12), min_size=1, max_size=9), between=st.integers(0, 5))
+def test_captures_come_back_to_the_nanosecond_whatever_lies_between_them(tmp_path_factory, gaps, between):
+    time = np.datetime64("2025-05-14T09:30:00", "ns") + np.cumsum(gaps).astype("timedelta64[ns]")
+    start = np.arange(len(gaps)) * (24 + between)
+    samples = np.random.default_rng(1).integers(1, 99, (start[-1] + 24 + between, 1, 2), dtype=np.int16)
+    node = replace(NODE, samples=samples, time_utc=time, start=start)
+    recording, _ = opened(write(tmp_path_factory.mktemp("written") / "c", node))
+    np.testing.assert_array_equal(recording.captures.time, time)
+    np.testing.assert_array_equal(recording.captures.start, start)
+    np.testing.assert_array_equal(recording.samples.read(0, len(samples)), samples)
+
+
+def test_samples_and_logs_may_lie_in_files(tmp_path):
+    np.save(tmp_path / "iq.npy", NODE.samples)
+    NODE.samples.astype("<i2").tofile(tmp_path / "iq.bin")
+    (tmp_path / "log.csv").write_text(
+        "time_utc,latitude_deg,longitude_deg,height_m\n2025-05-14T09:30:00Z,48,9,600\n2025-05-14T09:30:09Z,48,9,601\n"
+    )
+    for name in ("iq.npy", "iq.bin"):
+        given_files = replace(NODE, samples=tmp_path / name, track=tmp_path / "log.csv", track_utc=None)
+        recording, track = opened(write(tmp_path / f"of_{name}", given_files))
+        np.testing.assert_array_equal(recording.samples.captures(recording.captures.start, 24), NODE.samples)
+        assert track.sizes["epoch"] == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"samples": NODE.samples.astype(np.float64)}, "samples of float64, shape (3, 24, 1, 2); expected (sample, 1"),
+        ({"samples": NODE.samples[:, :, 0]}, "samples of int16, shape (3, 24, 2)"),
+        ({"channels": ("radar", "sidelink")}, "expected (sample, 2, 2) or (capture, sample, 2, 2)"),
+        ({"samples": np.zeros_like(NODE.samples)}, "3 captures of channel radar hold only zeros"),
+        ({"samples": "nowhere.iq"}, "nowhere.iq: no such file"),
+        ({"samples": NODE.samples.reshape(-1, 1, 2)[:-1]}, "71 samples, 3 captures; expected captures of equal length"),
+        ({"time_utc": TAGS[:2]}, "2 time tags, 3 starts and 2 frame numbers"),
+        ({"time_utc": TAGS[::-1]}, "capture 1 is tagged 2025-05-14T09:30:02.5"),
+        ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is no time"),
+        ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is no time"),
+        ({"time_utc": np.array(["3025-05-14"] * 3, "datetime64[s]")}, "is not between 1980 and 2199"),
+        ({"start": [0, 24, 480]}, "capture 2 starts at sample 480, the data end at 72"),
+        ({"frame": [1, 2]}, "and 2 frame numbers"),
+        ({"frame": [1, 2, -7]}, "captures.2.apertura:frame"),
+        ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected (2, 3)"),
+        ({"track": NODE.track * np.nan}, "0 epochs (2 left out: no fix)"),
+        ({"track_utc": NODE.track_utc[::-1]}, "an earlier time"),
+        ({"track": "nowhere.pos"}, "nowhere.pos: no such file"),
+        ({"attitude_deg": np.ones((3, 3))}, "attitude_deg of shape (3, 3)"),
+        ({"channels": ("sidelink",)}, "apertura:channels ['sidelink']"),
+    ],
+)  # fmt: skip
+def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, change, expected):
+    message = complaint(lambda: write(tmp_path / "c", replace(NODE, **change)))
+    assert expected in message
+    assert ".wip" not in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"config": CONFIG | {"scen": {}}}, "write_campaign: config: scen: unknown key (did you mean 'scene'?)"),
+        ({"config": CONFIG | {"waveform": WAVEFORM | {"prf_hz": "fast"}}}, "waveform.prf_hz"),
+        ({"codes": np.ones(7)}, "raw/codes.npy: complex64 of shape (7,)"),
+        ({"codes": None}, "raw/codes.npy: no such file"),
+        ({"transmitter": "uav3"}, "node 'uav3' is not in config/config.yaml: nodes"),
+        ({"transmitter": "uav2"}, "uav2.sigmf-meta: no such file"),
+        ({"kind": "picture"}, "kind 'picture' is neither image nor calibration"),
+        (
+            {"config": CONFIG | {"waveform": {"kind": "phase_history", "format": "afrl_mat"}}},
+            "waveform.kind phase_history; expected one recorded as samples",
+        ),
+        ({"config": CONFIG | {"waveform": WAVEFORM | {"codes": "../codes.npy"}}}, "leads out of the campaign folder"),
+    ],
+)
+def test_a_config_or_flight_that_cannot_be_is_named_and_nothing_is_left(tmp_path, change, expected):
+    message = complaint(lambda: write(tmp_path / "c", **change))
+    assert expected in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["../f01", "fused", "f 01", ""])
+def test_the_name_of_a_flight_leads_nowhere_else(tmp_path, name):
+    flights = {name: ap.RecordedFlight("uav1", {"uav1": NODE})}
+    complaint(lambda: ap.write_campaign(tmp_path / "c", CONFIG, flights, sent=np.ones(8)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_written_over(tmp_path):
+    made = write(tmp_path / "c")
+    before = contents(made)
+    assert "something is there already" in complaint(lambda: write(tmp_path / "c"))
+    assert contents(made) == before
