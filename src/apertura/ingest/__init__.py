@@ -58,11 +58,16 @@ class HistoryFormat(NamedTuple):
     """Whether the reader also takes described=, the section `waveform` of the config."""
     frame: str = ""
     """Of its positions, local or ecef; empty: the files say, or a flight log."""
+    waveform: str = "phase_history"
+    """waveform.kind that it belongs to."""
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "afrl_mat": HistoryFormat(".mat", "apertura.ingest.afrl:read_afrl_mat", frame="local"),
     "pulson": HistoryFormat(".out", "apertura.ingest.pulson:read_pulson"),
+    "beat_npy": HistoryFormat(".npy", "apertura.ingest.fmcw:read_beat_npy", described=True, waveform="fmcw"),
+    "beat_mat": HistoryFormat(".mat", "apertura.ingest.fmcw:read_beat_mat", described=True, waveform="fmcw"),
+    "beat_wav": HistoryFormat(".wav", "apertura.ingest.fmcw_wav:read_beat_wav", described=True, waveform="fmcw"),
 }
 """waveform.format → how it is read."""
 

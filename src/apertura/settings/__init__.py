@@ -11,7 +11,7 @@ from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
 from apertura.settings.section import Name, Section
 from apertura.settings.segments import SEGMENTS, Segment, read_segments
-from apertura.settings.waveform import OfdmWaveform, PhaseHistoryWaveform, Waveform
+from apertura.settings.waveform import FmcwWaveform, OfdmWaveform, PhaseHistoryWaveform, Waveform
 
 __all__ = [
     "CLOCKS",
@@ -24,6 +24,7 @@ __all__ = [
     "Calibration",
     "Clock",
     "Flight",
+    "FmcwWaveform",
     "LeverArms",
     "Name",
     "Node",
