@@ -41,7 +41,7 @@ from apertura.simulation.specification import read_specification
 from apertura.steps.calibration import calibrated
 from apertura.store import manifest_of, read_manifest, record_files
 
-from . import mutators, seeds
+from . import beats, mutators, seeds
 
 GRID = SceneGrid("EPSG:32632", 500030.0, 5400060.0, 2.0, (20, 20))
 FLIGHT = Flight("f01", "image", "uav1", seeds.NODES)
@@ -326,6 +326,10 @@ PARSERS: dict[str, Parser] = {
     "cphd": Parser("b.cphd", seeds.cphd, _cphd, (), _CPHD, True),
     "history.h5": Parser("b.h5", seeds.hdf5, _hdf5, (), "\x89HDF TREE SNOD HEAP GCOL OHDR FRHP transfer units", True),
     "history.zarr": Parser("b.zarr/transfer/zarr.json", seeds.zarr_arrays, _zarr, _JSON_TREE, _ZARR, True),
+    "beat.npy": Parser("uav1.npy", beats.arrays, beats.read_array, (), _NPY),
+    "beat.time.npy": Parser("uav1.time.npy", beats.times, beats.read_times, (), f"{_NPY} '<M8[ns]' '<M8[Y]' '<M8'"),
+    "beat.mat": Parser("uav1.mat", beats.matlab, beats.read_matlab, (), "MATLAB\x00 IM MI beat time \x0e\x00", True),
+    "beat.wav": Parser("uav1.wav", beats.sounds, beats.read_sound, (), "RIFF WAVE fmt\x20 data LIST RF64 ds64", True),
     "dem.tif": Parser("dem.tif", seeds.dems, _dem, (), _TIFF),
     "geoid.gtx": Parser("egm96.gtx", seeds.gtx_grids, _geoid),
     "geoid.tif": Parser("egm96.tif", seeds.tif_grids, _geoid, (), _TIFF),

@@ -66,6 +66,8 @@ class HistoryFormat(NamedTuple):
     """Whether the reader also takes described=, the section `waveform` of the config."""
     frame: str = ""
     """Of its positions, local or ecef; empty: the files say, or a flight log."""
+    waveform: str = "phase_history"
+    """waveform.kind that it belongs to."""
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
@@ -74,6 +76,9 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "cphd": HistoryFormat(".cphd", "apertura.ingest.cphd:read_cphd", described=True),
     "hdf5": HistoryFormat(".h5", "apertura.ingest.hdf5_history:read_hdf5_history"),
     "zarr": HistoryFormat(".zarr", "apertura.ingest.zarr_history:read_zarr_history"),
+    "beat_npy": HistoryFormat(".npy", "apertura.ingest.fmcw:read_beat_npy", described=True, waveform="fmcw"),
+    "beat_mat": HistoryFormat(".mat", "apertura.ingest.fmcw:read_beat_mat", described=True, waveform="fmcw"),
+    "beat_wav": HistoryFormat(".wav", "apertura.ingest.fmcw_wav:read_beat_wav", described=True, waveform="fmcw"),
 }
 """waveform.format → how it is read."""
 

@@ -6,6 +6,8 @@ import xarray as xr
 
 from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.dechirp import sweep_motion_flags
+from apertura.echo.missing_pulses import missing_flags
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
 from apertura.ingest import read_phase_history
@@ -69,17 +71,22 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     axes: dict[str, Any] = {
         name: (("pulse", "axis", "body"), log.body_axes(at)) for name, (log, beam) in beams.items() if beam
     }
-    counts: dict[str, Any] = {"used": len(at), "dropped": int((~placed.good).sum()), "reasons": placed.reasons}
+    left_out = {**history.attrs.get("dropped", {}), **placed.reasons}
+    counts: dict[str, Any] = {"used": len(at), "dropped": sum(left_out.values()), "reasons": left_out}
+    antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
+    lasting_s = history.attrs.get("sweep_used_s", 0.0)
+    missing = missing_flags(at.astype("datetime64[ns]").astype("int64"))
+    moved = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
     clock = campaign.clock(flight, rx.name)
     return history.assign(
         reference_delay=history.reference_delay - offset_s,
         path_limit=history.path_limit - offset_s * SPEED_OF_LIGHT_M_S,
-        tx_position=(("pulse", "axis"), tx.antenna("radar_tx", at)),
-        rx_position=(("pulse", "axis"), rx.antenna("radar_rx", at)),
+        tx_position=(("pulse", "axis"), antennas[0]),
+        rx_position=(("pulse", "axis"), antennas[1]),
         **axes,
     ).assign_attrs(
         frame=tx.track.attrs["frame"],
-        flags={**history.attrs["flags"], **placed.flags},
+        flags={**history.attrs["flags"], **placed.flags, **moved, **missing},
         positions=placed.report,
         pulses=counts,
         stated_offset_m=rx.settings.path_offset_m.radar,

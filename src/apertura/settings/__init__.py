@@ -6,18 +6,14 @@ Only `load`, `steps` and the command line see these objects; wings get plain arr
 from apertura.settings.clocks import CLOCK_COLUMNS, CLOCKS, Clock, read_clocks
 from apertura.settings.config import CONFIG, Settings, located, read_settings, validated
 from apertura.settings.flights import FLIGHTS, Flight, read_flights
+from apertura.settings.history_waveforms import FmcwWaveform, PhaseHistoryWaveform
 from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
 from apertura.settings.processing import Calibration, Processing
+from apertura.settings.sampled_waveforms import OfdmWaveform, PulseWaveform, SampledWaveform
 from apertura.settings.scene import Scene
 from apertura.settings.section import Name, Section
 from apertura.settings.segments import SEGMENTS, Segment, read_segments
-from apertura.settings.waveform import (
-    OfdmWaveform,
-    PhaseHistoryWaveform,
-    PulseWaveform,
-    SampledWaveform,
-    Waveform,
-)
+from apertura.settings.waveform import Waveform
 
 __all__ = [
     "CLOCKS",
@@ -30,6 +26,7 @@ __all__ = [
     "Calibration",
     "Clock",
     "Flight",
+    "FmcwWaveform",
     "LeverArms",
     "Name",
     "Node",

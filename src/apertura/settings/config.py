@@ -7,11 +7,12 @@ from pydantic import Field, model_validator
 
 from apertura import validation
 from apertura.documents import read_yaml
+from apertura.settings.history_waveforms import PhaseHistoryWaveform
 from apertura.settings.nodes import Node
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
 from apertura.settings.section import Name, Section, Title
-from apertura.settings.waveform import PhaseHistoryWaveform, Waveform
+from apertura.settings.waveform import Waveform
 
 CONFIG = Path("config/config.yaml")
 """Where the config lies in a campaign folder."""

@@ -1,0 +1,112 @@
+"""One scene, one flight and one band by FMCW and by OFDM: places, widths and sidelobes of the same three targets.
+
+python benchmarks/fmcw.py: the table of docs/theory/fmcw.md. 400 MHz from 2.2 GHz, 200 pulses along 10 m, 20 m away and
+10 m above; FMCW 20 µs sampled at 25 MHz, OFDM 1000 subcarriers of 400 kHz; no noise.
+"""
+
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from apertura.campaign import Campaign
+from apertura.echo.dechirp import Sweep
+from apertura.load.scene import open_scene
+from apertura.quality.point_targets import cut_through, find_peak
+from apertura.simulation import (
+    CampaignSpecification,
+    ImageGrid,
+    Origin,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    WaveformSpecification,
+    simulate,
+)
+from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
+from apertura.steps import echo, image, ingest, profile, refine, scene
+from apertura.store import open_stage
+
+TARGETS = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
+PULSES, PRF_HZ, SPEED_M_S, HALF_M, SPACING_M = 200, 100.0, 5.0, 3.5, 0.0625
+BAND = 2.2e9, 400e6
+
+
+def fmcw(root: Path, iq: str) -> np.ndarray:
+    """Write the campaign of a sweep; return where targets are, easting and northing."""
+    sweep = Sweep(*BAND, 20e-6, 25e6, iq)
+    nodes = {"uav1": (0.0, -20.0, 10.0)}
+    asked = {"speed_m_s": SPEED_M_S, "half_width_m": HALF_M, "spacing_m": SPACING_M}
+    flight = FmcwFlight(sweep, PRF_HZ, PULSES, nodes, TARGETS, **asked)
+    write_fmcw_campaign(root, flight, waveform={})
+    return np.add(flight.origin[:2], np.array(TARGETS)[:, :2])
+
+
+def ofdm(root: Path, _: str) -> np.ndarray:
+    """Write the campaign of a symbol; return where targets are, easting and northing."""
+    waveform = WaveformSpecification(1000, BAND[0], 400e3, 2.5e-6, 0.5e-6, 512e6, PRF_HZ)
+    start = -SPEED_M_S * (PULSES - 1) / PRF_HZ / 2
+    flight = SimulatedFlight("f01", "uav1", {"uav1": Straight((start, -20.0, 10.0), (SPEED_M_S, 0, 0))}, PULSES)
+    grid = ImageGrid("EPSG:32632", half_width_m=HALF_M, spacing_m=SPACING_M)
+    points = tuple(PointTarget(target) for target in TARGETS)
+    made = CampaignSpecification(
+        "ofdm", Origin(48.4, 9.95, 500.0), waveform, points, {"uav1": SimulatedNode()}, (flight,), grid
+    )
+    simulate(root, made)
+    truth = json.loads((root / "truth.json").read_text())["targets"]
+    return np.array([[target["x"], target["y"]] for target in truth])
+
+
+def formed(root: Path, window: str) -> tuple[Campaign, float]:
+    """Return the campaign with its image, and the processor's seconds for the echo."""
+    path = root / "config/config.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["processing"] = {"autofocus": False, "window": window}
+    path.write_text(yaml.safe_dump(document))
+    campaign = Campaign.load(root)
+    if campaign.settings.waveform.kind == "ofdm":
+        ingest.ingest(campaign, "f01", "uav1")
+    begun = time.process_time()
+    echo.echo(campaign, "f01", "uav1-uav1")
+    seconds = time.process_time() - begun
+    scene.scene(campaign)
+    profile.profile(campaign, "f01", "uav1-uav1")
+    refine.refine(campaign, "f01")
+    image.image(campaign, "f01", "uav1-uav1", threads=2)
+    return campaign, seconds
+
+
+def measured(campaign: Campaign, truth: np.ndarray) -> list[float]:
+    """Return the largest error of place (cm), and of the middle target widths (cm) and PSLR (dB) along and across."""
+    grid = open_scene(campaign).grid
+    pixels = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
+    errors, cuts = [], []
+    for east, north in truth:
+        row, column = (float(value) for value in grid.pixel_of(east, north))
+        peak = find_peak(pixels, round(row), round(column))
+        errors.append(100 * SPACING_M * np.hypot(peak.row - row, peak.column - column))
+        across = [
+            cut_through(pixels, peak, direction=one, spacing_m=SPACING_M, reach_m=2.0) for one in ((1, 0), (0, 1))
+        ]
+        cuts.append([*(100 * cut.width_m for cut in across), *(cut.pslr_db for cut in across)])
+    return [max(errors), *cuts[0]]
+
+
+if __name__ == "__main__":
+    print("waveform | window | place, cm | width along, across, cm | sidelobes along, across, dB | echo, CPU s")
+    for name, write, iq in (("FMCW, real", fmcw, "real"), ("FMCW, complex", fmcw, "complex"), ("OFDM", ofdm, "")):
+        for window in ("hann", "none"):
+            with tempfile.TemporaryDirectory() as folder:
+                root = Path(folder) / "campaign"
+                truth = write(root, iq)
+                campaign, seconds = formed(root, window)
+                error, along, across, *sides = measured(campaign, truth)
+            print(
+                f"{name} | {window} | {error:.2f} | {along:.1f}, {across:.1f} | {sides[0]:.1f}, {sides[1]:.1f} "
+                f"| {seconds:.2f}",
+                flush=True,
+            )

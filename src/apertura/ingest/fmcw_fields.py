@@ -1,0 +1,52 @@
+"""Beat signals in MATLAB and WAV files; run by `read_isolated`, and importing no more than that takes."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
+    """Return beat (sweep, sample), and time where there is one.
+
+    Parameters
+    ----------
+    path
+        MATLAB file, version 4 to 7.
+
+    Raises
+    ------
+    ValueError
+        If there is no such variable.
+    """
+    from scipy.io import loadmat
+
+    document = loadmat(path, variable_names=["beat", "time"])
+    if "beat" not in document:
+        raise ValueError("no variable called beat")
+    fields = {name: np.asarray(document[name]) for name in ("beat", "time") if name in document}
+    return {name: values.ravel() if name == "time" else values for name, values in fields.items()}
+
+
+def read_wav(path: Path) -> dict[str, NDArray[Any]]:
+    """Return rate (1,) float64 Hz and samples (sample, channel) as they were written.
+
+    Parameters
+    ----------
+    path
+        WAV file.
+
+    Raises
+    ------
+    ValueError
+        If it ends before its own header says so, or is otherwise none.
+    """
+    from scipy.io import wavfile
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wavfile.WavFileWarning)  # a file that was cut off is no more than a warning
+        warnings.filterwarnings("ignore", message="Chunk .* not understood", category=wavfile.WavFileWarning)
+        rate, samples = wavfile.read(path)
+    return {"rate": np.array([rate], np.float64), "samples": samples.reshape(len(samples), -1)}

@@ -1,0 +1,194 @@
+"""Beat signals of an FMCW radar over point targets, to the last term: no stop and go."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.dechirp import Sweep
+from apertura.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
+
+Floats = NDArray[np.float64]
+Place = tuple[float, float, float]
+
+_LOG_STEP_S = 0.1
+_LOG_MARGIN_S = 1.0
+
+
+@dataclass(frozen=True)
+class FmcwFlight:
+    """Nodes that fly side by side on straight lines past point targets; the first transmits, one clock sweeps them all.
+
+    Attributes
+    ----------
+    sweep
+        What is swept, and how it is mixed.
+    prf_hz, sweeps
+        Sweeps per second, and how many.
+    began
+        Of the first sweep, UTC.
+    nodes
+        Node → east, north, up at half of the flight, metres from the origin.
+    speed_m_s
+        Eastward.
+    targets
+        East, north, up, metres from the origin; amplitude 1 each.
+    crs, origin
+        Projected system, and easting, northing and ellipsoidal height of the origin.
+    half_width_m, spacing_m
+        Of the scene's grid about `middle`.
+    middle
+        East and north of the middle of the scene, metres from the origin.
+    """
+
+    sweep: Sweep
+    prf_hz: float
+    sweeps: int
+    nodes: Mapping[str, Place]
+    targets: Sequence[Place]
+    speed_m_s: float = 5.0
+    began: np.datetime64 = field(default_factory=lambda: np.datetime64("2025-05-14T09:30", "ns"))
+    crs: str = "EPSG:32632"
+    origin: Place = (570_000.0, 5_363_000.0, 500.0)
+    middle: tuple[float, float] = (0.0, 0.0)
+    half_width_m: float = 4.0
+    spacing_m: float = 0.125
+
+    @property
+    def start_s(self) -> Floats:
+        """When sweeps begin, (sweep,) seconds from `began`."""
+        return np.arange(self.sweeps) / self.prf_hz
+
+    def place(self, point: Place) -> Floats:
+        """Return a point as ECEF, (3,) float64 metres."""
+        east, north, up = np.add(self.origin, point)
+        at: Floats = ecef_from_projected(self.crs, np.array(east), np.array(north), np.array(up))
+        return at
+
+    def flown(self, node: str, time_s: Floats) -> Floats:
+        """Return where a node is, ECEF, (…, 3) float64 metres: uniform motion on a straight line."""
+        east, north, up = self.nodes[node]
+        here, later = self.place((east, north, up)), self.place((east + self.speed_m_s, north, up))
+        at: Floats = here + (time_s - self.start_s.mean())[..., None] * (later - here)
+        return at
+
+    def beats(self, node: str) -> NDArray[np.number]:
+        """Return the beat signals that a node records, (sweep, sample)."""
+        sender = next(iter(self.nodes))
+
+        def path_to(target: Place) -> Callable[[Floats], Floats]:
+            at = self.place(target)
+            legs = [sender, node]
+            return lambda time: sum(np.linalg.norm(self.flown(leg, time) - at, axis=-1) for leg in legs)
+
+        paths = [path_to(target) for target in self.targets]
+        return beat_signal(self.sweep, self.start_s, paths, [1.0] * len(paths))
+
+
+def write_fmcw_campaign(root: Path, flight: FmcwFlight, *, waveform: Mapping[str, Any]) -> Path:
+    """Write a campaign folder of beat signals as .npy, and return it.
+
+    Parameters
+    ----------
+    root
+        Where; it must not be there.
+    flight
+        What is flown and swept.
+    waveform
+        Keys of section waveform instead of those that fit.
+    """
+    import yaml
+
+    (root / "raw/f01").mkdir(parents=True)
+    (root / "config").mkdir()
+    time = flight.began + np.round(flight.start_s * 1e9).astype("timedelta64[ns]")
+    epoch_s = np.arange(-_LOG_MARGIN_S, flight.start_s[-1] + _LOG_MARGIN_S, _LOG_STEP_S)
+    for node in flight.nodes:
+        _write_log(root / f"raw/f01/{node}.track.csv", flight, node, epoch_s)
+        np.save(root / f"raw/f01/{node}.npy", flight.beats(node).astype("f4" if flight.sweep.iq == "real" else "c8"))
+        np.save(root / f"raw/f01/{node}.time.npy", time)
+    (root / "config" / "config.yaml").write_text(yaml.safe_dump(_config(flight, waveform)), encoding="utf-8")
+    names = list(flight.nodes)
+    line = f"f01\timage\t{names[0]}\t{','.join(names)}"
+    (root / "config/flights.tsv").write_text(f"flight\tkind\ttransmitter\tnodes\n{line}\n", encoding="utf-8")
+    return root
+
+
+def _config(flight: FmcwFlight, waveform: Mapping[str, Any]) -> dict[str, Any]:
+    east, north = (one + other for one, other in zip(flight.origin, flight.middle, strict=False))
+    half = flight.half_width_m
+    return {
+        "campaign": "fmcw",
+        "waveform": {"kind": "fmcw", "format": "beat_npy", **asdict(flight.sweep), **waveform},
+        "nodes": {node: {"attitude": "none"} for node in flight.nodes},
+        "scene": {
+            "crs": flight.crs,
+            "bounds_m": [east - half, north - half, east + half, north + half],
+            "spacing_m": flight.spacing_m,
+            "height_m": flight.origin[2],
+            "height_datum": "ellipsoid",
+        },
+    }
+
+
+def _write_log(path: Path, flight: FmcwFlight, node: str, epoch_s: Floats) -> None:
+    rows = [
+        f"{flight.began + np.timedelta64(round(second * 1e9), 'ns')}Z,{latitude:.11f},{longitude:.11f},{height:.6f}"
+        for second, (latitude, longitude, height) in zip(
+            epoch_s, geodetic_from_ecef(flight.flown(node, epoch_s)), strict=True
+        )
+    ]
+    path.write_text("\n".join(["time_utc,latitude_deg,longitude_deg,height_m", *rows]) + "\n", encoding="utf-8")
+
+
+def beat_signal(
+    sweep: Sweep, start_s: Floats, paths: Sequence[Callable[[Floats], Floats]], amplitudes: Sequence[float]
+) -> NDArray[np.number]:
+    """Return what is recorded of some echoes, sample by sample.
+
+    Parameters
+    ----------
+    sweep
+        What is swept, and how it is mixed.
+    start_s
+        (pulse,) float64, when each sweep begins, seconds.
+    paths
+        Per target: seconds, of any shape → total path of its echo that arrives then, metres.
+    amplitudes
+        Per target.
+
+    Returns
+    -------
+    ndarray
+        (pulse, sample), float64 or complex128 as `sweep.iq` says; an echo begins with its delay.
+
+    Notes
+    -----
+    Source: docs/theory/fmcw.md, eq. 1, from the phases of sent and received sweep, not from their expansion.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> sweep = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+    >>> beat_signal(sweep, np.zeros(1), [lambda t: np.full_like(t, 60.0)], [1.0]).shape
+    (1, 500)
+    """
+    elapsed = np.arange(sweep.whole) / sweep.sample_rate_hz
+    at = np.asarray(start_s)[:, None] + elapsed
+    reference = _phase(sweep, elapsed - sweep.reference_delay_s)
+    total = np.zeros(at.shape, np.complex128)
+    for path, amplitude in zip(paths, amplitudes, strict=True):
+        own = elapsed - path(at) / SPEED_OF_LIGHT_M_S
+        total += np.where(own >= 0, amplitude * np.exp(1j * (_phase(sweep, own) - reference)), 0)
+    if sweep.iq == "real":
+        return total.real
+    return total.conj() if sweep.iq == "conjugate" else total
+
+
+def _phase(sweep: Sweep, time_s: Floats) -> Floats:
+    """Return the phase of the sweep, radians, a time after it began."""
+    return 2 * np.pi * (sweep.start_hz * time_s + sweep.slope_hz_s * time_s**2 / 2)

@@ -1,0 +1,99 @@
+"""Beat signals as bytes in all their formats, and how a file of each is read."""
+
+import io
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import savemat, wavfile
+
+from apertura.echo.dechirp import Sweep
+from apertura.errors import CampaignError
+from apertura.ingest.fmcw import joined_sweeps, read_beat_npy, sweeps_of
+from apertura.ingest.fmcw_fields import read_beat_fields, read_wav
+from apertura.ingest.fmcw_wav import cut_sweeps
+
+SWEEP = Sweep(2.26e9, 330e6, 1e-3, 44_100.0)
+DESCRIBED = {
+    **asdict(SWEEP),
+    "prf_hz": 500.0,
+    "start_utc": "2025-05-14T09:30",
+    "trigger": {"sync_channel": 1, "beat_channel": 2, "edge": "rising", "threshold": 0.3},
+}
+_COUNT = 6
+
+
+def _beats() -> np.ndarray:
+    return np.cos(np.arange(_COUNT)[:, None] + 0.5 * np.arange(SWEEP.whole))
+
+
+def _saved(array: np.ndarray) -> bytes:
+    target = io.BytesIO()
+    np.save(target, array)
+    return target.getvalue()
+
+
+def arrays() -> list[bytes]:
+    """Return beats as .npy, of two types."""
+    return [_saved(_beats()), _saved((1000 * _beats()).astype("<i2"))]
+
+
+def times() -> list[bytes]:
+    """Return times of sweeps as .npy, written in two ways."""
+    seconds = 1.7e9 + 0.002 * np.arange(_COUNT)
+    return [_saved(seconds), _saved((1e9 * seconds).astype("datetime64[ns]"))]
+
+
+def matlab() -> list[bytes]:
+    """Return MATLAB files with and without times, one compressed."""
+    files = []
+    for fields in ({"beat": _beats()}, {"beat": _beats(), "time": 1.7e9 + 0.002 * np.arange(_COUNT)}):
+        target = io.BytesIO()
+        savemat(target, fields, do_compression="time" in fields)
+        files.append(target.getvalue())
+    return files
+
+
+def sounds() -> list[bytes]:
+    """Return recordings of a sound card, of two types."""
+    files = []
+    for dtype, scale in (("<i2", 8000), ("<f4", 0.5)):
+        high = np.zeros((_COUNT, 88))
+        high[:, 10 : 10 + SWEEP.whole] = 1
+        beat = np.zeros_like(high)
+        beat[:, 10 : 10 + SWEEP.whole] = _beats()
+        target = io.BytesIO()
+        wavfile.write(target, 44_100, (scale * np.stack([high.ravel(), beat.ravel()], 1)).astype(dtype))
+        files.append(target.getvalue())
+    return files
+
+
+def read_array(path: Path) -> Any:
+    """Read beats that come at a regular rate."""
+    return read_beat_npy([path], pair="a-a", described=DESCRIBED)
+
+
+def read_times(path: Path) -> Any:
+    """Read times beside beats that are as they should be."""
+    beside = path.with_name(path.name.replace(".time.npy", ".npy"))
+    beside.write_bytes(arrays()[0])
+    return read_beat_npy([beside, path], pair="a-a", described=DESCRIBED)
+
+
+def read_matlab(path: Path) -> Any:
+    """As `read_beat_mat`, in this process: whoever calls it lets it die."""
+    return joined_sweeps([sweeps_of(path, _fields(read_beat_fields, path))], pair="a-a", described=DESCRIBED)
+
+
+def read_sound(path: Path) -> Any:
+    """As `read_beat_wav`, in this process."""
+    sweeps = cut_sweeps(path, _fields(read_wav, path), DESCRIBED)
+    return joined_sweeps([sweeps], pair="a-a", described=DESCRIBED)
+
+
+def _fields(read: Any, path: Path) -> Any:
+    try:
+        return read(path)
+    except Exception as error:  # of whatever kind: there it is the last line of a process
+        raise CampaignError(str(error), path, "beat signals", "Copy it again.") from error

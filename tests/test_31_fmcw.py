@@ -1,0 +1,208 @@
+"""Files of beat signals: arrays, MATLAB and sound-card recordings hold the same sweeps, and wrong ones are named."""
+
+import re
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from folders import complaint
+from scipy.io import savemat, wavfile
+
+from apertura.echo.dechirp import Sweep, transfer_of
+from apertura.ingest import read_phase_history
+from apertura.ingest.fmcw_wav import trigger_starts
+from apertura.simulation.fmcw import beat_signal
+
+COFFEE = Sweep(2.26e9, 330e6, 20e-3, 44_100.0)
+"""The sweep of MIT's coffee-can radar."""
+
+BEGAN = np.datetime64("2025-05-14T09:30", "ns")
+TRIGGER = {"sync_channel": 1, "beat_channel": 2, "edge": "rising", "threshold": 0.3}
+
+
+def described(**changes):
+    own = {"kind": "fmcw", "prf_hz": None, "start_utc": "2025-05-14T09:30", "trigger": TRIGGER}
+    return {**asdict(COFFEE), **own, **changes}
+
+
+def echo(form, *paths, **changes):
+    return read_phase_history(form, paths, pair="a-a", described=described(**changes))
+
+
+def beats(start_s, sweep=COFFEE):
+    """A target that stands still 30 m away, another that comes."""
+    paths = [lambda time: np.full_like(time, 60.0), lambda time: 90.0 - 2 * time]
+    return beat_signal(sweep, np.asarray(start_s), paths, [1.0, 0.5])
+
+
+def sound(path, starts, *, count, scale=8000, dtype=np.int16, high_s=20e-3):
+    """Write what a sound card records: a sync channel that is high during sweeps, and the beats."""
+    rate = COFFEE.sample_rate_hz
+    samples = np.zeros((count, 2))
+    for start in starts:
+        first, last = int(np.ceil(start)), min(int(np.ceil(start + high_s * rate)), count)
+        samples[first:last, 0] = 1.0
+        late = replace(COFFEE, start_hz=COFFEE.start_hz)
+        exact = beats_from(late, (first - start) / rate, start / rate)
+        samples[first:last, 1] = exact[: last - first]
+    wavfile.write(path, int(rate), (samples * scale).astype(dtype))
+    return path
+
+
+def beats_from(sweep, late_s, start_s):
+    """A sweep whose first sample is taken `late_s` after its beginning."""
+    elapsed = np.arange(sweep.whole + 2) / sweep.sample_rate_hz + late_s
+    total = np.zeros(len(elapsed))
+    for path, amplitude in ((np.full_like(elapsed, 60.0), 1.0), (90.0 - 2 * (start_s + elapsed), 0.5)):
+        own = elapsed - path / 299_792_458.0
+        phase = [sweep.start_hz * at + sweep.slope_hz_s * at**2 / 2 for at in (own, elapsed)]
+        total += np.where(own >= 0, amplitude * np.cos(2 * np.pi * (phase[0] - phase[1])), 0)
+    return total
+
+
+STARTS_S = 0.05 + 0.040004 * np.arange(8)
+
+
+def test_arrays_and_matlab_hold_the_same_sweeps(tmp_path):
+    beat = beats(STARTS_S).astype("f4")
+    time = BEGAN + np.round(STARTS_S * 1e9).astype("timedelta64[ns]")
+    np.save(tmp_path / "a.npy", beat)
+    np.save(tmp_path / "a.time.npy", time)
+    savemat(tmp_path / "a.mat", {"beat": beat, "time": time.astype(np.int64) / 1e9})
+    array = echo("beat_npy", tmp_path / "a.npy", tmp_path / "a.time.npy")
+    matlab = echo("beat_mat", tmp_path / "a.mat")
+    np.testing.assert_array_equal(array.transfer, matlab.transfer)
+    np.testing.assert_array_equal(array.transfer, transfer_of(beat, COFFEE))
+    np.testing.assert_array_equal(array.time, time + np.timedelta64(round(COFFEE.middle_s * 1e9), "ns"))
+    assert np.abs(matlab.time.values - array.time.values).max() < np.timedelta64(1, "us")  # float64 seconds since 1970
+    assert matlab.frequency.values[0] == 2.26e9
+    assert array.attrs["dropped"] == {}
+
+
+def test_files_of_one_node_are_joined_each_with_its_times(tmp_path):
+    beat = beats(STARTS_S)
+    for part, rows in (("p1", slice(0, 5)), ("p2", slice(5, 8))):
+        np.save(tmp_path / f"a.{part}.npy", beat[rows])
+        np.save(tmp_path / f"a.{part}.time.npy", (BEGAN + (STARTS_S[rows] * 1e9).astype("timedelta64[ns]")))
+    both = echo("beat_npy", *sorted(tmp_path.glob("a*.npy")))
+    np.testing.assert_array_equal(both.transfer, transfer_of(beat, COFFEE))
+
+
+def test_without_times_sweeps_come_at_the_rate_stated_from_the_time_stated(tmp_path):
+    np.save(tmp_path / "a.npy", beats(STARTS_S))
+    stage = echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0)
+    middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
+    np.testing.assert_array_equal(stage.time, BEGAN + middle + np.arange(8) * np.timedelta64(40, "ms"))
+    unknown = echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0, start_utc=None)
+    assert unknown.time.values[0] == np.datetime64("1970-01-01", "ns") + middle
+
+
+def test_a_sound_card_holds_the_sweeps_between_its_samples(tmp_path):
+    starts = (STARTS_S + 0.00001) * COFFEE.sample_rate_hz
+    assert np.ptp(starts % 1) > 0.1
+    path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
+    stage = echo("beat_wav", path)
+    assert stage.sizes["pulse"] == len(starts)
+    assert stage.attrs["dropped"] == {}
+    begun = BEGAN + np.round((STARTS_S + 0.00001) * 1e9).astype("timedelta64[ns]")
+    middle = np.timedelta64(round(COFFEE.middle_s * 1e9), "ns")
+    within = np.timedelta64(round(0.51e9 / COFFEE.sample_rate_hz), "ns")  # such a sync edge says no more
+    assert np.abs(stage.time.values - middle - begun).max() <= within
+
+
+def test_of_a_sync_pulse_with_an_edge_that_is_sampled_the_fraction_counts(tmp_path):
+    starts = (STARTS_S + 0.00001) * COFFEE.sample_rate_hz
+    path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
+    rate, samples = wavfile.read(path)
+    number = np.arange(len(samples))
+    edges = [(number - edge) / 2 + 0.5 for start in starts for edge in (start, start + 882)]  # two samples wide
+    ramps = sum(sign * np.clip(edge, 0, 1) for edge, sign in zip(edges, [1, -1] * len(starts), strict=True))
+    wavfile.write(path, rate, np.stack([8000 * ramps, samples[:, 1]], 1).astype(np.int16))
+    stage = echo("beat_wav", path)
+    truth = transfer_of(beats(starts / COFFEE.sample_rate_hz), COFFEE) * 8000
+    inside = slice(40, -40)
+    error = np.abs(stage.transfer.values - truth)[:, inside].max() / 8000
+    assert error < 0.03
+    roughly = transfer_of(np.stack([samples[int(np.ceil(one)) :, 1][: COFFEE.whole] for one in starts]), COFFEE)
+    assert np.abs(roughly - truth)[:, inside].max() / 8000 > 0.3
+
+
+def test_sweeps_that_are_cut_short_are_left_out_and_counted(tmp_path):
+    starts = STARTS_S * COFFEE.sample_rate_hz
+    early = np.insert(starts, 4, starts[3] + 500)  # a trigger within a sweep
+    stage = echo("beat_wav", sound(tmp_path / "a.wav", early, count=int(starts[-1]) + 400, high_s=5e-3))
+    assert stage.attrs["dropped"] == {"incomplete": 2}
+    assert stage.sizes["pulse"] == 7
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32, np.uint8])
+def test_triggers_of_a_channel_that_swings_about_zero_and_of_any_type_are_found(tmp_path, dtype):
+    starts = STARTS_S * COFFEE.sample_rate_hz
+    path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
+    rate, samples = wavfile.read(path)
+    swings = np.where(samples[:, 0] > 0, -0.6, 0.4) * 100 + np.random.default_rng(1).normal(0, 3, len(samples))
+    own = np.stack([samples[:, 1] / 80, swings], 1) + (128 if dtype == np.uint8 else 0)
+    wavfile.write(path, rate, own.astype(dtype))
+    trigger = {"sync_channel": 2, "beat_channel": 1, "edge": "falling", "threshold": 0.3}
+    stage = echo("beat_wav", path, trigger=trigger)
+    assert stage.sizes["pulse"] == len(starts)
+    profile = np.abs(np.fft.ifft(stage.transfer.values * np.hanning(stage.sizes["subcarrier"]), axis=1))
+    assert set(profile[:, 1:].argmax(axis=1) + 1) == {round(60 / 299_792_458 * 330e6)}
+
+
+def test_a_click_beside_the_pulses_is_no_trigger():
+    sync = np.tile(np.r_[np.zeros(500), np.ones(500)], 5)
+    sync[1200] = 0.6  # beyond the middle, within the threshold
+    np.testing.assert_allclose(trigger_starts(sync, threshold=0.3), [499.5, 1499.5, 2499.5, 3499.5, 4499.5])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"beat": np.ones((8, 700))}, r"float64 of shape \(8, 700\): a sweep has 882 samples"),
+        ({"beat": np.ones((8, 882), "c8")}, "complex64 samples where waveform.iq is real"),
+        ({"beat": np.where(np.arange(8)[:, None] == 3, np.nan, np.ones((8, 882)))}, "sweep 3 holds what is no number"),
+        ({"beat": np.zeros((8, 882))}, "no sweep with a signal"),
+        ({"time": np.arange(7.0)}, "7 times for 8 sweeps"),
+        ({"time": np.r_[0.0, 2, 1, 3:8]}, "sweep 2 begins -1 s after another that lasts 0.02 s"),
+        ({"time": 1.7e9 + np.arange(8) / 128}, "sweep 1 begins 0.0078125 s after"),
+        ({"time": np.r_[0.0:7, np.nan]}, "time 7 is none between 1970 and 2199"),
+        ({"time": np.arange(8) * 10**18}, "time 1 is none between"),
+        ({"time": np.arange(8.0) * 1j}, "times as complex128"),
+        ({"time": None}, "no times of sweeps"),
+        ({"beat": None}, "no variable called beat"),
+    ],
+)
+def test_what_no_sweeps_can_be_is_refused(tmp_path, change, told):
+    fields = {"beat": beats(STARTS_S), "time": 1.7e9 + STARTS_S, **change}
+    savemat(tmp_path / "a.mat", {name: values for name, values in fields.items() if values is not None})
+    message = complaint(lambda: echo("beat_mat", tmp_path / "a.mat"))
+    assert re.search(told, message)
+    assert "a.mat" in message
+
+
+def test_times_alone_are_refused(tmp_path):
+    np.save(tmp_path / "a.time.npy", np.arange(8.0))
+    assert "times without beat signals" in complaint(lambda: echo("beat_npy", tmp_path / "a.time.npy"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"sample_rate_hz": 48_000.0}, "44100 samples/s"),
+        ({"trigger": TRIGGER | {"beat_channel": 3}}, "2 channels"),
+        ({"sweep_s": 0.1}, "8 triggers, none with a whole sweep"),
+        ({"start_utc": "soon"}, "waveform.start_utc"),
+    ],
+)
+def test_a_sound_file_that_does_not_fit_its_waveform_is_refused(tmp_path, changes, told):
+    starts = STARTS_S * COFFEE.sample_rate_hz
+    path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
+    assert told in complaint(lambda: echo("beat_wav", path, **changes))
+
+
+def test_a_sound_file_that_was_cut_off_is_refused(tmp_path):
+    starts = STARTS_S * COFFEE.sample_rate_hz
+    path = sound(tmp_path / "a.wav", starts, count=int(starts[-1]) + 1200)
+    path.write_bytes(path.read_bytes()[:-5000])
+    assert "not readable" in complaint(lambda: echo("beat_wav", path))

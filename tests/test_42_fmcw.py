@@ -1,0 +1,161 @@
+"""Beat signals of an FMCW radar, from their files to images: targets, sweeps that fall, mixers, motion."""
+
+import functools
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from folders import ROOT, complaint, edit_config, run_steps
+
+from apertura.campaign import Campaign
+from apertura.check import problems
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.echo.dechirp import Sweep, transfer_of
+from apertura.load.recorded import recorded_echo
+from apertura.load.scene import open_scene
+from apertura.quality.point_targets import find_peak
+from apertura.settings import validated
+from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
+from apertura.store import open_stage
+
+FAST = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+"""400 MHz about 2.4 GHz in 20 µs: gamma 2e13 Hz/s, real beats to 12.5 MHz, which are 187 m of path."""
+
+NEAR = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
+FLIGHT = FmcwFlight(FAST, 100.0, 200, {"uav1": (0.0, -20.0, 10.0)}, NEAR, spacing_m=0.0625, half_width_m=3.5)
+
+
+def written(tmp_path, flight=FLIGHT, **waveform):
+    root = write_fmcw_campaign(tmp_path / "campaign", flight, waveform=waveform)
+    edit_config(root, lambda document: document.update(processing={"autofocus": False}))
+    return root
+
+
+def image_of(root, pair="uav1-uav1"):
+    return open_stage(Campaign.load(root).stage("image", "f01", pair), "image")
+
+
+def peaks(root, flight, targets=None, pair="uav1-uav1"):
+    """East, north (m) from the origin and magnitude at the peak next to each target."""
+    grid, pixels = open_scene(Campaign.load(root)).grid, image_of(root, pair).image.values
+    found = []
+    for east, north, _ in targets or flight.targets:
+        row, column = grid.pixel_of(flight.origin[0] + east, flight.origin[1] + north)
+        peak = find_peak(pixels, round(float(row)), round(float(column)))
+        found.append(
+            (
+                east + (peak.column - float(column)) * flight.spacing_m,
+                north - (peak.row - float(row)) * flight.spacing_m,
+                abs(peak.value),
+            )
+        )
+    return np.array(found)
+
+
+def off(root, flight, pair="uav1-uav1"):
+    found = peaks(root, flight, pair=pair)
+    return np.abs(found[:, :2] - np.array(flight.targets)[:, :2]).max(), found[:, 2]
+
+
+@pytest.mark.parametrize(
+    "sweep",
+    [
+        FAST,
+        replace(FAST, iq="complex"),
+        replace(FAST, iq="conjugate", bandwidth_hz=-400e6, start_hz=2.6e9, settle_s=1e-6, reference_path_m=6.0),
+        replace(FAST, bandwidth_hz=-400e6, start_hz=2.6e9),
+    ],
+    ids=["real", "complex", "conjugate falling", "real falling"],
+)
+def test_targets_are_within_a_centimetre(tmp_path, sweep):
+    flight = replace(FLIGHT, sweep=sweep)
+    root = written(tmp_path, flight)
+    assert problems(root) == []
+    run_steps(root, exports=False)
+    error_m, heights = off(root, flight)
+    assert error_m < 0.01
+    assert heights == pytest.approx(1.0, abs=0.05)
+    assert set(image_of(root).attrs["quality"]["flags"]) <= {"sub_apertures"}
+
+
+@pytest.mark.parametrize("example", range(2))
+def test_the_configs_of_the_how_to_are_valid(example):
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/howto/fmcw.md").read_text(encoding="utf-8"), re.S)
+    assert len(blocks) == 2
+    document = {"campaign": "c", "nodes": {"a": {}}, **yaml.safe_load(blocks[example])}
+    assert validated(document, where="fmcw.md").waveform.kind == "fmcw"
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"bandwidth_hz": 0}, "no band above 0 Hz"),
+        ({"bandwidth_hz": -3e9}, "no band above 0 Hz"),
+        ({"settle_s": 21e-6}, "samples per sweep"),
+        ({"prf_hz": 60e3}, "longer than 1/prf_hz"),
+        ({"format": "afrl_mat"}, "choose beat_npy, beat_mat, beat_wav"),
+        ({"iq": "imaginary"}, "waveform.*iq"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_refused_by_its_key(tmp_path, changes, told):
+    root = written(tmp_path, replace(FLIGHT, sweeps=2), **changes)
+    assert re.search(told, complaint(lambda: Campaign.load(root)))
+
+
+def test_a_second_node_on_the_same_clock_sees_the_same_targets(tmp_path):
+    flight = replace(FLIGHT, nodes={"uav1": (0.0, -20.0, 10.0), "uav2": (3.0, -21.0, 11.0)})
+    root = written(tmp_path, flight)
+    run_steps(root, exports=False)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        error_m, heights = off(root, flight, pair)
+        assert error_m < 0.01
+        assert heights == pytest.approx(1.0, abs=0.05)
+
+
+def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path, monkeypatch):
+    """The frequency of its phase is gamma*tau lower: it stands at that much less of its distance along the track."""
+    east = 12.0
+    flight = replace(
+        FLIGHT,
+        nodes={"uav1": (0.0, -60.0, 10.0)},
+        targets=((east, 4.0, 0.0),),
+        middle=(east, 4.0),
+        half_width_m=2.0,
+    )
+    root = written(tmp_path, flight)
+    run_steps(root, exports=False)
+    assert off(root, flight)[0] < 0.01
+    monkeypatch.setattr("apertura.ingest.fmcw.transfer_of", functools.partial(transfer_of, deskewed=False))
+    kept = written(tmp_path / "kept", flight)
+    run_steps(kept, exports=False)
+    delay_s = 2 * np.linalg.norm(np.subtract(flight.targets[0], (0.0, -60.0, 10.0))) / SPEED_OF_LIGHT_M_S
+    short_m = east * FAST.slope_hz_s * delay_s / 2.4e9
+    assert short_m > 0.04
+    assert peaks(kept, flight)[0, 0] == pytest.approx(east - short_m, abs=0.005)
+
+
+def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
+    flight = replace(FLIGHT, sweep=replace(FAST, iq="complex"))
+    root = written(tmp_path, flight, iq="conjugate")
+    run_steps(root, exports=False)
+    assert {"echo_elsewhere", "unfocused"} & set(image_of(root).attrs["quality"]["flags"])
+
+
+def test_sweeps_so_slow_that_the_antenna_moves_are_flagged(tmp_path):
+    slow = replace(FLIGHT, sweep=Sweep(2.2e9, 400e6, 8e-3, 100e3), sweeps=120)
+    campaign = Campaign.load(written(tmp_path, slow))
+    flags = recorded_echo(campaign, "f01", "uav1-uav1").attrs["flags"]
+    assert set(flags) == {"sweep_motion"}
+    assert "0.64 wavelengths" in flags["sweep_motion"]
+
+
+def test_missing_sweeps_are_counted_and_flagged(tmp_path):
+    root = written(tmp_path)
+    beat = np.load(root / "raw/f01/uav1.npy")
+    beat[60:100] = 0
+    np.save(root / "raw/f01/uav1.npy", beat)
+    attrs = recorded_echo(Campaign.load(root), "f01", "uav1-uav1").attrs
+    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"silent": 40}}
+    assert set(attrs["flags"]) == {"pulses_missing"}
