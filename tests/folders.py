@@ -15,6 +15,7 @@ from apertura.campaign import Campaign
 from apertura.check.files import check_files
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
+from apertura.settings import SampledWaveform
 from apertura.simulation import (
     CampaignSpecification,
     Framing,
@@ -78,7 +79,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
     for flight in campaign.image_flights:
-        if campaign.settings.waveform.kind != "phase_history":
+        if isinstance(campaign.settings.waveform, SampledWaveform):
             for node in flight.nodes:
                 ingest.ingest(campaign, flight.name, node)
         for pair in flight.pairs:

@@ -1,5 +1,6 @@
 """The campaigns of examples/, whose configs are in the repository and whose data are not."""
 
+import runpy
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from apertura.campaign import Campaign
 from apertura.check import problems
 from apertura.ingest.optitrack import body_position
 from apertura.steps.align import align, keep
+from apertura.steps.verify import verify
 from apertura.store import open_stage
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -92,6 +94,17 @@ def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(
     config.write_text(config.read_text().replace("radar: 3.8225", f"radar: {stated['path_offset_m']:.4f}"))
     run_steps(rail_pass, exports=False)
     assert response(rail_pass, reflector(rail_pass))[0] < 0.10
+
+
+def test_targets_seen_from_a_real_px4_flight_are_within_a_centimetre(shared, tmp_path):
+    runpy.run_path(str(EXAMPLES / "px4_flight" / "replay.py"))["replay"](
+        shared / "px4_real_flight" / "esc_status_log.ulg", tmp_path / "replayed"
+    )
+    assert problems(tmp_path / "replayed") == []
+    run_steps(tmp_path / "replayed")
+    found = [row for row in verify(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
+    assert len(found) == 3
+    assert max(row.error_m for row in found) < 0.01
 
 
 def test_gotcha_is_without_problems(shared, tmp_path):

@@ -18,9 +18,9 @@ from apertura.simulation.specification import (
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
-    WaveformSpecification,
 )
 from apertura.simulation.trajectory import Waypoints
+from apertura.simulation.waveforms import WaveformSpecification
 
 FIRST_S, LAST_S = 5.6, 11.6
 """The leg of the flight that is imaged, from the log's first epoch."""
