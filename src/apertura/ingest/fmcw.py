@@ -181,7 +181,8 @@ def _check(one: Sweeps, sweep: Sweep) -> None:
         raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.whole} samples", one.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
         raise _error(f"{beat.dtype} samples where waveform.iq is {sweep.iq}", one.path)
-    bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
+    with np.errstate(invalid="ignore"):
+        bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
     if bad.size:
         raise _error(
             f"sweep {int(bad[0])} holds what is no number, or beyond {_LARGEST:g} ({bad.size} in all)", one.path

@@ -62,14 +62,16 @@ def cut_sweeps(path: Path, found: Mapping[str, NDArray[Any]], described: Mapping
     channels = {name: trigger[f"{name}_channel"] for name in ("sync", "beat")}
     if max(channels.values()) > samples.shape[1]:
         raise _error(f"{samples.shape[1]} channels", path, f"waveform.trigger's channels {[*channels.values()]}")
-    sync = samples[:, channels["sync"] - 1].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # what is no number stays none, and is refused as such
+        sync = samples[:, channels["sync"] - 1].astype(np.float64)
+        beat = samples[:, channels["beat"] - 1].astype(np.float32)
     falling = trigger["edge"] == "falling"
     starts = trigger_starts(-sync if falling else sync, threshold=trigger["threshold"])
     first, whole = np.ceil(starts).astype(np.int64), _whole(starts, sweep, len(samples))
     if not whole.any():
         raise _error(f"{len(starts)} triggers, none with a whole sweep of {sweep.whole} samples after it", path)
-    beat = samples[:, channels["beat"] - 1]
-    beat = beat.astype(np.float32) - (128 if beat.dtype == np.uint8 else 0)  # of 8 bits zero is 128
+    if samples.dtype == np.uint8:
+        beat -= 128  # of 8 bits that is zero
     rows = np.lib.stride_tricks.sliding_window_view(beat, sweep.whole)[first[whole]]
     time = beginning(described, path) + np.round(starts[whole] * (1e9 / rate)).astype("timedelta64[ns]")
     return Sweeps(path, rows, time, (first - starts)[whole] / rate, {"incomplete": int((~whole).sum())})

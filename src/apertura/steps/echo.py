@@ -12,7 +12,7 @@ from apertura.load.echo import PairEcho, pair_echo
 from apertura.load.recorded import recorded_echo
 from apertura.load.transmitted import transmitted
 from apertura.provenance import merged
-from apertura.settings import FmcwWaveform, PhaseHistoryWaveform
+from apertura.settings import SampledWaveform
 from apertura.steps.calibration import calibrated, calibration_spec
 from apertura.steps.stamping import stamped
 from apertura.store import finish, write_blocks, writing
@@ -24,7 +24,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     waveform = campaign.settings.waveform
     parents: list[xr.Dataset] = []
     calibration = calibrated(campaign, flight, pair)
-    if isinstance(waveform, PhaseHistoryWaveform | FmcwWaveform):
+    if not isinstance(waveform, SampledWaveform):
         files = [campaign.root / name for name in lineage.result.sources]
         formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
     else:
