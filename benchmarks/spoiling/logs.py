@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.campaign_files import write_csv_log
-from apertura.constants import GPS_UTC_LEAP_S
 from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.leap_seconds import gps_from_utc, utc_from_gps
 from apertura.simulation.scene import Origin
 
 Floats = NDArray[np.float64]
@@ -71,7 +71,8 @@ def read_log(path: Path) -> Log:
         return Log(_seconds(time), numbers[:, :3], numbers[:, 3:], (), (), time[0])
     header = tuple(line for line in lines if line.startswith("%"))
     rows = [line.split(maxsplit=5) for line in lines if not line.startswith("%")]
-    time = np.array([f"{row[0].replace('/', '-')}T{row[1]}" for row in rows], "datetime64[ns]") - _ahead(header)
+    time = np.array([f"{row[0].replace('/', '-')}T{row[1]}" for row in rows], "datetime64[ns]")
+    time = utc_from_gps(time) if _is_gpst(header) else time
     numbers = np.array([row[2:5] for row in rows], np.float64)
     return Log(_seconds(time), numbers, None, header, tuple(row[5] for row in rows), time[0])
 
@@ -84,7 +85,7 @@ def write_log(path: Path, log: Log) -> None:
         return
     lines = list(log.header)
     for at, (latitude, longitude, height), rest in zip(
-        time + _ahead(log.header), log.geodetic, log.quality, strict=True
+        gps_from_utc(time) if _is_gpst(log.header) else time, log.geodetic, log.quality, strict=True
     ):
         text = np.datetime_as_string(at, "ms").replace("-", "/").replace("T", " ")
         lines.append(f"{text}   {latitude:14.11f} {longitude:15.11f} {height:11.5f}   {rest}")
@@ -95,6 +96,6 @@ def _seconds(time: NDArray[np.datetime64]) -> Floats:
     return (time - time[0]).astype(np.float64) / 1e9
 
 
-def _ahead(header: tuple[str, ...]) -> np.timedelta64:
-    """Return how far the times of an RTKLIB solution are ahead of UTC."""
-    return np.timedelta64(GPS_UTC_LEAP_S if header[-1].split()[1] == "GPST" else 0, "s")
+def _is_gpst(header: tuple[str, ...]) -> bool:
+    """Return whether the times of an RTKLIB solution are GPS time."""
+    return header[-1].split()[1] == "GPST"

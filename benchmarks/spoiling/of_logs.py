@@ -1,6 +1,6 @@
 """Mistakes in flight logs: time, place, attitude, noise, gaps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -136,17 +136,25 @@ def retimed(change: Callable[[Floats], Floats]) -> Change:
     return lambda log: replace(log, time_s=change(log.time_s))
 
 
-def relabelled(system: str) -> Spoil:
+def relabelled(said: str, *, meant: str = "GPST") -> Spoil:
     """Return what lengthens both logs by 20 s and has the header of the RTKLIB solution name another time system."""
 
     def spoil(folder: Folder) -> None:
         folder.edit_log(TX, lambda log: longer(log, 20.0))
         folder.edit_log(RX, lambda log: longer(log, 20.0))
+        folder.edit_log(RX, lambda log: replace(log, header=_named(log.header, meant)))
         path = next((folder.root / "raw" / "f01").glob(f"{RX}.track.pos"))
-        text = path.read_text(encoding="utf-8")
-        path.write_text(text.replace("GPST", system.ljust(4)), encoding="utf-8")
+        lines = path.read_text(encoding="utf-8").splitlines()
+        count = sum(line.startswith("%") for line in lines)
+        path.write_text("\n".join([*_named(lines[:count], said), *lines[count:]]) + "\n", encoding="utf-8")
 
     return spoil
+
+
+def _named(header: Sequence[str], system: str) -> tuple[str, ...]:
+    """Return the header of an RTKLIB solution whose times are of another system."""
+    now = header[-1].split()[1]
+    return (*header[:-1], header[-1].replace(now, system, 1))
 
 
 def swap_tracks(folder: Folder) -> None:
@@ -199,6 +207,7 @@ MISTAKES = {
     "tracks_late_0s1": Mistake("both logs 0.1 s late", logs(late(0.1), *BOTH), "time", alike=("sample",)),
     "gpst_for_utc_both": Mistake("GPST taken for UTC in both logs", logs(late(18.0), *BOTH), "time"),
     "gpst_for_utc_rx": Mistake("GPST taken for UTC in the solution", relabelled("UTC"), "time"),
+    "utc_for_gpst_rx": Mistake("UTC taken for GPST in the solution", relabelled("GPST", meant="UTC"), "time"),
     "utc_for_gpst_tx": Mistake("UTC taken for GPST in one log", logs(late(-18.0), TX), "time"),
     "noise_4cm": Mistake("4 cm of track noise in both logs", logs(noisy(0.04), *BOTH)),
     "noise_2cm": Mistake("2 cm of track noise in both logs", logs(noisy(0.02), *BOTH)),
