@@ -170,6 +170,24 @@ def check(
 
 
 @app.command()
+def inspect(
+    path: Annotated[Path, typer.Argument(help="a recording, a flight log, phase history, a DEM, a folder, a campaign")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="what a log cannot say of itself, as nodes.<n>.log does"),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+) -> None:
+    """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
+    plot = None if plot is None else plot.absolute()
+    path = leave_working_folder(path)
+    from apertura.inspection.command import inspect_path
+
+    raise SystemExit(inspect_path(path, settings or (), plot=plot, as_json=as_json))
+
+
+@app.command()
 def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
     """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
     opened = _opened(campaign)  # before anything large is imported, see `leave_working_folder`
