@@ -96,14 +96,18 @@ def bounds(position_m: NDArray[np.float64], frame: str) -> dict[str, list[float]
     return {name: [float(one.min()), float(one.max())] for name, one in zip(names, values.T, strict=True)}
 
 
-def east_north_up(position_m: NDArray[np.float64], frame: str) -> NDArray[np.float64]:
-    """Return (n, 3) positions as metres to east, north and up: of their median on Earth, else of the frame's origin.
+def east_north_up(position_m: NDArray[np.float64], frame: str, middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 3) positions as metres to east and north of a place on Earth, and height above the ellipsoid.
 
-    Up is height: above the ellipsoid on Earth.
+    In a frame without a place on Earth they are its axes as they stand.
+
+    Examples
+    --------
+    >>> east_north_up(np.array([[6378147.0, 30.0, 40.0]]), "ecef", np.array([6378137.0, 0.0, 0.0])).round(3)[:, :2]
+    array([[30., 40.]])
     """
     if frame != "ecef":
         return position_m
-    middle = np.median(position_m, axis=0)
     north_east = ((position_m - middle) @ ned_axes(middle))[:, :2]
     return np.column_stack([north_east[:, ::-1], geodetic_from_ecef(position_m)[:, 2]])
 

@@ -2,7 +2,9 @@
 
 import stat
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from apertura.errors import CampaignError, explained, quoted, shown
@@ -93,24 +95,24 @@ def _told(error: Exception, path: Path) -> CampaignError:
 
 
 def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    """Yield kind, format and reader for every row of the tables that a name fits."""
+    """Yield kind, format and reader for every row of the tables that a name fits; of a format typed that alone."""
+    if "format" not in beside.asked:
+        yield from _of_recorders(path, beside)
+    if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.asked):
+        with suppress(CampaignError):  # none that is known
+            yield "flight log", log_format(path, beside.options), partial(_log, path, beside)
+    yield from _others(path)
+
+
+def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
     for row in RECORDERS:
         suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
         if suffix is not None:
             files = [path.with_name(path.name.removesuffix(suffix) + one) for one in row]
-            yield "recording", row[0].lstrip("."), lambda files=files: _recording(files, beside)
-    for name, row_ in PHASE_HISTORIES.items():
-        if path.name.endswith(row_.suffix):
-            yield "phase history", name, lambda name=name: _history(path, name, beside)
-    if path.is_dir():
-        return
-    try:
-        name = log_format(path, beside.options)
-    except CampaignError:
-        pass
-    else:
-        yield "flight log", name, lambda: _log(path, beside)
-    yield from _others(path)
+            yield "recording", row[0].lstrip("."), partial(_recording, files, beside)
+    for name, history in PHASE_HISTORIES.items():
+        if path.name.endswith(history.suffix):
+            yield "phase history", name, partial(_history, path, name, beside)
 
 
 def _recording(files: Sequence[Path], beside: Surroundings) -> Report:
@@ -137,9 +139,9 @@ def _others(path: Path) -> Iterator[tuple[str, str, Reader]]:
     from apertura.inspection.elevation import SUFFIXES, elevation_report
 
     if path.suffix.lower() in SUFFIXES:
-        yield "elevation model", "", lambda: elevation_report(path)
+        yield "elevation model", "", partial(elevation_report, path)
     if path.suffix == SUFFIX:
-        yield "array", "", lambda: array_report(path)
+        yield "array", "", partial(array_report, path)
 
 
 def _size(path: Path) -> dict[str, int]:

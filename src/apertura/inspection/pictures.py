@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
+from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import shown
 from apertura.geometry.track_checks import LONG_GAP
 from apertura.ingest.track import FIXES
@@ -45,25 +47,35 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     grid = figure.add_gridspec(2, 2)
     plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     steps = figure.add_subplot(grid[1, 1], sharex=height)
-    place, times = east_north_up(track.position.values, track.attrs["frame"]), track.time.values
-    at_s, late = seconds(times), gaps(times, LONG_GAP)
+    position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
+    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
     for label, own in _by_fix(track).items():
-        style = {"color": _COLOURS[label], "label": f"{label}, {int(own.sum())} epochs", "markersize": 2.5}
-        plan.plot(place[own, 0], place[own, 1], ".", **style)
-        height.plot(at_s[own], place[own, 2], ".", **style)
-    for number, epoch in enumerate(late):
+        told, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
+        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=told, markersize=2.5)
+        height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
+    for number, epoch in enumerate(gaps(times, LONG_GAP)):
         ends = slice(epoch - 1, epoch + 1)
         plan.plot(*place[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
         height.axvspan(*at_s[ends], color="red", alpha=0.2)
     plan.plot(*place[0, :2], "k^", label="first epoch")
-    earth = track.attrs["frame"] == "ecef"
+    earth = frame == "ecef"
     _named(plan, "east of the median, m" if earth else "east, m", "north of the median, m" if earth else "north, m")
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
     _named(height, "", "height above the ellipsoid, m" if earth else "up, m")
-    steps.semilogy(at_s[1:], np.diff(at_s), "k.", markersize=2)
+    _intervals(steps, at_s[1:], times)
     _named(steps, f"seconds since {utc(times[0])}", "since the epoch before, s")
     return figure
+
+
+def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]) -> None:
+    """Draw the times between neighbours, seconds: from zero, or by decades where they differ by more than that."""
+    steps = np.diff(times) / np.timedelta64(1, "s")
+    axes.plot(across, steps, "k.", markersize=2.5)
+    if steps.max() > 10 * steps.min():
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0, 1.2 * float(steps.max()))
 
 
 def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
@@ -76,26 +88,33 @@ def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
 
 def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name: str) -> Figure:
     """Return the times between captures, and the amplitude of the first captures in each channel."""
-    count = len(recording.channels)
-    figure = _figure(name, (11, 3 + 2.5 * count))
-    axes = figure.subplots(count + 1, 1)
-    times = recording.captures.time
-    axes[0].plot(np.arange(1, len(times)), np.diff(seconds(times)) * 1e3, "k.", markersize=2.5)
-    for capture in gaps(times, LOST)[:100]:
-        axes[0].axvline(capture, color="red", linewidth=0.6)
-    typical_ms = interval_s(times) * 1e3
-    if np.isfinite(typical_ms):
-        axes[0].axhline(typical_ms, color="tab:blue", linewidth=0.8, label=f"typical {typical_ms:.6g} ms")
-        axes[0].legend(loc="best", fontsize="small")
-    _named(
-        axes[0], f"capture; the first at {utc(times[0])}; red: captures are missing before", "since the one before, ms"
-    )
-    for number, channel in enumerate(recording.channels):
-        level = _decibels(samples[:, :, number])
-        length_us = samples.shape[1] / recording.sample_rate_hz * 1e6
-        _image(axes[number + 1], level, (0.0, length_us), f"dB under the largest, {shown(channel)}")
-        _named(axes[number + 1], "time in the capture, µs", "capture")
+    several = len(recording.captures.time) > 1
+    count = len(recording.channels) + several
+    figure = _figure(name, (11, 0.5 + 2.7 * count))
+    axes = list(np.ravel(figure.subplots(count, 1)))
+    if several:
+        _captures(axes.pop(0), recording.captures.time)
+    length_us = samples.shape[1] / recording.sample_rate_hz * 1e6
+    for channel, own, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
+        level_db, label = _decibels(values), f"dB under the largest, {shown(channel)}"
+        if several:
+            _image(own, level_db, (0.0, length_us), label)
+            _named(own, "time in the capture, µs", "capture")
+        else:
+            own.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
+            _named(own, f"time since {utc(recording.captures.time[0])}, µs", label)
     return figure
+
+
+def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
+    """Draw the times between captures; red where some are missing."""
+    _intervals(axes, np.arange(1, len(times)), times)
+    for capture in gaps(times, LOST)[:_ROWS]:
+        axes.axvline(capture, color="red", linewidth=0.6)
+    typical_s = interval_s(times)
+    axes.axhline(typical_s, color="tab:blue", linewidth=0.8, label=f"typical: {typical_s:.6g} s")
+    axes.legend(loc="lower right", fontsize="small")
+    _named(axes, f"capture; the first at {utc(times[0])}; red: some are missing before", "since the one before, s")
 
 
 def draw_history(echo: "xr.Dataset", name: str) -> Figure:
@@ -103,24 +122,30 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     figure = _figure(name, (11, 5))
     profiles, plan = figure.subplots(1, 2, width_ratios=(1.6, 1))
     pulses = np.unique(np.linspace(0, echo.sizes["pulse"] - 1, _ROWS).astype(int))
-    transfer = np.asarray(echo.transfer[pulses].values)
-    frequency = echo.frequency.values
+    transfer, frequency = np.asarray(echo.transfer[pulses].values), echo.frequency.values
     window = np.hanning(frequency.size + 2)[1:-1]
     profile = np.fft.fftshift(np.fft.ifft(transfer * window, axis=1), axes=1)
-    reach_m = 299_792_458.0 / max(float(np.diff(frequency[:2]).sum()), 1e-9) / 2
+    reach_m = SPEED_OF_LIGHT_M_S * (frequency.size - 1) / max(float(np.ptp(frequency)), 1.0) / 2
     _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest")
     _named(profiles, "path beyond the reference, m", f"pulse ({len(pulses)} of {echo.sizes['pulse']})")
     if "tx_position" not in echo:
         plan.text(0.5, 0.5, "no positions: a flight log says them", ha="center", transform=plan.transAxes)
         plan.set_axis_off()
         return figure
-    for leg, style in (("tx_position", "k."), ("rx_position", "r.")):
-        place = east_north_up(echo[leg].values, echo.attrs["frame"])
-        plan.plot(place[:, 0], place[:, 1], style, markersize=2, label=leg.removesuffix("_position"))
-    _named(plan, "east, m", "north, m")
+    _antennas(plan, echo)
+    return figure
+
+
+def _antennas(plan: "Axes", echo: "xr.Dataset") -> None:
+    """Draw where both antennas were, about the middle of the transmitting one."""
+    frame, middle = echo.attrs["frame"], np.median(echo.tx_position.values, axis=0)
+    for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
+        place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
+        plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
+    about = " of the middle" if frame == "ecef" else ""
+    _named(plan, f"east{about}, m", f"north{about}, m")
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
-    return figure
 
 
 def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str) -> Figure:
@@ -164,6 +189,10 @@ def _named(axes: "Axes", across: str, up: str) -> None:
     axes.set_xlabel(across, parse_math=False)
     axes.set_ylabel(up, parse_math=False)
     axes.grid(visible=True, linewidth=0.3)
+    for axis in (axes.xaxis, axes.yaxis):
+        digits = axis.get_major_formatter()
+        if isinstance(digits, ScalarFormatter):
+            digits.set_useOffset(False)
 
 
 def _decibels(values: NDArray[np.complexfloating]) -> Floats:
