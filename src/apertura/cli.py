@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
+app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
@@ -167,24 +168,6 @@ def check(
     from apertura.check import print_findings
 
     raise SystemExit(2 if print_findings(campaign, products=products, paranoid=paranoid) else 0)
-
-
-@app.command()
-def inspect(
-    path: Annotated[Path, typer.Argument(help="a recording, a flight log, phase history, a DEM, a folder, a campaign")],
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="what a log cannot say of itself, as nodes.<n>.log does"),
-    ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
-) -> None:
-    """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
-    plot = None if plot is None else plot.absolute()
-    path = leave_working_folder(path)
-    from apertura.inspection.command import inspect_path
-
-    raise SystemExit(inspect_path(path, settings or (), plot=plot, as_json=as_json))
 
 
 @app.command()

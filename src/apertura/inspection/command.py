@@ -1,13 +1,17 @@
 """`apertura inspect`: the report printed, as text or JSON, and its preview drawn."""
 
 import json
+import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, shown
 from apertura.inspection.look import look
-from apertura.inspection.report import Report, print_report
+from apertura.inspection.report import print_report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def inspect_path(path: Path, settings: Sequence[str] = (), *, plot: Path | None = None, as_json: bool = False) -> int:
@@ -32,18 +36,15 @@ def inspect_path(path: Path, settings: Sequence[str] = (), *, plot: Path | None 
     if plot is not None and (plot.suffix.lower() != ".png" or plot == path or (plot.exists() and not _is_png(plot))):
         found = "a file that is no picture" if plot.exists() else "another suffix than .png"
         raise CampaignError(found, f"--plot {plot}", "the name of a new .png file", "Choose another name.")
+    logging.getLogger("apertura.ingest").addHandler(logging.NullHandler())  # remarks of readers are in the report
     report = look(path, settings)
-    drawn = plot is not None and report.picture is not None
-    if plot is not None and report.picture is not None:
-        _draw(report, plot)
-    if plot is not None and not drawn:
-        report = replace(report, missing=(*report.missing, "a preview: there is nothing to draw"))
+    drawn = None if plot is None or report.picture is None else _drawn(report.picture(), plot)
     if as_json:
-        print(json.dumps(report.as_json(), indent=1, allow_nan=False))
+        print(json.dumps(report.as_json() | {"plot": drawn and str(drawn)}, indent=1, allow_nan=False))
     else:
         print_report(report)
-        if drawn:
-            print(plot)
+        if plot is not None:
+            print(shown(drawn, 400) if drawn else "nothing to draw")
     return 2 if report.problem else 0
 
 
@@ -52,14 +53,13 @@ def _is_png(path: Path) -> bool:
         return stream.read(8) == b"\x89PNG\r\n\x1a\n"
 
 
-def _draw(report: Report, plot: Path) -> None:
+def _drawn(figure: "Figure", plot: Path) -> Path:
+    """Write a picture; return its path."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from apertura.atomic import replacement
 
-    figure = report.picture() if report.picture else None
-    if figure is None:
-        return
     FigureCanvasAgg(figure)
     with replacement(plot) as temporary:
         figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})
+    return plot

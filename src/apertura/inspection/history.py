@@ -52,7 +52,7 @@ def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Re
         "phase history",
         kind,
         history_facts(echo),
-        tuple(_missing(echo, beside)),
+        tuple(_missing(echo, kind, beside)),
         picture=lambda: draw_history(echo, here.name),
     )
 
@@ -81,14 +81,13 @@ def history_facts(echo: "xr.Dataset") -> dict[str, Any]:
         "pulses": len(times),
         "frequencies": frequency.size,
         "band_hz": [float(frequency[0]), float(frequency[-1])],
-        "carries_time": not own_clock(times),
     }
     if frequency.size > 1:
         step_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
         found["resolution_of_path_m"] = SPEED_OF_LIGHT_M_S / (step_hz * frequency.size)
         found["unambiguous_path_m"] = SPEED_OF_LIGHT_M_S / step_hz
-    if found["carries_time"]:
-        found |= timing(times, longer=LOST)
+    counted = own_clock(times) and bool((np.diff(times) == np.timedelta64(1, "s")).all())
+    found |= {"clock": "none, pulses are counted"} if counted else timing(times, longer=LOST)
     if "tx_position" in echo:
         tx, rx = echo.tx_position.values, echo.rx_position.values
         found["frame"] = echo.attrs["frame"]
@@ -99,12 +98,12 @@ def history_facts(echo: "xr.Dataset") -> dict[str, Any]:
     return found
 
 
-def _missing(echo: "xr.Dataset", beside: Surroundings) -> list[str]:
+def _missing(echo: "xr.Dataset", kind: str, beside: Surroundings) -> list[str]:
     found = []
     if "tx_position" not in echo:
         found.append(f"where it was: a flight log {NODE}.track.<{'|'.join(log_suffixes())}> beside, for each antenna")
         if own_clock(echo.time.values):
-            found.append("the time: pulses have a clock of their own; config/clocks.tsv sets it against the log's")
+            found.append("the time: the recorder has a clock of its own; `apertura align` sets it against the log's")
     if not beside.waveform:
-        found.append("its place: a campaign folder with waveform.kind: phase_history; `apertura init` makes one")
+        found.append(f"its place: a campaign folder whose config says waveform.format: {kind}")
     return found

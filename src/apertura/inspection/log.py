@@ -12,7 +12,7 @@ from apertura.ingest import log_format, log_suffixes, read_track
 from apertura.ingest.track import FIXES
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import NODE, Surroundings
-from apertura.inspection.timing import seconds, timing
+from apertura.inspection.timing import gaps, seconds, timing
 from apertura.load.node_log import poorer_fix
 
 if TYPE_CHECKING:
@@ -68,6 +68,8 @@ def log_facts(track: "xr.Dataset") -> dict[str, Any]:
     }
     if "position_std" in track and np.isfinite(track.position_std.values).any():
         found["stated_std_m"] = [float(value) for value in np.nanmedian(track.position_std.values, axis=0)]
+    if track.attrs.get("remarks"):
+        found["remarks"] = list(track.attrs["remarks"])
     return found
 
 
@@ -121,6 +123,9 @@ def _missing(path: Path, track: "xr.Dataset", beside: Surroundings) -> list[str]
     found += [f"what --set gives here: put nodes.{NODE}.log.{key} into config/config.yaml" for key in beside.asked]
     if not np.isfinite(track.attitude.values).any():
         found.append(f"attitude: set nodes.{NODE}.attitude to course, or lever arms to zero and antennas to null")
+    late = gaps(track.time.values, LONG_GAP)
+    if late.size:
+        found.append(f"epochs in {late.size} gaps: pulses are left out where a spline through them errs too much")
     logged = fixes(track) or {}
     if logged and not {"fix", "float"} & logged.keys():
         found.append("a solution with carrier phase (RTK or PPK): positions err by many wavelengths")

@@ -119,8 +119,10 @@ def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
 
 def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     """Return range profiles of pulses spread over the flight, and where the antennas were in plan."""
+    placed = "tx_position" in echo
     figure = _figure(name, (11, 5))
-    profiles, plan = figure.subplots(1, 2, width_ratios=(1.6, 1))
+    grid = figure.add_gridspec(1, 1 + placed, width_ratios=(1.6, 1)[: 1 + placed])
+    profiles = figure.add_subplot(grid[0])
     pulses = np.unique(np.linspace(0, echo.sizes["pulse"] - 1, _ROWS).astype(int))
     transfer, frequency = np.asarray(echo.transfer[pulses].values), echo.frequency.values
     window = np.hanning(frequency.size + 2)[1:-1]
@@ -128,11 +130,8 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     reach_m = SPEED_OF_LIGHT_M_S * (frequency.size - 1) / max(float(np.ptp(frequency)), 1.0) / 2
     _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest")
     _named(profiles, "path beyond the reference, m", f"pulse ({len(pulses)} of {echo.sizes['pulse']})")
-    if "tx_position" not in echo:
-        plan.text(0.5, 0.5, "no positions: a flight log says them", ha="center", transform=plan.transAxes)
-        plan.set_axis_off()
-        return figure
-    _antennas(plan, echo)
+    if placed:
+        _antennas(figure.add_subplot(grid[1]), echo)
     return figure
 
 

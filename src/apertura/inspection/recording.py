@@ -119,7 +119,7 @@ def _missing(recording: "Recording", facts: dict[str, Any], beside: Surroundings
     if len(recording.captures.start) == 1 and recording.framing is None:
         found.append("pulses: it is one capture; write one per trigger, or apertura:framing where the recorder ran on")
     if own_clock(recording.captures.time):
-        found.append("the time: the recorder has a clock of its own; config/clocks.tsv sets it against the log's")
+        found.append("the time: the recorder has a clock of its own; `apertura align` finds how it stands to the log's")
     return found
 
 
@@ -142,7 +142,7 @@ def _against_log(recording: "Recording", log: Path, beside: Surroundings, facts:
     if inside == 1.0:
         return []
     first, last = utc(logged[0]), utc(logged[-1])
-    clocks = "; config/clocks.tsv sets the recorder's clock against the log's" if inside == 0 else ""
+    clocks = "; `apertura align` finds a clock that is off" if inside == 0 else ""
     return [f"positions for {1 - inside:.1%} of the captures: {log.name} lasts from {first} to {last}{clocks}"]
 
 

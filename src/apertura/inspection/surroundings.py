@@ -17,6 +17,7 @@ NODE = "<node>"
 
 _KEY = re.compile(r"\bnodes\.\S+?\.log\.(\w+)")
 _OPTIONS = {one.name for one in fields(LogOptions)}
+_TYPED = {"columns": "columns.NAME='COLUMN OF THE LOG'", "base": "base=LATITUDE,LONGITUDE,HEIGHT"}
 _EXPECTED = f"--set KEY=VALUE, a key of {', '.join(sorted(_OPTIONS))}"
 
 
@@ -102,4 +103,7 @@ def retries(problem: CampaignError) -> list[str]:
     """
     told = f"{problem.found} {problem.expected} {problem.remedy}"
     keys = [key for key in dict.fromkeys(_KEY.findall(told)) if key in _OPTIONS]
-    return [f"set nodes.{NODE}.log.{key} in the config; to try a value now: --set {key}=VALUE" for key in keys]
+    return [
+        f"set nodes.{NODE}.log.{key} in the config; to try a value now: --set {_TYPED.get(key, f'{key}=VALUE')}"
+        for key in keys
+    ]

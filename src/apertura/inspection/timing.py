@@ -70,9 +70,10 @@ def timing(times: Times, *, longer: float) -> dict[str, Any]:
     typical_s, late = interval_s(times), gaps(times, longer)
     lengths_s = np.diff(seconds(times))[late - 1]
     longest = np.sort(late[np.argsort(-lengths_s, kind="stable")[:NAMED]])
+    begun = {} if own_clock(times) else {"first_utc": utc(times[0]), "last_utc": utc(times[-1])}
     found: dict[str, Any] = {
-        "first_utc": utc(times[0]),
-        "last_utc": utc(times[-1]),
+        "clock": "its own" if own_clock(times) else "UTC",
+        **begun,
         "duration_s": float(seconds(times)[-1]),
         "rate_hz": 1 / typical_s if 0 < typical_s < np.inf else None,
         "gaps": int(late.size),
@@ -80,7 +81,10 @@ def timing(times: Times, *, longer: float) -> dict[str, Any]:
     if late.size:
         found["lost_in_gaps"] = int((np.round(lengths_s / typical_s) - 1).sum())
         found["longest_gaps"] = [
-            {"after_utc": utc(times[at - 1]), "length_s": round(float(seconds(times[at - 1 : at + 1])[-1]), 6)}
+            {
+                "after_s": round(float(seconds(times)[at - 1]), 6),
+                "length_s": round(float(seconds(times[at - 1 : at + 1])[-1]), 6),
+            }
             for at in longest
         ]
     return found

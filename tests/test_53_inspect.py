@@ -1,0 +1,290 @@
+"""`apertura inspect`: what files say of themselves, what they lack, and nothing that a stranger's file may do to it."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import yaml
+from folders import SHARED, copy_writable
+from matplotlib import image
+
+from apertura.errors import CampaignError
+from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
+from apertura.inspection.command import inspect_path
+from apertura.inspection.look import look
+
+APERTURA = Path(sys.executable).parent / "apertura"
+F01 = SHARED / "campaign-sample/raw/f01"
+
+EVERY_SUFFIX = sorted(
+    {f".{suffix}" for suffix in log_suffixes()}
+    | {suffix for row in RECORDERS for suffix in row}
+    | {row.suffix for row in PHASE_HISTORIES.values()}
+    | {".tif", ".npy", ".jpg", ""}
+)
+
+
+def run(*words):
+    return subprocess.run([APERTURA, "inspect", *words], capture_output=True, check=False, timeout=120)
+
+
+def rows_of(path):
+    with path.open(encoding="utf-8-sig") as stream:
+        return list(csv.DictReader(stream, skipinitialspace=True))
+
+
+def drawn(report, path):
+    assert inspect_path(report.path, plot=path) == 0
+    return image.imread(path)
+
+
+def test_a_csv_log_is_told_as_its_own_columns_say(shared):
+    rows = rows_of(F01 / "uav1.track.csv")
+    report = look(F01 / "uav1.track.csv")
+    assert (report.kind, report.format, report.problem) == ("flight log", "csv", None)
+    assert report.facts["epochs"] == len(rows)
+    assert report.facts["first_utc"][:21] == rows[0]["time_utc"][:21].replace(" ", "T")
+    assert report.facts["rate_hz"] == pytest.approx(10.0)
+    for name in ("latitude_deg", "longitude_deg", "height_m"):
+        values = [float(row[name]) for row in rows]
+        assert report.facts["bounds"][name] == pytest.approx([min(values), max(values)], abs=1e-6)
+
+
+def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared, tmp_path):
+    lines = (F01 / "uav1.track.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "uav1.track.csv").write_text("".join(lines[:41] + lines[51:]))
+    report = look(tmp_path / "uav1.track.csv")
+    assert report.facts["gaps"] == 1
+    assert report.facts["lost_in_gaps"] == 10
+    assert report.facts["longest_gaps"] == [{"after_s": 3.9, "length_s": 1.1}]
+    assert any(sentence.startswith("epochs in 1 gaps") for sentence in report.missing)
+
+
+def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_path):
+    text = (F01 / "uav2.track.pos").read_text()
+    lines = text.splitlines()
+    solutions = [number for number, line in enumerate(lines) if line[0] != "%"]
+    for number in solutions[:7]:
+        cells = lines[number].split()
+        cells[5] = "5"
+        lines[number] = " ".join(cells)
+    (tmp_path / "uav2.track.pos").write_text("\n".join(lines) + "\n")
+    report = look(tmp_path / "uav2.track.pos")
+    assert report.facts["fix"] == {"fix": len(solutions) - 7, "single": 7}
+    assert report.facts["unusable_epochs"] == 7
+    assert any("worst_fix" in sentence for sentence in report.missing)
+    assert not any("worst_fix" in sentence for sentence in look(F01 / "uav2.track.pos").missing)
+
+
+@pytest.mark.parametrize("file", ["uav1.sigmf-meta", "uav1.sigmf-data"])
+def test_a_recording_is_told_as_its_metadata_and_samples_say(shared, file):
+    meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
+    report = look(F01 / file)
+    length = meta["captures"][1]["core:sample_start"]
+    iq = np.fromfile(F01 / "uav1.sigmf-data", "<i2").reshape(-1, length, 2)[:128].astype(float)
+    assert report.kind == "recording"
+    assert report.facts["captures"] == len(meta["captures"])
+    assert report.facts["sample_rate_hz"] == meta["global"]["core:sample_rate"]
+    assert report.facts["carrier_hz"] == meta["captures"][0]["core:frequency"]
+    assert report.facts["first_captures"]["radar"]["rms"] == pytest.approx(np.sqrt((iq**2).sum(-1).mean()), rel=1e-5)
+    assert report.facts["first_captures"]["radar"]["largest"] == np.abs(iq).max()
+    assert report.facts["captures_inside_log_share"] == 1.0
+    assert report.missing == ()
+
+
+def test_a_recording_alone_lacks_its_log_and_its_waveform_and_says_what_to_put_into_the_config(shared, tmp_path):
+    for suffix in ("sigmf-meta", "sigmf-data"):
+        (tmp_path / f"x.{suffix}").write_bytes((F01 / f"uav1.{suffix}").read_bytes())
+    missing = " ".join(look(tmp_path / "x.sigmf-meta").missing)
+    assert "sample_rate_hz: 1.024e+09, carrier_hz: 1.2e+09, prf_hz: 20" in missing
+    assert "no flight log x.track.<" in missing
+
+
+def test_a_log_of_another_hour_says_that_the_clock_may_be_off(tiny):
+    log = tiny / "raw/f01/uav1.track.csv"
+    times = re.findall(r"T(\d\d):", log.read_text())
+    log.write_text(re.sub(r"T\d\d:", f"T{(int(times[0]) + 3) % 24:02}:", log.read_text()))
+    report = look(tiny / "raw/f01/uav1.sigmf-meta")
+    assert report.facts["captures_inside_log_share"] == 0.0
+    assert any("positions for 100.0% of the captures" in one and "apertura align" in one for one in report.missing)
+
+
+def test_a_recording_of_one_capture_is_no_pulses(shared):
+    report = look(SHARED / "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-data")
+    assert report.facts["captures"] == 1
+    assert any(sentence.startswith("pulses: it is one capture") for sentence in report.missing)
+
+
+def test_phase_history_is_told_as_its_fields_say(shared):
+    path = SHARED / "gotcha_afrl/data_3dsar_pass1_az001_HH.mat"
+    fields = scipy.io.loadmat(path, squeeze_me=True)["data"]
+    frequency, x = (np.ravel(fields[name].item()) for name in ("freq", "x"))
+    report = look(path)
+    assert (report.kind, report.format) == ("phase history", "afrl_mat")
+    assert report.facts["pulses"] == x.size
+    assert report.facts["band_hz"] == pytest.approx([frequency.min(), frequency.max()], rel=1e-6)
+    assert report.facts["tx_bounds"]["east_m"] == pytest.approx([x.min(), x.max()])
+    assert report.facts["clock"] == "none, pulses are counted"
+
+
+def test_the_scans_of_a_radar_with_a_clock_of_its_own_ask_for_a_log_and_for_align(shared):
+    report = look(SHARED / "bwsi_rail_passA/July23_03.out")
+    assert report.facts["clock"] == "its own"
+    assert "first_utc" not in report.facts
+    assert any("apertura align" in sentence for sentence in report.missing)
+    assert any("a flight log" in sentence for sentence in report.missing)
+
+
+def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set(shared):
+    path = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
+    refused = look(path)
+    assert "height_offset_m" in refused.problem.expected
+    assert "to try a value now: --set height_offset_m=VALUE" in refused.missing[0]
+    report, higher = (look(path, [f"height_offset_m={offset}"]) for offset in (40, 50))
+    rows = rows_of(path)
+    latitude = [float(row["latitude"]) for row in rows if float(row["latitude"])]
+    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(rows)
+    assert report.facts["bounds"]["latitude_deg"] == pytest.approx([min(latitude), max(latitude)], abs=1e-7)
+    raised = np.subtract(higher.facts["bounds"]["height_m"], report.facts["bounds"]["height_m"])
+    assert raised == pytest.approx(10.0, abs=1e-6)
+
+
+@pytest.mark.skipif("px4" not in TRACKS, reason="no reader of ULog is there")
+def test_a_ulog_is_a_flight_log(shared):
+    report = look(SHARED / "px4_real_flight/esc_status_log.ulg")
+    assert (report.kind, report.format) == ("flight log", "px4")
+    assert report.problem is None or report.missing
+
+
+def test_a_dem_says_what_its_heights_lack(shared):
+    report = look(SHARED / "dem_isce3/SanAnd_dem.tif")
+    assert report.kind == "elevation model"
+    assert report.facts["crs"] == "EPSG:4326"
+    assert any("scene.dem_datum" in sentence for sentence in report.missing)
+
+
+def test_a_campaign_is_told_node_by_node(shared):
+    report = look(SHARED / "campaign-sample")
+    assert (report.kind, report.missing) == ("campaign folder", ())
+    told = {part.path.name: part.facts for part in report.parts}
+    for node in ("uav1", "uav2"):
+        meta = json.loads((F01 / f"{node}.sigmf-meta").read_text())
+        times = np.array([one["core:datetime"][:-1] for one in meta["captures"]], "datetime64[ns]")
+        steps = np.diff(times) / np.timedelta64(50, "ms")
+        assert told[node]["captures"] == len(times)
+        assert told[node]["lost"] == round(steps.sum() - steps.size)
+        assert told[node]["prf_hz"] == pytest.approx(20.0)
+        assert told[node]["captures_inside_log_share"] == 1.0
+    assert told["uav2"]["fix"] == {"fix": 108}
+
+
+def test_a_spoilt_campaign_says_what_check_says(tiny):
+    (tiny / "raw/f01/uav1.sigmf-data").unlink()
+    report = look(tiny)
+    assert any(line.startswith("raw/f01/uav1.sigmf-data: no such file") for line in report.missing)
+    (tiny / "config/config.yaml").write_text("campaign: [")
+    assert "config/config.yaml: not readable as YAML" in look(tiny).missing[0]
+
+
+def test_inside_a_campaign_the_config_says_how_a_log_is_read(tiny, tmp_path):
+    log, config = tiny / "raw/f01/uav1.track.csv", tiny / "config/config.yaml"
+    log.write_text(log.read_text().replace("height_m", "up", 1))
+    document = yaml.safe_load(config.read_text())
+    document["nodes"]["uav1"]["log"] = {"columns": {"height_m": "up"}}
+    config.write_text(yaml.safe_dump(document))
+    assert look(log).problem is None
+    alone = tmp_path / "uav1.track.csv"
+    alone.write_text(log.read_text())
+    assert look(alone).problem is not None
+    assert look(alone, ["columns.height_m=up"]).problem is None
+
+
+@pytest.mark.parametrize("suffix", EVERY_SUFFIX)
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00\xff\x1b[31m" * 700, b"$,%\n1,2\n{[(" * 300], ids=["empty", "bytes", "text"]
+)
+def test_a_broken_file_of_any_suffix_is_a_report_with_a_reason(tmp_path, suffix, content):
+    path = tmp_path / f"broken{suffix}"
+    path.write_bytes(content)
+    report = look(path)
+    assert report.problem is not None
+    assert report.problem.remedy
+    assert "its reader failed" not in report.problem.found
+    json.dumps(report.as_json(), allow_nan=False)
+
+
+def test_what_a_reader_fails_of_is_told_and_no_traceback(shared, monkeypatch):
+    monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), "operator:truediv"))
+    report = look(F01 / "uav1.track.csv")
+    assert report.problem.found.startswith("its reader failed: TypeError")
+
+
+def test_samples_that_only_a_config_describes_are_asked_to_lie_in_a_campaign(tmp_path, monkeypatch):
+    monkeypatch.setitem(PHASE_HISTORIES, "beat", HistoryFormat(".beat", "operator:truediv", described=True))
+    (tmp_path / "a.beat").write_bytes(b"x")
+    assert "waveform.format: beat" in look(tmp_path / "a.beat").problem.expected
+
+
+@pytest.mark.parametrize("setting", ["height=3", "time_system", "time_system=tai", "base=1,2", "height_offset_m=x"])
+def test_a_setting_that_is_none_is_one_message(shared, setting):
+    with pytest.raises(CampaignError, match="--set"):
+        look(F01 / "uav1.track.csv", [setting])
+
+
+def test_hostile_names_are_shown_escaped(tmp_path):
+    names = [b"new\nline\x1b[31m.csv", b"[red]x[bold].pos", b"\xff\xfe.npy", b"n" * 250 + b".out", b"a\tb"]
+    for name in names:
+        (tmp_path / os.fsdecode(name)).write_bytes(b"\x1b]0;title\x07" * 99)
+    for words in ([tmp_path], *([os.fsencode(tmp_path) + b"/" + name] for name in names)):
+        done = run(*words)
+        assert b"Traceback" not in done.stdout + done.stderr
+        assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", done.stdout + done.stderr)
+        assert done.returncode == (0 if words == [tmp_path] else 2)
+    assert b"[red]x" in run(os.fsencode(tmp_path) + b"/" + names[1]).stdout.replace(b"\n", b"")
+    parts = json.loads(run("--json", tmp_path).stdout)["parts"]
+    assert sorted(os.fsencode(Path(part["path"]).name) for part in parts) == sorted(names)
+
+
+def test_what_is_no_file_is_one_line(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in (tmp_path / "pipe.csv", tmp_path / "nowhere", tmp_path / ("x" * 300)):
+        done = run(path)
+        assert (done.returncode, done.stdout, done.stderr.count(b"\n")) == (2, b"", 1)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "campaign-sample",
+        "campaign-sample/raw/f01/uav1.sigmf-meta",
+        "campaign-sample/raw/f01/uav2.track.pos",
+        "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-meta",
+        "gotcha_afrl/data_3dsar_pass1_az001_HH.mat",
+        "dem_isce3/SanAnd_dem.tif",
+    ],
+)
+def test_previews_are_pictures_and_the_same_each_time(shared, tmp_path, capsys, name):
+    pictures = []
+    for number in range(2):
+        assert inspect_path(SHARED / name, plot=tmp_path / f"{number}.png") == 0
+        pictures.append((tmp_path / f"{number}.png").read_bytes())
+    assert pictures[0] == pictures[1]
+    assert image.imread(tmp_path / "0.png")[..., :3].std() > 0.02
+    assert str(tmp_path / "0.png") in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_preview_never_replaces_what_is_no_picture(shared, tmp_path):
+    folder = copy_writable(F01, tmp_path / "f01")
+    (folder / "notes.png").write_text("mine")
+    for name in ("uav1.track.csv", "uav2.track.pos", "notes.png"):
+        before = (folder / name).read_bytes()
+        with pytest.raises(CampaignError, match="--plot"):
+            inspect_path(folder / "uav1.track.csv", plot=folder / name)
+        assert (folder / name).read_bytes() == before
