@@ -1,6 +1,7 @@
 """`apertura inspect`: what files say of themselves, what they lack, and nothing that a stranger's file may do to it."""
 
 import csv
+import doctest
 import json
 import os
 import re
@@ -31,8 +32,11 @@ EVERY_SUFFIX = sorted(
 )
 
 
-def run(*words):
-    return subprocess.run([APERTURA, "inspect", *words], capture_output=True, check=False, timeout=120)
+HOWTO = Path(__file__).parents[1] / "docs/howto/inspect.md"
+
+
+def run(*words, **options):
+    return subprocess.run([APERTURA, "inspect", *words], capture_output=True, check=False, timeout=120, **options)
 
 
 def rows_of(path):
@@ -238,25 +242,28 @@ def test_a_setting_that_is_none_is_one_message(shared, setting):
         look(F01 / "uav1.track.csv", [setting])
 
 
-def test_hostile_names_are_shown_escaped(tmp_path):
+def test_hostile_names_are_shown_escaped(tmp_path, capsys):
     names = [b"new\nline\x1b[31m.csv", b"[red]x[bold].pos", b"\xff\xfe.npy", b"n" * 250 + b".out", b"a\tb"]
     for name in names:
         (tmp_path / os.fsdecode(name)).write_bytes(b"\x1b]0;title\x07" * 99)
-    for words in ([tmp_path], *([os.fsencode(tmp_path) + b"/" + name] for name in names)):
-        done = run(*words)
-        assert b"Traceback" not in done.stdout + done.stderr
-        assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", done.stdout + done.stderr)
-        assert done.returncode == (0 if words == [tmp_path] else 2)
-    assert b"[red]x" in run(os.fsencode(tmp_path) + b"/" + names[1]).stdout.replace(b"\n", b"")
-    parts = json.loads(run("--json", tmp_path).stdout)["parts"]
-    assert sorted(os.fsencode(Path(part["path"]).name) for part in parts) == sorted(names)
+    told = {}
+    for name in (*names, b""):
+        assert inspect_path(tmp_path / os.fsdecode(name)) == (2 if name else 0)
+        told[name] = capsys.readouterr().out.encode()  # what is no UTF-8 would fail
+        assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", told[name])
+    assert b"[red]x[bold].pos" in told[names[1]].replace(b"\n", b"")
+    done = run("--json", tmp_path)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert sorted(os.fsencode(Path(part["path"]).name) for part in json.loads(done.stdout)["parts"]) == sorted(names)
 
 
 def test_what_is_no_file_is_one_line(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
-    for path in (tmp_path / "pipe.csv", tmp_path / "nowhere", tmp_path / ("x" * 300)):
-        done = run(path)
-        assert (done.returncode, done.stdout, done.stderr.count(b"\n")) == (2, b"", 1)
+    for name in ("pipe.csv", "nowhere", "x" * 300):
+        with pytest.raises(CampaignError):
+            look(tmp_path / name)
+    done = run(tmp_path / "pipe.csv")
+    assert (done.returncode, done.stdout, done.stderr.count(b"\n")) == (2, b"", 1)
 
 
 @pytest.mark.parametrize(
@@ -288,3 +295,15 @@ def test_a_preview_never_replaces_what_is_no_picture(shared, tmp_path):
         with pytest.raises(CampaignError, match="--plot"):
             inspect_path(folder / "uav1.track.csv", plot=folder / name)
         assert (folder / name).read_bytes() == before
+
+
+def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
+    folder = copy_writable(SHARED / "campaign-sample", tmp_path / "sample")
+    airdata = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
+    (folder / "raw/f01/uav1.track.csv").write_text("".join(airdata.open(encoding="utf-8-sig").readlines()[:60]))
+    examples = re.findall(r"```text\n\$ apertura inspect (\S+)\n(.*?)```", HOWTO.read_text(encoding="utf-8"), re.S)
+    assert len(examples) == 2
+    for path, wanted in examples:
+        printed = run(path, cwd=folder, env={**os.environ, "COLUMNS": "200"}).stdout.decode()
+        flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+        assert doctest.OutputChecker().check_output(wanted, printed, flags), printed

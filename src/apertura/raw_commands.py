@@ -23,7 +23,7 @@ def inspect(
     there = leave_working_folder(path)
     from apertura.inspection.command import inspect_path
 
-    raise typer.Exit(inspect_path(there, settings or (), plot=picture, as_json=as_json))
+    raise typer.Exit(inspect_path(there, settings or (), name=path, plot=picture, as_json=as_json))
 
 
 def align(

@@ -14,13 +14,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def inspect_path(path: Path, settings: Sequence[str] = (), *, plot: Path | None = None, as_json: bool = False) -> int:
+def inspect_path(
+    path: Path,
+    settings: Sequence[str] = (),
+    *,
+    name: Path | None = None,
+    plot: Path | None = None,
+    as_json: bool = False,
+) -> int:
     """Print what a file or folder is; return 0, or 2 where no reader reads it.
 
     Parameters
     ----------
     path
         Absolute.
+    name
+        What people call it; None: its path.
     settings
         KEY=VALUE, keys of `apertura.ingest.log_options.LogOptions`.
     plot
@@ -42,7 +51,7 @@ def inspect_path(path: Path, settings: Sequence[str] = (), *, plot: Path | None 
     if as_json:
         print(json.dumps(report.as_json() | {"plot": drawn and str(drawn)}, indent=1, allow_nan=False))
     else:
-        print_report(report)
+        print_report(report, name if report.path == path else None)
         if plot is not None:
             print(shown(drawn, 400) if drawn else "nothing to draw")
     return 2 if report.problem else 0

@@ -124,17 +124,17 @@ def _number(value: float, unit: str) -> str:
     return f"{value:{digits}} {unit}".rstrip()
 
 
-def print_report(report: Report) -> None:
-    """Print what is told of a file or folder, for people."""
+def print_report(report: Report, name: Path | None = None) -> None:
+    """Print what is told of a file or folder, for people; `name` is what they call it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     console = Console(highlight=False)
-    console.print(Text.assemble((shown(report.path, 400), "bold"), f": {report.title}"))
+    console.print(Text.assemble((shown(name or report.path, 400), "bold"), f": {report.title}"))
     grid = Table.grid(padding=(0, 2, 0, 0))
-    for name, value in report.lines():
-        grid.add_row(Text(f"  {name}", style="dim"), Text(value))
+    for fact, value in report.lines():
+        grid.add_row(Text(f"  {fact}", style="dim"), Text(value))
     if report.facts:
         console.print(grid)
     if report.parts:
