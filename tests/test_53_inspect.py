@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyulog
 import scipy.io
 import yaml
 from folders import SHARED, copy_writable
@@ -68,7 +69,7 @@ def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared
     assert report.facts["gaps"] == 1
     assert report.facts["lost_in_gaps"] == 10
     assert report.facts["longest_gaps"] == [{"after_s": 3.9, "length_s": 1.1}]
-    assert any(sentence.startswith("epochs in 1 gaps") for sentence in report.missing)
+    assert any(sentence.startswith("epochs where it has gaps (1)") for sentence in report.missing)
 
 
 def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_path):
@@ -160,11 +161,15 @@ def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set
     assert raised == pytest.approx(10.0, abs=1e-6)
 
 
-@pytest.mark.skipif("px4" not in TRACKS, reason="no reader of ULog is there")
-def test_a_ulog_is_a_flight_log(shared):
-    report = look(SHARED / "px4_real_flight/esc_status_log.ulg")
+def test_a_ulog_is_told_as_its_own_messages_say(shared):
+    path = SHARED / "px4_real_flight/esc_status_log.ulg"
+    gps = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
+    report = look(path)
     assert (report.kind, report.format) == ("flight log", "px4")
-    assert report.problem is None or report.missing
+    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(gps["lat"])
+    latitude = gps["lat"] * 1e-7
+    assert report.facts["bounds"]["latitude_deg"] == pytest.approx([latitude.min(), latitude.max()], abs=1e-7)
+    assert any("RTK" in sentence for sentence in report.missing)
 
 
 def test_a_dem_says_what_its_heights_lack(shared):

@@ -125,7 +125,7 @@ def _missing(path: Path, track: "xr.Dataset", beside: Surroundings) -> list[str]
         found.append(f"attitude: set nodes.{NODE}.attitude to course, or lever arms to zero and antennas to null")
     late = gaps(track.time.values, LONG_GAP)
     if late.size:
-        found.append(f"epochs in {late.size} gaps: pulses are left out where a spline through them errs too much")
+        found.append(f"epochs where it has gaps ({late.size}): pulses there may be left out")
     logged = fixes(track) or {}
     if logged and not {"fix", "float"} & logged.keys():
         found.append("a solution with carrier phase (RTK or PPK): positions err by many wavelengths")
