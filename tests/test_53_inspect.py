@@ -247,7 +247,8 @@ def test_a_setting_that_is_none_is_one_message(shared, setting):
         look(F01 / "uav1.track.csv", [setting])
 
 
-def test_hostile_names_are_shown_escaped(tmp_path, capsys):
+def test_hostile_names_are_shown_escaped(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "500")
     names = [b"new\nline\x1b[31m.csv", b"[red]x[bold].pos", b"\xff\xfe.npy", b"n" * 250 + b".out", b"a\tb"]
     for name in names:
         (tmp_path / os.fsdecode(name)).write_bytes(b"\x1b]0;title\x07" * 99)
@@ -256,10 +257,18 @@ def test_hostile_names_are_shown_escaped(tmp_path, capsys):
         assert inspect_path(tmp_path / os.fsdecode(name)) == (2 if name else 0)
         told[name] = capsys.readouterr().out.encode()  # what is no UTF-8 would fail
         assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", told[name])
-    assert b"[red]x[bold].pos" in told[names[1]].replace(b"\n", b"")
+    assert b"[red]x[bold].pos" in told[names[1]]
+    assert b"[red]x[bold].pos" in told[b""]
     done = run("--json", tmp_path)
     assert (done.returncode, done.stderr) == (0, b"")
     assert sorted(os.fsencode(Path(part["path"]).name) for part in json.loads(done.stdout)["parts"]) == sorted(names)
+
+
+def test_a_hostile_name_among_the_facts_is_escaped(shared, tmp_path, capsys):
+    for suffix in (".sigmf-meta", ".sigmf-data"):
+        (tmp_path / f"a\x1b[31m{suffix}").write_bytes((F01 / f"uav1{suffix}").read_bytes())
+    assert inspect_path(tmp_path / "a\x1b[31m.sigmf-data") == 0
+    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_what_is_no_file_is_one_line(tmp_path):
