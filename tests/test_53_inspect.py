@@ -34,6 +34,7 @@ EVERY_SUFFIX = sorted(
 
 
 HOWTO = Path(__file__).parents[1] / "docs/howto/inspect.md"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 def run(*words, **options):
@@ -192,6 +193,21 @@ def test_a_campaign_is_told_node_by_node(shared):
         assert told[node]["prf_hz"] == pytest.approx(20.0)
         assert told[node]["captures_inside_log_share"] == 1.0
     assert told["uav2"]["fix"] == {"fix": 108}
+
+
+def test_a_campaign_of_phase_history_is_told_by_the_clock_that_was_aligned(shared, tmp_path):
+    root = copy_writable(EXAMPLES / "rail_pass", tmp_path / "rail")
+    flight, node = (root / "config/flights.tsv").read_text().splitlines()[1].split("\t")[::3]
+    raw = root / f"raw/{flight}"
+    raw.mkdir(parents=True)
+    (raw / f"{node}.out").write_bytes((SHARED / "bwsi_rail_passA/July23_03.out").read_bytes())
+    (raw / f"{node}.track.csv").write_bytes((SHARED / "bwsi_rail_passA/Rail SAR 2.csv").read_bytes())
+    report = look(root)
+    (part,) = report.parts
+    assert part.facts["pulses"] == 635
+    assert part.facts["captures_inside_log_share"] == pytest.approx(1.0, abs=0.01)
+    (root / "config/clocks.tsv").unlink()
+    assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
 
 
 def test_a_spoilt_campaign_says_what_check_says(tiny):

@@ -13,7 +13,7 @@ from apertura.inspection.log import bounds
 from apertura.inspection.recording import LOST
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import NODE, Surroundings
-from apertura.inspection.timing import own_clock, timing
+from apertura.inspection.timing import counted, own_clock, timing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -86,8 +86,7 @@ def history_facts(echo: "xr.Dataset") -> dict[str, Any]:
         step_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
         found["resolution_of_path_m"] = SPEED_OF_LIGHT_M_S / (step_hz * frequency.size)
         found["unambiguous_path_m"] = SPEED_OF_LIGHT_M_S / step_hz
-    counted = own_clock(times) and bool((np.diff(times) == np.timedelta64(1, "s")).all())
-    found |= {"clock": "none, pulses are counted"} if counted else timing(times, longer=LOST)
+    found |= {"clock": "none, pulses are counted"} if counted(times) else timing(times, longer=LOST)
     if "tx_position" in echo:
         tx, rx = echo.tx_position.values, echo.rx_position.values
         found["frame"] = echo.attrs["frame"]

@@ -107,3 +107,14 @@ def own_clock(times: Times) -> bool:
     True
     """
     return bool(times[0] < np.datetime64(0, "ns") + _UNIX_DAYS)
+
+
+def counted(times: Times) -> bool:
+    """Return whether times only count pulses from the epoch of the machine, one a second: there was no clock at all.
+
+    Examples
+    --------
+    >>> counted(np.arange(3).astype("datetime64[s]").astype("datetime64[ns]"))
+    True
+    """
+    return own_clock(times) and bool((np.diff(times) == np.timedelta64(1, "s")).all())
