@@ -206,7 +206,9 @@ def test_a_campaign_of_phase_history_is_told_by_the_clock_that_was_aligned(share
     (part,) = report.parts
     assert part.facts["pulses"] == 635
     assert part.facts["captures_inside_log_share"] == pytest.approx(1.0, abs=0.01)
+    assert look(raw / f"{node}.out").missing == ()
     (root / "config/clocks.tsv").unlink()
+    assert "apertura align" in look(raw / f"{node}.out").missing[0]
     assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
 
 
@@ -252,7 +254,9 @@ def test_what_a_reader_fails_of_is_told_and_no_traceback(shared, monkeypatch):
 
 
 def test_samples_that_only_a_config_describes_are_asked_to_lie_in_a_campaign(tmp_path, monkeypatch):
-    monkeypatch.setitem(PHASE_HISTORIES, "beat", HistoryFormat(".beat", "operator:truediv", described=True))
+    monkeypatch.setitem(
+        PHASE_HISTORIES, "beat", HistoryFormat(".beat", "operator:truediv", described=True, waveform="fmcw")
+    )
     (tmp_path / "a.beat").write_bytes(b"x")
     assert "waveform.format: beat" in look(tmp_path / "a.beat").problem.expected
 

@@ -1,6 +1,6 @@
 """Phase history: pulses, band, and where the antennas were."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,10 @@ from apertura.inspection.timing import counted, own_clock, timing
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+PHASE_HISTORY = "phase_history"
+"""waveform.kind of samples that say themselves what was transmitted."""
 
 
 def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Report:
@@ -37,14 +41,15 @@ def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Re
         If they are none, or only the config of a campaign says what was transmitted, and there is none.
     """
     here = files[0] if len(files) == 1 else Path(*files[0].parts[: _depth(files)])
-    if PHASE_HISTORIES[kind].described and beside.waveform.get("format") != kind:
+    described = beside.waveform if beside.waveform.get("format") == kind else {}
+    if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
         raise CampaignError(
             "samples that do not say what was transmitted",
             here,
             f"raw/<flight>/{here.name} of a campaign whose config says waveform.format: {kind}",
             "`apertura init` makes a campaign folder; copy it there.",
         )
-    echo = _read(files, kind, beside)
+    echo = _read(files, kind, beside.node, described)
     from apertura.inspection.pictures import draw_history
 
     return Report(
@@ -63,13 +68,13 @@ def _depth(files: Sequence[Path]) -> int:
     return alike.index(False) if False in alike else len(alike)
 
 
-def _read(files: Sequence[Path], kind: str, beside: Surroundings) -> "xr.Dataset":
+def _read(files: Sequence[Path], kind: str, node: str, described: Mapping[str, Any]) -> "xr.Dataset":
     """Return the `echo` stage as of one antenna, else as of two, where the format says how it was taken."""
     try:
-        return read_phase_history(kind, files, pair=f"{beside.node}-{beside.node}", described=beside.waveform)
+        return read_phase_history(kind, files, pair=f"{node}-{node}", described=described)
     except CampaignError as problem:
         try:
-            return read_phase_history(kind, files, pair=f"tx-{beside.node}", described=beside.waveform)
+            return read_phase_history(kind, files, pair=f"tx-{node}", described=described)
         except CampaignError:
             raise problem from None
 
@@ -99,10 +104,10 @@ def history_facts(echo: "xr.Dataset") -> dict[str, Any]:
 
 def _missing(echo: "xr.Dataset", kind: str, beside: Surroundings) -> list[str]:
     found = []
-    if "tx_position" not in echo:
+    if "tx_position" not in echo and not beside.logged:
         found.append(f"where it was: a flight log {NODE}.track.<{'|'.join(log_suffixes())}> beside, for each antenna")
-        if own_clock(echo.time.values):
-            found.append("the time: the recorder has a clock of its own; `apertura align` sets it against the log's")
+    if "tx_position" not in echo and not beside.aligned and own_clock(echo.time.values):
+        found.append("the time: the recorder has a clock of its own; `apertura align` sets it against the log's")
     if not beside.waveform:
         found.append(f"its place: a campaign folder whose config says waveform.format: {kind}")
     return found

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from apertura.errors import CampaignError, explained, quoted, shown
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes
+from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import Surroundings, retries, surroundings
 
@@ -108,17 +108,16 @@ def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, 
     for row in RECORDERS:
         suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
         if suffix is not None:
-            files = [path.with_name(path.name.removesuffix(suffix) + one) for one in row]
-            yield "recording", row[0].lstrip("."), partial(_recording, files, beside)
+            yield "recording", row[0].lstrip("."), partial(_recording, path, path.name.removesuffix(suffix), beside)
     for name, history in PHASE_HISTORIES.items():
         if path.name.endswith(history.suffix):
             yield "phase history", name, partial(_history, path, name, beside)
 
 
-def _recording(files: Sequence[Path], beside: Surroundings) -> Report:
+def _recording(path: Path, node: str, beside: Surroundings) -> Report:
     from apertura.inspection.recording import recording_report
 
-    return recording_report(files, beside)
+    return recording_report(recording_files(path.parent, node), beside)
 
 
 def _history(path: Path, name: str, beside: Surroundings) -> Report:

@@ -8,7 +8,7 @@ from typing import Any
 
 from apertura.errors import CampaignError
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
-from apertura.settings import CONFIG, read_settings
+from apertura.settings import CLOCKS, CONFIG, read_settings
 from apertura.settings.log import Log
 from apertura.validation import validated
 
@@ -37,6 +37,10 @@ class Surroundings:
         Why that config cannot be read.
     asked
         What was typed of its log.
+    logged
+        Whether a flight log of the node lies beside.
+    aligned
+        Whether its campaign says how clocks stand to logs.
     """
 
     node: str
@@ -44,6 +48,8 @@ class Surroundings:
     waveform: Mapping[str, Any] = field(default_factory=dict)
     problem: CampaignError | None = None
     asked: Mapping[str, Any] = field(default_factory=dict)
+    logged: bool = False
+    aligned: bool = False
 
 
 def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
@@ -72,7 +78,14 @@ def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
     except CampaignError as problem:
         return Surroundings(name, _log(asked).options, problem=problem, asked=asked)
     log = stated.nodes[name].log.model_dump() if name in stated.nodes else {}
-    return Surroundings(name, _log(log | asked).options, stated.waveform.model_dump(), asked=asked)
+    return Surroundings(
+        name,
+        _log(log | asked).options,
+        stated.waveform.model_dump(),
+        asked=asked,
+        logged=any(other.name.startswith(f"{name}.track.") for other in path.parent.iterdir()),
+        aligned=(path.parents[2] / CLOCKS).is_file(),
+    )
 
 
 def _log(values: Mapping[str, Any]) -> Log:
