@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step")
 app.add_typer(study, name="study")
+app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]

@@ -8,6 +8,24 @@ import typer
 from apertura.paths import leave_working_folder
 
 
+def inspect(
+    path: Annotated[Path, typer.Argument(help="a recording, a flight log, phase history, a DEM, a folder, a campaign")],
+    *,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="what a log cannot say of itself, as nodes.<n>.log does"),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+) -> None:
+    """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
+    picture = None if plot is None else plot.absolute()
+    there = leave_working_folder(path)
+    from apertura.inspection.command import inspect_path
+
+    raise typer.Exit(inspect_path(there, settings or (), name=path, plot=picture, as_json=as_json))
+
+
 def align(
     campaign: Annotated[Path, typer.Argument(help="campaign folder")],
     flight: Annotated[str, typer.Argument(help="flight")],

@@ -67,7 +67,12 @@ def problems(root: str | Path, *, without: Collection[str] = ()) -> list[Campaig
         return found
     from apertura.check.inspected import Inspected
 
-    inspected = Inspected(campaign)
+    return [*found, *problems_of(Inspected(campaign), without=without)]
+
+
+def problems_of(inspected: "Inspected", *, without: Collection[str] = ()) -> list[CampaignError]:
+    """Return what is wrong with a campaign that is opened already; `without` as of `problems`."""
+    found: list[CampaignError] = []
     for name, function in CHECKS.items():
         if name not in without:
             found += _each(pkgutil.resolve_name(function), inspected)

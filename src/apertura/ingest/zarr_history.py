@@ -32,6 +32,8 @@ def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
         If a folder is not of the layout of docs/formats/phase_history.md.
     """
     folders = folders_of(paths)
+    if not folders:
+        raise refused("a file, not a folder", paths[0], _EXPECTED)
     sizes = [path.stat().st_size for path in paths]
     limits: dict[str, Any] = {"memory_bytes": _SPARE_BYTES + BYTES_PER_BYTE * sum(sizes)}
     try:

@@ -1,0 +1,256 @@
+"""`apertura inspect`: what files say of themselves, what they lack, and nothing that a stranger's file may do to it."""
+
+import csv
+import doctest
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyulog
+import scipy.io
+import yaml
+from folders import SHARED, copy_writable
+from matplotlib import image
+
+from apertura.inspection.command import inspect_path
+from apertura.inspection.look import look
+
+APERTURA = Path(sys.executable).parent / "apertura"
+F01 = SHARED / "campaign-sample/raw/f01"
+
+HOWTO = Path(__file__).parents[1] / "docs/howto/inspect.md"
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run(*words, **options):
+    return subprocess.run([APERTURA, "inspect", *words], capture_output=True, check=False, timeout=120, **options)
+
+
+def rows_of(path):
+    with path.open(encoding="utf-8-sig") as stream:
+        return list(csv.DictReader(stream, skipinitialspace=True))
+
+
+def drawn(report, path):
+    assert inspect_path(report.path, plot=path) == 0
+    return image.imread(path)
+
+
+def test_a_csv_log_is_told_as_its_own_columns_say(shared):
+    rows = rows_of(F01 / "uav1.track.csv")
+    report = look(F01 / "uav1.track.csv")
+    assert (report.kind, report.format, report.problem) == ("flight log", "csv", None)
+    assert report.facts["epochs"] == len(rows)
+    assert report.facts["first_utc"][:21] == rows[0]["time_utc"][:21].replace(" ", "T")
+    assert report.facts["rate_hz"] == pytest.approx(10.0)
+    for name in ("latitude_deg", "longitude_deg", "height_m"):
+        values = [float(row[name]) for row in rows]
+        assert report.facts["bounds"][name] == pytest.approx([min(values), max(values)], abs=1e-6)
+
+
+def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared, tmp_path):
+    lines = (F01 / "uav1.track.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "uav1.track.csv").write_text("".join(lines[:41] + lines[51:]))
+    report = look(tmp_path / "uav1.track.csv")
+    assert report.facts["gaps"] == 1
+    assert report.facts["lost_in_gaps"] == 10
+    assert report.facts["longest_gaps"] == [{"after_s": 3.9, "length_s": 1.1}]
+    assert any(sentence.startswith("epochs where it has gaps (1)") for sentence in report.missing)
+
+
+def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_path):
+    text = (F01 / "uav2.track.pos").read_text()
+    lines = text.splitlines()
+    solutions = [number for number, line in enumerate(lines) if line[0] != "%"]
+    for number in solutions[:7]:
+        cells = lines[number].split()
+        cells[5] = "5"
+        lines[number] = " ".join(cells)
+    (tmp_path / "uav2.track.pos").write_text("\n".join(lines) + "\n")
+    report = look(tmp_path / "uav2.track.pos")
+    assert report.facts["fix"] == {"fix": len(solutions) - 7, "single": 7}
+    assert report.facts["unusable_epochs"] == 7
+    assert any("worst_fix" in sentence for sentence in report.missing)
+    assert not any("worst_fix" in sentence for sentence in look(F01 / "uav2.track.pos").missing)
+
+
+@pytest.mark.parametrize("file", ["uav1.sigmf-meta", "uav1.sigmf-data"])
+def test_a_recording_is_told_as_its_metadata_and_samples_say(shared, file):
+    meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
+    report = look(F01 / file)
+    length = meta["captures"][1]["core:sample_start"]
+    iq = np.fromfile(F01 / "uav1.sigmf-data", "<i2").reshape(-1, length, 2)[:128].astype(float)
+    assert report.kind == "recording"
+    assert report.facts["captures"] == len(meta["captures"])
+    assert report.facts["sample_rate_hz"] == meta["global"]["core:sample_rate"]
+    assert report.facts["carrier_hz"] == meta["captures"][0]["core:frequency"]
+    assert report.facts["first_captures"]["radar"]["rms"] == pytest.approx(np.sqrt((iq**2).sum(-1).mean()), rel=1e-5)
+    assert report.facts["first_captures"]["radar"]["largest"] == np.abs(iq).max()
+    assert report.facts["captures_inside_log_share"] == 1.0
+    assert report.missing == ()
+
+
+def test_a_recording_alone_lacks_its_log_and_its_waveform_and_says_what_to_put_into_the_config(shared, tmp_path):
+    for suffix in ("sigmf-meta", "sigmf-data"):
+        (tmp_path / f"x.{suffix}").write_bytes((F01 / f"uav1.{suffix}").read_bytes())
+    missing = " ".join(look(tmp_path / "x.sigmf-meta").missing)
+    assert "sample_rate_hz: 1.024e+09, carrier_hz: 1.2e+09, prf_hz: 20" in missing
+    assert "no flight log x.track.<" in missing
+
+
+def test_a_log_of_another_hour_says_that_the_clock_may_be_off(tiny):
+    log = tiny / "raw/f01/uav1.track.csv"
+    times = re.findall(r"T(\d\d):", log.read_text())
+    log.write_text(re.sub(r"T\d\d:", f"T{(int(times[0]) + 3) % 24:02}:", log.read_text()))
+    report = look(tiny / "raw/f01/uav1.sigmf-meta")
+    assert report.facts["captures_inside_log_share"] == 0.0
+    assert any("positions for 100.0% of the captures" in one and "apertura align" in one for one in report.missing)
+
+
+def test_a_recording_of_one_capture_is_no_pulses(shared):
+    report = look(SHARED / "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-data")
+    assert report.facts["captures"] == 1
+    assert any(sentence.startswith("pulses: it is one capture") for sentence in report.missing)
+
+
+def test_phase_history_is_told_as_its_fields_say(shared):
+    path = SHARED / "gotcha_afrl/data_3dsar_pass1_az001_HH.mat"
+    fields = scipy.io.loadmat(path, squeeze_me=True)["data"]
+    frequency, x = (np.ravel(fields[name].item()) for name in ("freq", "x"))
+    report = look(path)
+    assert (report.kind, report.format) == ("phase history", "afrl_mat")
+    assert report.facts["pulses"] == x.size
+    assert report.facts["band_hz"] == pytest.approx([frequency.min(), frequency.max()], rel=1e-6)
+    assert report.facts["tx_bounds"]["east_m"] == pytest.approx([x.min(), x.max()])
+    assert report.facts["clock"] == "none, pulses are counted"
+
+
+def test_the_scans_of_a_radar_with_a_clock_of_its_own_ask_for_a_log_and_for_align(shared):
+    report = look(SHARED / "bwsi_rail_passA/July23_03.out")
+    assert report.facts["clock"] == "its own"
+    assert "first_utc" not in report.facts
+    assert any("apertura align" in sentence for sentence in report.missing)
+    assert any("a flight log" in sentence for sentence in report.missing)
+
+
+def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set(shared):
+    path = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
+    refused = look(path)
+    assert "height_offset_m" in refused.problem.expected
+    assert "to try a value now: --set height_offset_m=VALUE" in refused.missing[0]
+    report, higher = (look(path, [f"height_offset_m={offset}"]) for offset in (40, 50))
+    rows = rows_of(path)
+    latitude = [float(row["latitude"]) for row in rows if float(row["latitude"])]
+    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(rows)
+    assert report.facts["bounds"]["latitude_deg"] == pytest.approx([min(latitude), max(latitude)], abs=1e-7)
+    raised = np.subtract(higher.facts["bounds"]["height_m"], report.facts["bounds"]["height_m"])
+    assert raised == pytest.approx(10.0, abs=1e-6)
+
+
+def test_a_ulog_is_told_as_its_own_messages_say(shared):
+    path = SHARED / "px4_real_flight/esc_status_log.ulg"
+    gps = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
+    report = look(path)
+    assert (report.kind, report.format) == ("flight log", "px4")
+    assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(gps["lat"])
+    latitude = gps["lat"] * 1e-7
+    assert report.facts["bounds"]["latitude_deg"] == pytest.approx([latitude.min(), latitude.max()], abs=1e-7)
+    assert any("RTK" in sentence for sentence in report.missing)
+
+
+def test_a_dem_says_what_its_heights_lack(shared):
+    report = look(SHARED / "dem_isce3/SanAnd_dem.tif")
+    assert report.kind == "elevation model"
+    assert report.facts["crs"] == "EPSG:4326"
+    assert any("scene.dem_datum" in sentence for sentence in report.missing)
+
+
+def test_a_campaign_is_told_node_by_node(shared):
+    report = look(SHARED / "campaign-sample")
+    assert (report.kind, report.missing) == ("campaign folder", ())
+    told = {part.path.name: part.facts for part in report.parts}
+    for node in ("uav1", "uav2"):
+        meta = json.loads((F01 / f"{node}.sigmf-meta").read_text())
+        times = np.array([one["core:datetime"][:-1] for one in meta["captures"]], "datetime64[ns]")
+        steps = np.diff(times) / np.timedelta64(50, "ms")
+        assert told[node]["captures"] == len(times)
+        assert told[node]["lost"] == round(steps.sum() - steps.size)
+        assert told[node]["prf_hz"] == pytest.approx(20.0)
+        assert told[node]["captures_inside_log_share"] == 1.0
+    assert told["uav2"]["fix"] == {"fix": 108}
+
+
+def test_a_campaign_of_phase_history_is_told_by_the_clock_that_was_aligned(shared, tmp_path):
+    root = copy_writable(EXAMPLES / "rail_pass", tmp_path / "rail")
+    flight, node = (root / "config/flights.tsv").read_text().splitlines()[1].split("\t")[::3]
+    raw = root / f"raw/{flight}"
+    raw.mkdir(parents=True)
+    (raw / f"{node}.out").write_bytes((SHARED / "bwsi_rail_passA/July23_03.out").read_bytes())
+    (raw / f"{node}.track.csv").write_bytes((SHARED / "bwsi_rail_passA/Rail SAR 2.csv").read_bytes())
+    report = look(root)
+    (part,) = report.parts
+    assert part.facts["pulses"] == 635
+    assert part.facts["captures_inside_log_share"] == pytest.approx(1.0, abs=0.01)
+    assert look(raw / f"{node}.out").missing == ()
+    (root / "config/clocks.tsv").unlink()
+    assert "apertura align" in look(raw / f"{node}.out").missing[0]
+    assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
+
+
+def test_a_spoilt_campaign_says_what_check_says(tiny):
+    (tiny / "raw/f01/uav1.sigmf-data").unlink()
+    report = look(tiny)
+    assert any(line.startswith("raw/f01/uav1.sigmf-data: no such file") for line in report.missing)
+    (tiny / "config/config.yaml").write_text("campaign: [")
+    assert "config/config.yaml: not readable as YAML" in look(tiny).missing[0]
+
+
+def test_inside_a_campaign_the_config_says_how_a_log_is_read(tiny, tmp_path):
+    log, config = tiny / "raw/f01/uav1.track.csv", tiny / "config/config.yaml"
+    log.write_text(log.read_text().replace("height_m", "up", 1))
+    document = yaml.safe_load(config.read_text())
+    document["nodes"]["uav1"]["log"] = {"columns": {"height_m": "up"}}
+    config.write_text(yaml.safe_dump(document))
+    assert look(log).problem is None
+    alone = tmp_path / "uav1.track.csv"
+    alone.write_text(log.read_text())
+    assert look(alone).problem is not None
+    assert look(alone, ["columns.height_m=up"]).problem is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "campaign-sample",
+        "campaign-sample/raw/f01/uav1.sigmf-meta",
+        "campaign-sample/raw/f01/uav2.track.pos",
+        "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-meta",
+        "gotcha_afrl/data_3dsar_pass1_az001_HH.mat",
+        "dem_isce3/SanAnd_dem.tif",
+    ],
+)
+def test_previews_are_pictures_and_the_same_each_time(shared, tmp_path, capsys, name):
+    pictures = []
+    for number in range(2):
+        assert inspect_path(SHARED / name, plot=tmp_path / f"{number}.png") == 0
+        pictures.append((tmp_path / f"{number}.png").read_bytes())
+    assert pictures[0] == pictures[1]
+    assert image.imread(tmp_path / "0.png")[..., :3].std() > 0.02
+    assert str(tmp_path / "0.png") in capsys.readouterr().out.replace("\n", "")
+
+
+def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
+    folder = copy_writable(SHARED / "campaign-sample", tmp_path / "sample")
+    airdata = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
+    (folder / "raw/f01/uav1.track.csv").write_text("".join(airdata.open(encoding="utf-8-sig").readlines()[:60]))
+    examples = re.findall(r"```text\n\$ apertura inspect (\S+)\n(.*?)```", HOWTO.read_text(encoding="utf-8"), re.S)
+    assert len(examples) == 2
+    for path, wanted in examples:
+        printed = run(path, cwd=folder, env={**os.environ, "COLUMNS": "200"}).stdout.decode()
+        flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+        assert doctest.OutputChecker().check_output(wanted, printed, flags), printed
