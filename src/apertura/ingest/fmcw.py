@@ -23,6 +23,9 @@ _MOST_VALUES = 1 << 34
 _LARGEST = 1e15
 """What a sample may be: its square is a float32."""
 
+_FARTHEST_S = 2.0**33
+"""Since 1970, what nanoseconds can count."""
+
 _LEAST_STEP = 0.9
 """Of a sweep, what at least is between the beginnings of two; float64 seconds since 1970 are good to 0.2 us."""
 
@@ -214,12 +217,13 @@ def _times(stored: NDArray[Any], path: Path) -> Times:
     if not known or stored.ndim != 1 or not stored.size:
         raise _error(f"times as {stored.dtype} of shape {stored.shape}", path)
     if stored.dtype.kind != "M":
-        seconds = np.where(np.abs(stored) < 2.0**33, stored, np.nan)  # within what nanoseconds count
-        whole = np.floor(seconds)
-        # apart, because float64 holds nanoseconds of one second but not of all since 1970
-        stored = whole.astype("datetime64[s]").astype("datetime64[ns]") + np.round((seconds - whole) * 1e9).astype(
-            "timedelta64[ns]"
-        )
+        with np.errstate(invalid="ignore", over="ignore"):  # what is no number becomes no time, and is refused as such
+            seconds = stored.astype(np.float64)
+            seconds = np.where(np.abs(seconds) < _FARTHEST_S, seconds, np.nan)
+            whole = np.floor(seconds)
+            # apart, because float64 holds nanoseconds of one second but not of all since 1970
+            rest = np.round((seconds - whole) * 1e9).astype("timedelta64[ns]")
+            stored = whole.astype("datetime64[s]").astype("datetime64[ns]") + rest
     years = stored.astype("datetime64[Y]").astype(np.int64) + 1970
     wrong = np.flatnonzero(np.isnat(stored) | (years < 1970) | (years > 2199))
     if wrong.size:
