@@ -13,9 +13,10 @@ import pytest
 import xarray as xr
 import zarr
 
-from apertura.contracts import STAGES, check, stamp
+from apertura.contracts import STAGES, check
 from apertura.errors import CampaignError, ContractError
 from apertura.provenance import sha256_tree
+from apertura.steps.stamping import stamp
 from apertura.store import (
     blocks,
     finish,

@@ -1,19 +1,16 @@
 """What each stage holds: dimensions, dtype and unit of every variable, and what is written beside it.
 
 Stages are nouns and data flows one way: raw → echo → profile → image → cube → files; `track` joins
-at echo. Two functions serve every step: `check` refuses a dataset that breaks its contract, and
-`stamp` writes where it came from.
+at echo. `check` refuses a dataset that breaks its contract.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apertura import __version__
 from apertura.errors import ContractError
-from apertura.provenance import canonical_json
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -218,54 +215,3 @@ def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
     if wrong:
         raise ContractError(f"{stage}: {'; '.join(wrong)}")
     return dataset
-
-
-def stamp(
-    dataset: "xr.Dataset",
-    stage: str,
-    *,
-    runspec: Mapping[str, Any],
-    inputs: Mapping[str, str],
-    code_sha256: str,
-) -> "xr.Dataset":
-    """Check `dataset` and write units and provenance into its attributes.
-
-    Parameters
-    ----------
-    dataset
-        What the stage computed.
-    stage
-        A key of `STAGES`.
-    runspec
-        Every setting that mattered for this stage and those before it.
-    inputs
-        Role → sha256 of each thing read.
-    code_sha256
-        Chain of the code hashes of this stage and those before it.
-
-    Returns
-    -------
-    xarray.Dataset
-        A shallow copy; the arrays are shared.
-
-    Raises
-    ------
-    ContractError
-        As `check`.
-    """
-    stamped = check(dataset, stage).copy()
-    contract = STAGES[stage]
-    for name, promise in {**contract.variables, **contract.optional}.items():
-        if name not in dataset.variables:
-            continue
-        if promise.unit:
-            stamped[name].attrs["units"] = promise.unit
-        stamped[name].attrs["long_name"] = promise.meaning
-    stamped.attrs |= {
-        "apertura_stage": stage,
-        "apertura_version": __version__,
-        "runspec": canonical_json(runspec),
-        "inputs": dict(sorted(inputs.items())),
-        "code_sha256": code_sha256,
-    }
-    return stamped

@@ -1,4 +1,4 @@
-"""Hashes of a campaign's files: taken once per state of a file, whatever its times say, and compared later.
+"""What results are made from: hashes of a campaign's files, taken once per state of a file, and compared later.
 
 A file's state is its size, inode, and times of content and of inode: `cp -p` and `rsync -a` set the former time back,
 none sets the latter. A hash is kept under that state in ``results/.hashes``, so that nothing large is read twice.
@@ -6,15 +6,15 @@ none sets the latter. A hash is kept under that state in ``results/.hashes``, so
 
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from apertura.atomic import write_json
 from apertura.errors import CampaignError
-from apertura.provenance import hashes_of_file
+from apertura.provenance import canonical_json, code_sha256, hashes_of_file, sha256_text
 
 _KEPT = Path("results/.hashes")
 _SMALL = 1 << 16  # bytes; hashed faster than its state is looked up
@@ -129,3 +129,51 @@ def _changed(path: Path) -> CampaignError:
         expected="a file that nobody writes to",
         remedy="Wait until it is copied, then run the workflow again.",
     )
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one rule writes.
+
+    Attributes
+    ----------
+    manifest
+        Its manifest, relative to the campaign folder.
+    sources
+        What it is made from: files, and manifests of other results, relative to the campaign folder.
+    settings
+        What of the config matters to it.
+    """
+
+    manifest: str
+    sources: tuple[str, ...]
+    settings: Mapping[str, Any]
+
+    @property
+    def settings_sha256(self) -> str:
+        """Hash of the settings, as the manifest records it."""
+        return sha256_text(canonical_json(self.settings))
+
+    def begin(self, root: Path, modules: Sequence[str], *, further: Sequence[str] = ()) -> "Lineage":
+        """Hash what it is made from, and `further` files that reading it names; code is what `modules` import."""
+        return Lineage(self, Sources.of(root, (*self.sources, *further)), tuple(modules))
+
+
+@dataclass(frozen=True)
+class Lineage:
+    """A result that is being made, and its sources as they were found."""
+
+    result: Result
+    sources: Sources
+    modules: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """Return what the manifest says of where the result comes from.
+
+        Raises
+        ------
+        CampaignError
+            If a source has changed since it was hashed.
+        """
+        made_by = {"settings": self.result.settings_sha256, "code": code_sha256(*self.modules)}
+        return {"sources": self.sources.unchanged(), **made_by}

@@ -5,13 +5,9 @@ file, setting or code (`apertura.steps.code`) makes it stale, whatever the times
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 from apertura.campaign import Campaign
-from apertura.digests import Sources
-from apertura.provenance import canonical_json, code_sha256, sha256_text
+from apertura.digests import Result
 from apertura.settings import SampledWaveform
 
 STUDY = "study"
@@ -30,54 +26,6 @@ def on_demand(manifest: str) -> bool:
     (True, False)
     """
     return manifest.rpartition("/")[2].removesuffix(".manifest.json") in ON_DEMAND
-
-
-@dataclass(frozen=True)
-class Result:
-    """What one rule writes.
-
-    Attributes
-    ----------
-    manifest
-        Its manifest, relative to the campaign folder.
-    sources
-        What it is made from: files, and manifests of other results, relative to the campaign folder.
-    settings
-        What of the config matters to it.
-    """
-
-    manifest: str
-    sources: tuple[str, ...]
-    settings: Mapping[str, Any]
-
-    @property
-    def settings_sha256(self) -> str:
-        """Hash of the settings, as the manifest records it."""
-        return sha256_text(canonical_json(self.settings))
-
-    def begin(self, root: Path, modules: Sequence[str], *, further: Sequence[str] = ()) -> "Lineage":
-        """Hash what it is made from, and `further` files that reading it names; code is what `modules` import."""
-        return Lineage(self, Sources.of(root, (*self.sources, *further)), tuple(modules))
-
-
-@dataclass(frozen=True)
-class Lineage:
-    """A result that is being made, and its sources as they were found."""
-
-    result: Result
-    sources: Sources
-    modules: tuple[str, ...]
-
-    def record(self) -> dict[str, Any]:
-        """Return what the manifest says of where the result comes from.
-
-        Raises
-        ------
-        CampaignError
-            If a source has changed since it was hashed.
-        """
-        made_by = {"settings": self.result.settings_sha256, "code": code_sha256(*self.modules)}
-        return {"sources": self.sources.unchanged(), **made_by}
 
 
 def result_of(campaign: Campaign, result: str, *where: str) -> Result:

@@ -24,7 +24,7 @@ _ROW = re.compile(r"[\"'](apertura(?:\.\w+)+):\w+[\"']")  # a row that names a f
 
 
 class Stage(Protocol):
-    """What `apertura.contracts.stamp` has stamped: its attributes say where it comes from."""
+    """What `apertura.steps.stamping.stamp` has stamped: its attributes say where it comes from."""
 
     @property
     def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102

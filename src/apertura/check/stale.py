@@ -10,10 +10,10 @@ from typing import Any
 
 from apertura.atomic import date
 from apertura.campaign import Campaign
-from apertura.digests import digest_of
+from apertura.digests import Result, digest_of
 from apertura.errors import CampaignError
 from apertura.export import COVERAGE, PHASE_HISTORY, exports_in
-from apertura.lineage import Result, results_of
+from apertura.lineage import results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest

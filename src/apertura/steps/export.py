@@ -11,8 +11,9 @@ from rasterio import Affine
 
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
+from apertura.digests import Lineage
 from apertura.export import export_modules, write_exports
-from apertura.lineage import Lineage, result_of
+from apertura.lineage import result_of
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
 from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256

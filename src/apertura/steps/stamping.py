@@ -5,8 +5,9 @@ from typing import Any
 
 import xarray as xr
 
-from apertura.contracts import stamp
-from apertura.provenance import Provenance
+from apertura import __version__
+from apertura.contracts import STAGES, check
+from apertura.provenance import Provenance, canonical_json
 
 
 def stamped(
@@ -33,3 +34,54 @@ def stamped(
     """
     origin = Provenance.of(modules, parents, settings=settings, inputs=inputs)
     return stamp(dataset, stage, runspec=origin.runspec, inputs=origin.inputs, code_sha256=origin.code_sha256)
+
+
+def stamp(
+    dataset: xr.Dataset,
+    stage: str,
+    *,
+    runspec: Mapping[str, Any],
+    inputs: Mapping[str, str],
+    code_sha256: str,
+) -> xr.Dataset:
+    """Check `dataset` and write units and provenance into its attributes.
+
+    Parameters
+    ----------
+    dataset
+        What the stage computed.
+    stage
+        A key of `STAGES`.
+    runspec
+        Every setting that mattered for this stage and those before it.
+    inputs
+        Role → sha256 of each thing read.
+    code_sha256
+        Chain of the code hashes of this stage and those before it.
+
+    Returns
+    -------
+    xarray.Dataset
+        A shallow copy; the arrays are shared.
+
+    Raises
+    ------
+    ContractError
+        As `check`.
+    """
+    stamped = check(dataset, stage).copy()
+    contract = STAGES[stage]
+    for name, promise in {**contract.variables, **contract.optional}.items():
+        if name not in dataset.variables:
+            continue
+        if promise.unit:
+            stamped[name].attrs["units"] = promise.unit
+        stamped[name].attrs["long_name"] = promise.meaning
+    stamped.attrs |= {
+        "apertura_stage": stage,
+        "apertura_version": __version__,
+        "runspec": canonical_json(runspec),
+        "inputs": dict(sorted(inputs.items())),
+        "code_sha256": code_sha256,
+    }
+    return stamped

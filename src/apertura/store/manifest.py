@@ -34,7 +34,7 @@ def remake(result: Path) -> str:
 
 
 class Origin(Protocol):
-    """What a result is being made from, `apertura.lineage.Lineage`."""
+    """What a result is being made from, `apertura.digests.Lineage`."""
 
     def record(self) -> dict[str, Any]:
         """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
