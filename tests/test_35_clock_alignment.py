@@ -6,6 +6,7 @@ import pytest
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
 from apertura.refinement.clock_alignment import align_on_point
+from apertura.refinement.clock_drift import with_drift
 from apertura.refinement.motion import Logged, Recorded, plausible_offsets
 from apertura.refinement.scene_alignment import align_on_scene
 from apertura.scene.grid import SceneGrid
@@ -73,6 +74,33 @@ def test_a_path_that_is_known_is_kept():
     found = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
     assert found.path_m == 0.0
     assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
+
+
+def test_a_clock_that_runs_slow_is_told_on_a_long_recording():
+    """Ten minutes to and fro; 40 ppm are 24 ms, and 4 cm of path: over half a wave."""
+
+    def to_and_fro(time_s):
+        return 2.0 * np.sin(0.6 * time_s + 0.4 * np.sin(0.05 * time_s))
+
+    slow_ppm, pulse_s = 40.0, np.arange(1.0, 600.0, 0.2)
+    path = 2 * np.linalg.norm(flown(to_and_fro(pulse_s)) - POINTS[0], axis=1) + PATH_M
+    transfer = np.exp(-2j * np.pi * FREQUENCY * path[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+    clock_s = (pulse_s - pulse_s[0]) / (1 + slow_ppm * 1e-6) + pulse_s[0] - BEHIND_S
+    echo = Recorded(transfer, FREQUENCY, np.zeros(len(pulse_s)), clock_s)
+    log = Logged(lambda at_s: Aperture(flown(to_and_fro(at_s)), flown(to_and_fro(at_s))), 0.0, 610.0)
+    without = align_on_point(echo, log, POINTS[0], within_s=(2.9, 3.5), search_m=2.0)
+    found = with_drift(without, echo, log, POINTS[0])
+    assert found.drift_ppm == pytest.approx(slow_ppm, abs=0.5)
+    assert found.offset_s == pytest.approx(BEHIND_S, abs=1e-3)
+    assert abs(without.offset_s - BEHIND_S) > 5e-3
+
+
+def test_on_a_short_recording_no_drift_is_told():
+    echo, log = given(start_and_stop)
+    found = align_on_point(echo, log, POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
+    kept = with_drift(found, echo, log, POINTS[0])
+    assert kept.drift_ppm == 0.0
+    assert "cannot be told" in kept.report["drift"]
 
 
 def test_a_point_that_is_not_there_is_told_of():

@@ -37,6 +37,7 @@ def align(
     ] = None,
     search_s: Annotated[float | None, typer.Option(min=0, help="how far the clock may be off, s")] = None,
     search_m: Annotated[float, typer.Option(min=0, help="how long the path may be, m of total path")] = 10.0,
+    drift: Annotated[bool, typer.Option("--drift", help="find by how much the clock runs slow, too")] = False,
     keep_path: Annotated[bool, typer.Option("--keep-path", help="the path is as the config says")] = False,
     write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
 ) -> None:
@@ -46,5 +47,5 @@ def align(
     opened = Campaign.load(leave_working_folder(campaign))
     from apertura.steps.align import print_alignment
 
-    asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m}
+    asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}
     print_alignment(opened, flight, node, write=write, **asked)

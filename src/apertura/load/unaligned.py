@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
@@ -15,6 +16,9 @@ from apertura.load.node_log import NodeLog, raw_log, shortest_wave
 from apertura.refinement.motion import Logged, Recorded
 from apertura.settings import SampledWaveform
 from apertura.store import manifest_of, open_stage
+
+MOST_PULSES = 8192
+"""That are read of a recording: their changes tell when the node moved."""
 
 _SECOND = np.timedelta64(1, "s")
 
@@ -33,6 +37,8 @@ class Unaligned:
         What of an offset in config/clocks.tsv is in the recorder's times already.
     stated_ns
         That offset, 0 without.
+    applied_ppm
+        What of a drift stated there is in them already.
     taken_off_m
         Path beyond geometry that is taken off the echoes already.
     own_clock
@@ -44,6 +50,7 @@ class Unaligned:
     apart_ns: int
     applied_ns: int
     stated_ns: int
+    applied_ppm: float
     taken_off_m: float
     own_clock: bool
 
@@ -70,7 +77,8 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     CampaignError
         If the node has no log, or its echoes are not there yet.
     """
-    stated_ns, applied_ns = campaign.clock(flight, node).offset_ns, 0
+    clock = campaign.clock(flight, node)
+    applied_ns, applied_ppm = 0, 0.0
     if isinstance(campaign.settings.waveform, SampledWaveform):
         path = campaign.stage("echo", flight, f"{node}-{node}")
         if not manifest_of(path).is_file():
@@ -80,12 +88,13 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
                 expected=f"the echo of {node} by its own pulses",
                 remedy=f"Run `snakemake results/{flight}/{node}-{node}/echo.manifest.json` first.",
             )
-        history = open_stage(path, "echo")
-        off_m, applied_ns = float(history.attrs["stated_offset_m"]), stated_ns
+        history = _some(open_stage(path, "echo"))
+        off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns
+        applied_ppm = clock.drift_ppm
     else:
         described = campaign.settings.waveform.model_dump()
         files = campaign.history_files(flight, node)
-        history = read_phase_history(described["format"], files, pair=f"{node}-{node}", described=described)
+        history = _some(read_phase_history(described["format"], files, pair=f"{node}-{node}", described=described))
         off_m = 0.0
     times = history.time.values
     log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
@@ -97,7 +106,12 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     )
     apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
     own_clock = bool(times[0] < FIRST)
-    return Unaligned(echo, _logged(log), apart_ns, applied_ns, stated_ns, off_m, own_clock)
+    return Unaligned(echo, _logged(log), apart_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
+
+
+def _some(history: xr.Dataset) -> xr.Dataset:
+    """Return so many of the pulses, evenly spread, that memory is bounded."""
+    return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
 
 
 def _logged(log: NodeLog) -> Logged:

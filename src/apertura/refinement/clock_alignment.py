@@ -44,6 +44,8 @@ class Alignment:
         Peak above what other offsets give.
     report
         What was found on the way.
+    drift_ppm
+        By which more is to be added for every second since the first pulse.
     flags
         Edge crossed → what was measured, in one line.
     """
@@ -54,6 +56,7 @@ class Alignment:
     path_width_m: float
     contrast_db: float
     report: Mapping[str, Any] = field(default_factory=dict)
+    drift_ppm: float = 0.0
     flags: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -143,15 +146,20 @@ def align_on_point(
     contrast_db = 10 * float(np.log10(gathering.power(*found) / max(float(np.median(power)), 1e-300)))
     flags = doubts(power.max(axis=1), offsets_s, found[0], apart[0], contrast_db)
     report = {"method": "point", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
-    return Alignment(*found, *apart, contrast_db, report, flags)
+    return Alignment(*found, *apart, contrast_db, report, flags=flags)
 
 
 def offset_steps(echo: Recorded, log: Logged, low: float, high: float) -> Floats:
     """Return offsets so near to each other that no path changes by more than a part of a wave in between."""
+    step_s = offset_step_s(echo, log)
+    return np.arange(low, high + step_s, step_s)
+
+
+def offset_step_s(echo: Recorded, log: Logged) -> float:
+    """Return in which time no path changes by more than a part of a wave, seconds."""
     times_s = np.linspace(log.first_s, log.last_s, 2048)
     fastest = float(np.quantile(log.speeds_m_s(times_s), 0.95))
-    step_s = echo.shortest_wave_m / (_STEPS_PER_WAVE * max(fastest, 1e-6))
-    return np.arange(low, high + step_s, step_s)
+    return echo.shortest_wave_m / (_STEPS_PER_WAVE * max(fastest, 1e-6))
 
 
 def _steps(offsets_s: Floats, paths_m: Floats, search_m: float) -> tuple[float, float]:

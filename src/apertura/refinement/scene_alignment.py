@@ -151,7 +151,7 @@ def align_on_scene(
     brightest = fine.places_m[np.unravel_index(int(image.argmax()), image.shape)]
     report = {"method": "sharpness", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
     flags = doubts(values.max(axis=1), offsets_s, found[0], apart[0], contrast_db)
-    return Alignment(*found, *apart, contrast_db, report | {"brightest_m": brightest.tolist()}, flags)
+    return Alignment(*found, *apart, contrast_db, report | {"brightest_m": brightest.tolist()}, flags=flags)
 
 
 def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:

@@ -12,6 +12,7 @@ from apertura.load.ground import Ground
 from apertura.load.unaligned import Unaligned, unaligned
 from apertura.paths import inside
 from apertura.refinement.clock_alignment import Alignment, align_on_point
+from apertura.refinement.clock_drift import with_drift
 from apertura.refinement.scene_alignment import align_on_scene
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround
@@ -29,6 +30,7 @@ def align(
     point: tuple[float, float, float] | None = None,
     search_s: float | None = None,
     search_m: float = 10.0,
+    drift: bool = False,
 ) -> tuple[Alignment, dict[str, Any]]:
     """Return how the recorder of a node stands to its log, and what that means in the campaign's own terms.
 
@@ -43,13 +45,15 @@ def align(
         How far the clock may be off; None: `NEAR_S`, or anything where the recorder has no clock but its own.
     search_m
         How long the electrical path may be, metres of total path; 0: it is as the config says.
+    drift
+        Whether to find by how much the recorder's clock runs slow, too; that takes a reflector.
 
     Returns
     -------
     Alignment
         In the recorder's and the log's own seconds.
     dict
-        offset_s, of clocks.tsv, to its last digit as text; path_offset_m, of the config.
+        offset_s, of clocks.tsv, to its last digit as text, and drift_ppm; path_offset_m, of the config.
 
     Raises
     ------
@@ -66,6 +70,7 @@ def align(
         else:
             place = frame_from_map(campaign.settings.scene.crs, *point)
             found = align_on_point(given.echo, given.log, place, within_s=within_s, search_m=search_m)
+            found = with_drift(found, given.echo, given.log, place) if drift else found
     except ValueError as error:
         raise CampaignError(
             str(error),
@@ -74,10 +79,11 @@ def align(
             remedy="Check that recording and log belong together, and nodes.<node>.log.",
         ) from error
     offset = Decimal(given.offset_ns(found.offset_s)).scaleb(-9)
-    return found, {"offset_s": str(offset), "path_offset_m": given.taken_off_m + found.path_m}
+    stated = {"offset_s": str(offset), "drift_ppm": round(given.applied_ppm + found.drift_ppm, 4)}
+    return found, stated | {"path_offset_m": given.taken_off_m + found.path_m}
 
 
-def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float) -> Path:
+def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float, drift_ppm: float = 0.0) -> Path:
     """Write the line of a node's clock into config/clocks.tsv; those of others are kept."""
     path = inside(campaign.root, CLOCKS.as_posix(), where=campaign.root)
     others = [clock for clock in campaign.clocks if (clock.flight, clock.node) != (flight, node)]
@@ -85,7 +91,7 @@ def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: fl
         (one.flight, one.node, Decimal(one.offset_ns).scaleb(-9), one.drift_ppm, "" if one.std_s is None else one.std_s)
         for one in others
     ]
-    rows = [CLOCK_COLUMNS, *kept, (flight, node, offset_s, 0, f"{std_s:.6f}")]
+    rows = [CLOCK_COLUMNS, *kept, (flight, node, offset_s, drift_ppm, f"{std_s:.6f}")]
     write_text(path, "".join("\t".join(map(str, row)) + "\n" for row in rows))
     return path
 
@@ -103,11 +109,15 @@ def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, 
     )
     for name, line in found.flags.items():
         print(f"{name}: {line}")
-    print(f"{CLOCKS}: {flight}\t{node}\t{stated['offset_s']}\t0\t{found.offset_width_s:.6f}")
+    if asked["drift"]:
+        print(f"drift {found.drift_ppm:.2f} ppm: {found.report['drift']}")
+    cells = (flight, node, stated["offset_s"], stated["drift_ppm"], f"{found.offset_width_s:.6f}")
+    print(f"{CLOCKS}: {chr(9).join(map(str, cells))}")
     if asked["search_m"] > 0:
         print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {stated['path_offset_m']:.4f}")
     if write:
-        path = keep(campaign, flight, node, offset_s=stated["offset_s"], std_s=found.offset_width_s)
+        clock = {name: stated[name] for name in ("offset_s", "drift_ppm")}
+        path = keep(campaign, flight, node, std_s=found.offset_width_s, **clock)
         print(f"{path} is written")
 
 
