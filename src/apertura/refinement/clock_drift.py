@@ -19,8 +19,8 @@ def drifting(time_s: Floats, drift_ppm: float) -> Floats:
 
     Examples
     --------
-    >>> drifting(np.array([0.0, 50.0, 100.0]), 20.0)
-    array([-1.0000e-03,  5.0000e+01,  1.0000e+02])
+    >>> drifting(np.array([0.0, 50.0, 100.0]), 20.0).tolist()
+    [-0.001, 50.0, 100.001]
     """
     middle_s = (time_s[0] + time_s[-1]) / 2
     return np.asarray(middle_s + (time_s - middle_s) * (1 + drift_ppm * 1e-6))
