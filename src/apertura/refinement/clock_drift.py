@@ -19,7 +19,7 @@ def drifting(time_s: Floats, drift_ppm: float) -> Floats:
 
     Examples
     --------
-    >>> drifting(np.array([0.0, 50.0, 100.0]), 20.0).tolist()
+    >>> drifting(np.array([0.0, 50.0, 100.0]), 20.0).round(6).tolist()
     [-0.001, 50.0, 100.001]
     """
     middle_s = (time_s[0] + time_s[-1]) / 2
