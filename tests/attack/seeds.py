@@ -91,14 +91,14 @@ def clocks() -> list[bytes]:
 
 def scans() -> list[bytes]:
     """Return scans of a PulsON radar, the last of them cut off, and as it began to write them."""
-    messages = np.zeros((4, 2), MESSAGE)
+    messages = np.zeros((2, 2), MESSAGE)
     messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
     messages["start_ps"], messages["stop_ps"], messages["total"], messages["messages"] = 10_000, 40_518, 500, 2
-    messages["index"], messages["id"] = np.arange(2), np.arange(4)[:, None]
-    messages["time_ms"] = 1_000_000 + 21 * np.arange(4)[:, None]
+    messages["index"], messages["id"] = np.arange(2), np.arange(2)[:, None]
+    messages["time_ms"] = 1_000_000 + 21 * np.arange(2)[:, None]
     messages["scan"] = np.random.default_rng(1).integers(-50_000, 50_000, messages["scan"].shape)
     whole = bytes(32) + messages.tobytes()
-    return [whole, whole[:-1000], *real("bwsi_rail_passA/July23_03.out")]
+    return [whole, whole[:-1000]]
 
 
 def sigmf_meta() -> list[bytes]:

@@ -81,7 +81,8 @@ class SampleLayout:
         if stored.dtype.kind == "u":
             stored = stored - np.float64(1 << 8 * stored.itemsize - 1)
         elif stored.dtype.kind == "f":
-            good = np.abs(stored) <= _LARGEST  # false for NaN
+            with np.errstate(invalid="ignore"):  # a NaN that signals
+                good = np.abs(stored) <= _LARGEST  # false for NaN
             if not good.all():
                 raise ValueError("not finite or beyond 1e15", int(np.argmin(good)))
         if self.stored.kind in "iu" and self.stored.itemsize <= 2:

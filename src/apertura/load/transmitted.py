@@ -135,8 +135,8 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
     pairs = stored.dtype.kind == "i" and stored.shape == (count, 2)
     if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
         raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
-    pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+        pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
         level = np.abs(pulse)
     lost = int((~np.isfinite(level)).sum())
     if lost or not level.max() > 0:
@@ -158,12 +158,13 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
     stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
         codes = stored.astype(np.complex64)
+        zeros = int((codes == 0).sum())
     usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
     if not usable:
         raise CampaignError(
-            f"{stored.dtype} of shape {codes.shape}, {int((codes == 0).sum())} of them zero, "
+            f"{stored.dtype} of shape {codes.shape}, {zeros} of them zero, "
             f"{int((~np.isfinite(codes)).sum())} not finite",
             where=path,
             expected=expected,

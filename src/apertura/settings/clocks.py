@@ -109,7 +109,7 @@ def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> D
         value = Decimal(cells[name])
     except InvalidOperation:
         value = Decimal("nan")
-    if value.is_finite() and abs(value) <= most:
+    if value.is_finite() and -most <= value <= most:
         return value
     raise CampaignError(
         f"{name} {quoted(cells[name])}",
