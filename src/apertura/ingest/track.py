@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, shown
 from apertura.geometry.geodesy import ecef_from_geodetic
 from apertura.ingest.times import outside
 
@@ -115,7 +115,7 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
     where
         The log.
     """
-    _LOG.warning("%s: %s", where, remark)
+    _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
     return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
 
 

@@ -34,7 +34,8 @@ class Placed:
     flags
         Edge crossed → what was measured, in one line.
     report
-        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m, and smoothing_residual_m where that was asked.
+        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m; smoothing_residual_m, source and remarks of the
+        log where there are any.
     """
 
     good: NDArray[np.bool_]
@@ -69,15 +70,18 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
     report = {
         leg: position_error(node.track, node.settings, at[good])
         | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
-        | _smoothed(node)
+        | _told(node)
         for leg, node in (("tx", tx), ("rx", rx))
     }
     return Placed(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
 
 
-def _smoothed(node: NodeLog) -> dict[str, float]:
-    residual_m = node.smoothing_residual_m
-    return {} if residual_m is None else {"smoothing_residual_m": residual_m}
+def _told(node: NodeLog) -> dict[str, Any]:
+    """Return what a person should know of how a log was read and smoothed, where there is something."""
+    told = {"smoothing_residual_m": node.smoothing_residual_m} | {
+        name: node.track.attrs.get(name) for name in ("source", "remarks")
+    }
+    return {name: value for name, value in told.items() if value is not None}
 
 
 def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
