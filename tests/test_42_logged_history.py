@@ -109,6 +109,23 @@ def test_by_a_clock_half_a_second_off_the_target_is_as_far_off_as_was_flown_mean
     assert abs(brightest(campaign)[0] - 1.5) < 0.25
 
 
+def test_what_clocks_tsv_says_of_an_offset_is_in_the_budget(campaign):
+    keep_time(campaign, std_s=0.05)
+    run_steps(campaign, exports=False)
+    quality = open_stage(Campaign.load(campaign).stage("image", "f01", "uav1-uav1"), "image").attrs["quality"]
+    tags = next(line for line in quality["budget"] if line["cause"] == "time tags")
+    assert tags["stated"].startswith("50 ms")
+    assert tags["shift_m"] > 0.01
+
+
+def test_the_check_tells_of_pulses_that_no_log_places(campaign):
+    told = [str(problem) for problem in problems(campaign)]
+    assert len(told) == 1
+    assert "begins 3.440 s after the first pulse" in told[0]
+    (campaign / "raw/f01/uav1.track.csv").unlink()
+    assert "samples without positions" in str(problems(campaign)[0])
+
+
 def test_a_log_that_does_not_cover_the_pulses_is_told_of_with_the_clock(campaign):
     message = complaint(lambda: run_steps(campaign, exports=False))
     assert "begins 3.440 s after the first pulse" in message

@@ -113,6 +113,8 @@ def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tm
             assert "worst_fix" in message
         else:
             assert flags_of(echo_of(campaign)) == {}
+    edit_config(campaign.root, lambda document: document["nodes"]["a"].update(worst_fix="fix"))
+    assert "poorer than fix" in complaint(lambda: echo_of(campaign))
 
 
 def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_path):

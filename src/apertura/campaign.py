@@ -16,6 +16,7 @@ from apertura.settings import (
     Antenna,
     Clock,
     Flight,
+    Node,
     Segment,
     read_clocks,
     read_flights,
@@ -134,6 +135,11 @@ class Campaign(RawFolder):
     def clock(self, flight: str, node: str) -> Clock:
         """Return how a node's recorder stands to its log in a flight."""
         return self._clocks.get((flight, node), Clock(flight, node))
+
+    def node(self, flight: str, node: str) -> Node:
+        """Return the settings of a node as they hold in a flight: what clocks.tsv says of its tags goes first."""
+        stated, std_s = self.settings.nodes[node], self.clock(flight, node).std_s
+        return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
 
     @cached_property
     def _clocks(self) -> dict[tuple[str, str], Clock]:

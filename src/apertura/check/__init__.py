@@ -25,6 +25,7 @@ CHECKS: Mapping[str, str] = {
     "results": "apertura.check.results:check_writable",
     "codes": "apertura.check.codes:check_codes",
     "recordings": "apertura.check.recordings:check_recordings",
+    "histories": "apertura.check.histories:check_histories",
     "channels": "apertura.check.recordings:check_channels",
     "intervals": "apertura.check.tags:check_intervals",
     "overlap": "apertura.check.tags:check_overlap",

@@ -74,7 +74,8 @@ def _uncovered(inspected: Inspected, key: Key, pulses: Times) -> CampaignError |
 
 def _all_poor(inspected: Inspected, key: Key, pulses: Times) -> CampaignError | None:
     """Return what is wrong where every epoch between the first and the last pulse is poorer than the config allows."""
-    track, worst = inspected.tracks[key], inspected.campaign.settings.nodes[key[1]].worst_fix
+    track, node = inspected.tracks[key], inspected.campaign.settings.nodes[key[1]]
+    worst = node.worst_fix
     if "fix" not in track or not pulses.size or worst == "any":
         return None
     times, fixes = track.time.values, track.fix.values
@@ -86,7 +87,7 @@ def _all_poor(inspected: Inspected, key: Key, pulses: Times) -> CampaignError | 
     if not poorer_fix(fixes, worst)[during].all():
         return None
     return CampaignError(
-        f"all {int(during.sum())} epochs while pulses were sent have a solution poorer than {worst}",
+        f"all {int(during.sum())} epochs while pulses were sent have a solution poorer than {node.poorest_fix}",
         where=inspected.campaign.track_file(*key),
         expected=f"solutions that {CONFIG}: nodes.{key[1]}.worst_fix allows",
         remedy="Process the log again, or allow poorer solutions by that key.",

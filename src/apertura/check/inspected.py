@@ -1,7 +1,7 @@
 """A campaign while it is checked: recordings, logs and grid opened once, whoever asks for them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -29,6 +29,7 @@ T = TypeVar("T")
 Key = tuple[str, str]
 """Flight and node."""
 
+_SMALL_BYTES = 64 << 20  # of phase history, which is read to be checked
 _NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
 
 
@@ -43,7 +44,7 @@ class Inspected:
 
     @property
     def waveform(self) -> SampledWaveform | None:
-        """What was transmitted; None: phase history, without recordings and logs."""
+        """What was transmitted, where it was recorded as samples; None: phase history."""
         stated = self.campaign.settings.waveform
         return stated if isinstance(stated, SampledWaveform) else None
 
@@ -93,26 +94,37 @@ class Inspected:
         return self._tracks[1]
 
     @cached_property
-    def unread_history(self) -> list[CampaignError]:
-        """What is wrong with the phase history of the first pair, where its frame is known from nothing else."""
-        flights = self.campaign.image_flights
-        if self.frame or not flights:
+    def unread_histories(self) -> list[CampaignError]:
+        """What is wrong with phase history: of every pair whose files are small, and of one that the frame rests on."""
+        if self.waveform is not None:
             return []
         from apertura.load.recorded import recorded_echo
 
-        try:
-            self.campaign.history_files(flights[0].name, flights[0].nodes[0])
-        except CampaignError:  # for 'files' to name
-            return []
-        try:
-            recorded_echo(self.campaign, flights[0].name, flights[0].pairs[0])
-        except CampaignError as problem:
-            return [problem]
-        return []
+        wrong: list[CampaignError] = []
+        pairs = [(flight.name, pair) for flight in self.campaign.flights for pair in flight.pairs]
+        for number, (flight, pair) in enumerate(pairs):
+            try:
+                files = self.campaign.history_files(flight, pair.split("-")[1])
+            except CampaignError:  # for 'files' to name
+                continue
+            size = sum(path.stat().st_size for path in files)
+            if not size or (size > _SMALL_BYTES and (number or self.frame)):
+                continue
+            try:
+                recorded_echo(self.campaign, flight, pair)
+            except CampaignError as problem:
+                wrong.append(problem)
+        return wrong
 
     @cached_property
     def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
-        return self._each(self.campaign.recording_files, lambda files, _: open_recording(files))
+        return self._each(self.campaign.recording_files, self._opened)
+
+    def _opened(self, files: tuple[Path, ...], key: Key) -> "Recording":
+        """Return a recording by the clock of its node's log."""
+        recording = open_recording(files)
+        captures = recording.captures
+        return replace(recording, captures=replace(captures, time=self.campaign.clock(*key).utc(captures.time)))
 
     @cached_property
     def _tracks(self) -> tuple[dict[Key, "xr.Dataset"], list[CampaignError]]:
@@ -120,10 +132,10 @@ class Inspected:
             return (self.campaign.track_file(flight, node),)
 
         options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
-        return self._each(files, lambda logs, node: read_track(logs[0], node=node, options=options[node]))
+        return self._each(files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]))
 
     def _each(
-        self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], str], T]
+        self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], Key], T]
     ) -> tuple[dict[Key, T], list[CampaignError]]:
         """Open what lies there and is not empty; the others are for 'files' to name."""
         found: dict[Key, T] = {}
@@ -136,7 +148,7 @@ class Inspected:
             if not all(path.stat().st_size for path in paths):
                 continue
             try:
-                found[flight, node] = opened(paths, node)
+                found[flight, node] = opened(paths, (flight, node))
             except CampaignError as problem:
                 wrong.append(problem)
         return found, wrong

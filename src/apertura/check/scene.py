@@ -23,8 +23,8 @@ def check_scene_crs(inspected: Inspected) -> Iterator[CampaignError]:
     asked = inspected.campaign.settings.scene
     if inspected.other_frame:
         yield _other_frame(asked.crs)
-    elif inspected.unread_history:
-        yield from inspected.unread_history
+    elif inspected.unread_histories:
+        return  # which frame they are in is not known
     elif asked.crs not in {LOCAL, "auto"} and inspected.crs is None:
         yield _not_in_metres(inspected, asked.crs)
     elif inspected.crs not in {LOCAL, None}:

@@ -173,9 +173,10 @@ def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64
     early = float(_seconds(track_time[0] - at.min()))
     late = float(_seconds(at.max() - track_time[-1]))
     if max(early, late) > 0:
+        ends = [f"begins {early:.3f} s after the first pulse"] if early > 0 else []
+        ends += [f"ends {late:.3f} s before the last"] if late > 0 else []
         raise CampaignError(
-            f"the track ({track_time[0]} to {track_time[-1]}) begins {max(early, 0):.3f} s after the first pulse "
-            f"and ends {max(late, 0):.3f} s before the last",
+            f"the track ({track_time[0]} to {track_time[-1]}) {' and '.join(ends)}",
             where=where,
             expected=f"a track that covers the pulses, {at.min()} to {at.max()}",
             remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "

@@ -119,7 +119,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
     samples = SampleFile(path, len(raw.attrs["channels"]), SampleLayout.of(raw))
     _check_same(campaign, raw)
-    settings, numerology = campaign.settings.nodes[node], sent.numerology
+    settings, numerology = campaign.node(flight, node), sent.numerology
     check_mixing(samples, numerology, where=recording)
     wave_m = shortest_wave(numerology.frequency_hz)
     return Acquisition(node, settings, track, log, wave_m, raw, samples, files, recording, numerology)

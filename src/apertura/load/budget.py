@@ -113,10 +113,14 @@ def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> 
 
 
 def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
-    """Return the deviation of the transmitter's tags, milliseconds; None where the config has only its default."""
-    node = campaign.settings.nodes.get(pair.name.split("-")[0])
-    stated = node is not None and "time_tag_std_s" in node.model_fields_set
-    return node.time_tag_std_s / _MS if node is not None and stated else None
+    """Return the deviation of the pulses' tags, milliseconds; None where the config has only its default."""
+    tx, rx = pair.name.split("-")
+    sampled = isinstance(campaign.settings.waveform, SampledWaveform)
+    name = tx if sampled else rx  # who tagged the pulses
+    if name not in campaign.settings.nodes:
+        return None
+    node = campaign.node(pair.flight, name)
+    return node.time_tag_std_s / _MS if "time_tag_std_s" in node.model_fields_set else None
 
 
 def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:

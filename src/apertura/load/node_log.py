@@ -111,7 +111,7 @@ class NodeLog:
 def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLog:
     """Return where a node was by its log as it lies in raw/; `wave_m` is the shortest wavelength."""
     file = str(campaign.track_file(flight, node))
-    return NodeLog(node, campaign.settings.nodes[node], campaign.read_log(flight, node), file, wave_m)
+    return NodeLog(node, campaign.node(flight, node), campaign.read_log(flight, node), file, wave_m)
 
 
 def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
@@ -119,15 +119,17 @@ def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
     return SPEED_OF_LIGHT_M_S / float(frequency_hz[-1])
 
 
-def poorer_fix(fix: NDArray[np.int8], worst: Literal["fix", "float", "any"]) -> NDArray[np.bool_]:
-    """Return (epoch,) bool: solutions poorer than `worst`; none in a log without RTK, nor where nothing is logged.
+def poorer_fix(fix: NDArray[np.int8], worst: Literal["auto", "fix", "float", "any"]) -> NDArray[np.bool_]:
+    """Return (epoch,) bool: solutions poorer than `worst`; none where nothing is logged, nor by auto without RTK.
 
     Examples
     --------
-    >>> poorer_fix(np.array([1, 2, 5, 0], np.int8), "fix"), poorer_fix(np.array([5, 4], np.int8), "fix")
+    >>> poorer_fix(np.array([1, 2, 5, 0], np.int8), "auto"), poorer_fix(np.array([5, 4], np.int8), "auto")
     (array([False,  True,  True, False]), array([False, False]))
+    >>> poorer_fix(np.array([5, 4], np.int8), "fix")
+    array([ True,  True])
     """
     rtk = FIXES["fix"], FIXES["float"]
-    if worst == "any" or not np.isin(fix, rtk).any():
+    if worst == "any" or (worst == "auto" and not np.isin(fix, rtk).any()):
         return np.zeros(len(fix), bool)
     return ~np.isin(fix, (0, *rtk[: 1 + (worst == "float")]))

@@ -127,7 +127,7 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
             continue
         worst = f"; {len(faults)} found, worst {_worst(node, faults)}" if faults else ""
         longest = _longest(node, checked, name) if out else ""
-        asked = what.format(asked=node.settings.worst_fix)
+        asked = what.format(asked=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {asked}{longest}{worst}"
     if node.track.attrs["dropped"]:
         counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())

@@ -77,7 +77,6 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     lasting_s = history.attrs.get("sweep_used_s", 0.0)
     missing = missing_flags(at.astype("datetime64[ns]").astype("int64"))
     moved = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
-    clock = campaign.clock(flight, rx.name)
     return history.assign(
         reference_delay=history.reference_delay - offset_s,
         path_limit=history.path_limit - offset_s * SPEED_OF_LIGHT_M_S,
@@ -90,5 +89,5 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
         positions=placed.report,
         pulses=counts,
         stated_offset_m=rx.settings.path_offset_m.radar,
-        time_tags={"std_s": tx.settings.time_tag_std_s if clock.std_s is None else clock.std_s},
+        time_tags={"std_s": rx.settings.time_tag_std_s},
     )

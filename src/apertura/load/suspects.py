@@ -184,7 +184,8 @@ def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -
         ranges = [(sign * size, "") for size in _RANGES_M for sign in (1, -1)]
         for path_m, count in (*(samples if tx == rx else ()), *ranges):
             what = f"paths of {one.pair} are {path_m:+.2f} m off"
-            what = f"{what}: captures begin {count} from the prefix?" if count else f"{what}: a path offset?"
+            begin = "the prefix" if nodes[tx].numerology.prefix_samples else "where waveform.lead_s says"
+            what = f"{what}: captures begin {count} from {begin}?" if count else f"{what}: a path offset?"
             histories = [other.history for other in found]
             histories[place] = _delayed(one.history, -path_m)
             yield Suspicion(what, "prefix" if count else "range", tuple(histories))

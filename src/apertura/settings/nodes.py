@@ -80,10 +80,10 @@ class Node(Section):
         "none", description="where attitude comes from: the log, the course over ground, or none"
     )
     log: Log = Field(default_factory=Log, description="how the flight log is read, where it leaves that open")
-    worst_fix: Literal["fix", "float", "any"] = Field(
-        "fix",
-        description="poorest solution to image with where the log says and has RTK: fix, float, or any; "
-        "pulses of poorer ones are left out",
+    worst_fix: Literal["auto", "fix", "float", "any"] = Field(
+        "auto",
+        description="poorest solution to image with, where the log says: fix, float, or any; auto: fix where the log "
+        "has RTK at all, else any; pulses of poorer ones are left out",
     )
     position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
         None,
@@ -102,6 +102,11 @@ class Node(Section):
     time_tag_std_s: float = Field(
         3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
     )
+
+    @property
+    def poorest_fix(self) -> str:
+        """What `worst_fix` asks of a log with RTK."""
+        return "fix" if self.worst_fix == "auto" else self.worst_fix
 
     @model_validator(mode="after")
     def _lever_arm_needs_attitude(self) -> Self:
