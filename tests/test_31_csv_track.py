@@ -112,3 +112,36 @@ def test_a_name_of_ours_that_is_also_mapped_is_not_guessed(tmp_path):
     assert "columns time and time_s" in complaint(
         lambda: read(tmp_path, f"time,time_s,{GEODETIC}", TIMES, range(40), *PLACES.T)
     )
+
+
+def test_a_log_of_other_names_shows_them_and_how_they_are_mapped(tmp_path):
+    message = complaint(lambda: read(tmp_path, "when,lat,lon,alt", TIMES, *PLACES.T))
+    assert "no column latitude_deg among ['when', 'lat', 'lon', 'alt']" in message
+    assert "nodes.a.log.columns: {latitude_deg: NAME}, or to try it --set columns.latitude_deg=NAME" in message
+    message = complaint(lambda: read(tmp_path, f"when,{GEODETIC}", TIMES, *PLACES.T))
+    assert "no column time_utc among ['when', 'latitude_deg', 'longitude_deg', 'height_m']" in message
+    wide = ",".join(f"column{number}" for number in range(900))
+    assert len(complaint(lambda: read(tmp_path, wide, *[range(40)] * 900))) < 1500
+
+
+@pytest.mark.parametrize("comma", [".", ","])
+def test_cells_between_semicolons_are_named_with_their_line(tmp_path, comma):
+    rows = [
+        f"{time};{north};{east};{up}".replace(".", comma) for time, (north, east, up) in zip(TIMES, PLACES, strict=True)
+    ]
+    message = complaint(lambda: read(tmp_path, "time_utc;latitude_deg;longitude_deg;height_m", rows))
+    assert "line 1 has its cells between semicolons, not commas" in message
+
+
+def test_a_line_with_more_cells_than_the_heading_is_named(tmp_path):
+    rows = [f"{time},{north},{east},{up}" for time, (north, east, up) in zip(TIMES, PLACES, strict=True)]
+    rows[6] += ",0"
+    assert "line 8 has 5 cells, the heading 4" in complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", rows))
+    assert (
+        read(
+            tmp_path,
+            f"time_utc,{GEODETIC}",
+            [f"{time},{n},{e},{u}," for time, (n, e, u) in zip(TIMES, PLACES, strict=True)],
+        ).sizes["epoch"]
+        == 40
+    )

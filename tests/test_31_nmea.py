@@ -166,3 +166,14 @@ def test_no_flipped_bit_moves_an_epoch(tmp_path_factory, data):
     assert 39 <= len(kept) <= 40
     np.testing.assert_array_equal(good.time.values[kept], track.time.values)
     np.testing.assert_array_equal(good.position.values[kept], track.position.values)
+
+
+def test_a_day_of_the_config_that_is_not_the_logs_is_refused(tmp_path):
+    text = logs.nmea(TIMES, PLACES)
+    for day in ("2025-05-13", "2025-05-15", "1970-01-01"):
+        message = complaint(lambda day=day: read(tmp_path, text, start_utc=day))
+        assert (
+            "RMC or ZDA date its first epoch 2025-05-14; expected what config.yaml says, nodes.a.log.start_utc"
+            in message
+        )
+    np.testing.assert_array_equal(read(tmp_path, text, start_utc="2025-05-14T09:00").time.values, TIMES)

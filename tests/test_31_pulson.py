@@ -81,3 +81,13 @@ def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, b
     sent = 1_000_000 + 20 * np.arange(6)
     millisecond = np.timedelta64(1, "ms")
     assert set(((history.time.values - np.datetime64(0, "s")) // millisecond).tolist()) <= set(sent.tolist())
+
+
+@pytest.mark.parametrize("lost", [1, 7, MESSAGE.itemsize - 5, MESSAGE.itemsize - 1])
+def test_a_scan_that_a_file_ends_in_is_counted_once_wherever_it_ends(tmp_path, lost):
+    whole, size = recorded(8 + 0.1 * np.arange(6)), MESSAGE.itemsize
+    for messages in range(MESSAGES):
+        cut = written(tmp_path / "a.out", whole[: len(whole) - messages * size - lost])
+        assert cut.sizes["pulse"] == 5
+        assert cut.attrs["flags"]["scans_incomplete"] == "1 of 6 scans"
+    assert written(tmp_path / "a.out", whole + bytes([0xF2, 0x02, 0])).attrs["flags"] == {}

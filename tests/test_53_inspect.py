@@ -13,12 +13,16 @@ import numpy as np
 import pytest
 import pyulog
 import scipy.io
+import xarray as xr
 import yaml
 from folders import SHARED, copy_writable
 from matplotlib import image
 
+from apertura.echo.dechirp import Sweep
 from apertura.inspection.command import inspect_path
 from apertura.inspection.look import look
+from apertura.inspection.pictures import draw_history
+from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"
@@ -254,3 +258,47 @@ def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
         printed = run(path, cwd=folder, env={**os.environ, "COLUMNS": "200"}).stdout.decode()
         flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
         assert doctest.OutputChecker().check_output(wanted, printed, flags), printed
+
+
+def test_beats_of_a_campaign_are_told_with_the_times_beside(tmp_path):
+    flight = FmcwFlight(Sweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),))
+    raw = write_fmcw_campaign(tmp_path / "campaign", flight, waveform={}) / "raw/f01"
+    times = np.load(raw / "uav1.time.npy")
+    for name in ("uav1.npy", "uav1.time.npy"):
+        report = look(raw / name)
+        assert (report.path.name, report.kind, report.format) == ("uav1.npy", "phase history", "beat_npy")
+        assert (report.facts["pulses"], report.facts["clock"]) == (len(times), "UTC")
+    assert [part.path.name for part in look(raw).parts].count("uav1.npy") == 1
+    np.save(raw / "uav1.time.npy", times[::-1])
+    refused = look(raw / "uav1.npy")
+    assert (refused.kind, refused.format) == ("phase history", "beat_npy")
+    assert "sweep 1 begins" in refused.problem.found
+
+
+def test_times_of_a_campaign_are_whole_on_a_narrow_terminal_and_for_machines(shared):
+    meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
+    report = look(SHARED / "campaign-sample")
+    told = next(part.facts for part in report.parts if part.path.name == "uav1")
+    assert np.datetime64(told["recorded"]["first_utc"][:-1]) == np.datetime64(meta["captures"][0]["core:datetime"][:-1])
+    assert len(told["logged"]["last_utc"]) == len("2025-05-14T09:30:08.700000000Z")
+    printed = run(SHARED / "campaign-sample", env={**os.environ, "COLUMNS": "50"}).stdout.decode()
+    assert max(map(len, printed.splitlines())) <= 50
+    assert "…" not in printed
+    for part in report.parts:
+        for kind in ("recorded", "logged"):
+            for time in part.facts[kind].values():
+                assert time in printed
+
+
+def test_a_preview_of_phase_history_spreads_its_pulses_over_the_whole_of_it():
+    count = 3000
+    ramp = np.exp(-2j * np.pi * np.arange(64) * np.linspace(-0.4, 0.4, count)[:, None])  # range moves from end to end
+    echo = xr.Dataset(
+        {"transfer": (("pulse", "subcarrier"), ramp), "frequency": ("subcarrier", 1e9 + 1e6 * np.arange(64.0))}
+    )
+    (profiles, *_) = draw_history(echo, "a").axes
+    (drawn,) = profiles.images
+    strongest = drawn.get_array().argmax(axis=1)
+    assert len(strongest) <= 256
+    assert strongest.max() - strongest.min() > 45
+    assert tuple(drawn.get_extent()[2:]) == (count, 0)

@@ -105,3 +105,17 @@ def test_a_preview_never_replaces_what_is_no_picture(shared, tmp_path):
         with pytest.raises(CampaignError, match="--plot"):
             inspect_path(folder / "uav1.track.csv", plot=folder / name)
         assert (folder / name).read_bytes() == before
+
+
+def test_an_empty_folder_named_zarr_holds_no_group(tmp_path):
+    (tmp_path / "e.zarr").mkdir()
+    report = look(tmp_path / "e.zarr")
+    assert "no zarr group" in report.problem.found
+    assert "defect" not in report.problem.remedy
+
+
+def test_a_log_that_leaves_times_open_is_told_what_may_be_typed(tmp_path):
+    (tmp_path / "a.track.csv").write_text("time,latitude_deg,longitude_deg,height_m\n2025-05-14T09:30:00,48,9,600\n")
+    assert "--set time_system=utc|gpst" in look(tmp_path / "a.track.csv").missing[0]
+    (tmp_path / "b.track.csv").write_text("time_s,latitude_deg,longitude_deg,height_m\n1,48,9,600\n2,48,9,600\n")
+    assert "--set start_utc=YYYY-MM-DDTHH:MM:SS" in look(tmp_path / "b.track.csv").missing[0]

@@ -68,6 +68,17 @@ class HistoryFormat(NamedTuple):
     """Of its positions, local or ecef; empty: the files say, or a flight log."""
     waveform: str = "phase_history"
     """waveform.kind that it belongs to."""
+    beside: str = ""
+    """What ends the name of a second file of <stem><suffix>, <stem><beside>; empty: there is none."""
+
+    def files_of(self, path: Path) -> list[Path]:
+        """Return the files of what one file or folder belongs to, the one that all others are named after first."""
+        if path.is_dir():
+            return sorted(one for one in path.rglob("*") if one.is_file())
+        if not self.beside:
+            return [path]
+        stem = path.name.removesuffix(self.beside if path.name.endswith(self.beside) else self.suffix)
+        return [one for one in (path.with_name(stem + end) for end in (self.suffix, self.beside)) if one.is_file()]
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
@@ -76,7 +87,9 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
     "cphd": HistoryFormat(".cphd", "apertura.ingest.cphd:read_cphd", described=True),
     "hdf5": HistoryFormat(".h5", "apertura.ingest.hdf5_history:read_hdf5_history"),
     "zarr": HistoryFormat(".zarr", "apertura.ingest.zarr_history:read_zarr_history"),
-    "beat_npy": HistoryFormat(".npy", "apertura.ingest.fmcw:read_beat_npy", described=True, waveform="fmcw"),
+    "beat_npy": HistoryFormat(
+        ".npy", "apertura.ingest.fmcw:read_beat_npy", described=True, waveform="fmcw", beside=".time.npy"
+    ),
     "beat_mat": HistoryFormat(".mat", "apertura.ingest.fmcw:read_beat_mat", described=True, waveform="fmcw"),
     "beat_wav": HistoryFormat(".wav", "apertura.ingest.fmcw_wav:read_beat_wav", described=True, waveform="fmcw"),
 }

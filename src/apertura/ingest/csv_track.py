@@ -56,7 +56,7 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     log = _Log(path, node, options)
     try:
         table = _table(log)
-        frame = _frame(table)
+        frame = _frame(table, log)
         position = numbers(table[_POSITIONS[frame]])
         attitude, std = (
             numbers(table[names]) if set(names) <= set(table.columns) else None for names in (_ATTITUDE, _STD)
@@ -66,14 +66,7 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     except CampaignError:
         raise
     except (ValueError, ArithmeticError) as error:
-        raise CampaignError(
-            str(error).partition("\n")[0],
-            where=path,
-            expected="columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, "
-            f"y_m, z_m, or east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality "
-            f"({', '.join(FIXES)}, or their numbers 1 to 6); or their names in nodes.{node}.log.columns",
-            remedy="Correct the log or export it again.",
-        ) from error
+        raise _error(str(error).partition("\n")[0], log, "Correct the log or export it again.") from error
     if frame == "geodetic":
         position = position + np.array([0.0, 0.0, options.height_offset_m or 0.0])
     last = slice(None, -1) if cut_off(path) else slice(None)
@@ -107,15 +100,34 @@ def _table(log: _Log) -> pd.DataFrame:
     doubled = [name for name in mapped if name in table.columns and name not in mapped.values()]
     if doubled:
         raise ValueError(f"column {doubled[0]}, besides {quoted(mapped[doubled[0]])} that config.yaml maps to it")
-    return pd.DataFrame({name: table[column] for name, column in zip(_OURS, theirs, strict=True) if column in table})
+    ours = {name: table[column] for name, column in zip(_OURS, theirs, strict=True) if column in table}
+    found = pd.DataFrame(ours)
+    found.attrs["heading"] = [str(column) for column in table.columns]
+    return found
 
 
-def _frame(table: pd.DataFrame) -> Literal["geodetic", "ecef", "local"]:
-    """Return the first frame whose columns are whole; ValueError names what the nearest lacks."""
+def _error(found: str, log: _Log, remedy: str) -> CampaignError:
+    expected = (
+        "columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m, or "
+        f"east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality ({', '.join(FIXES)}, "
+        f"or their numbers 1 to 6); or their names in nodes.{log.node}.log.columns"
+    )
+    return CampaignError(found, log.path, expected, remedy)
+
+
+def _lacking(name: str, table: pd.DataFrame, log: _Log) -> CampaignError:
+    """Return the error of a log without a column: what columns it has, and how one of them is named in its stead."""
+    key = f"nodes.{log.node}.log.columns"
+    remedy = f"If it has another name, say which: {key}: {{{name}: NAME}}, or to try it --set columns.{name}=NAME."
+    return _error(f"no column {name} among {quoted(table.attrs['heading'], 300)}", log, remedy)
+
+
+def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local"]:
+    """Return the first frame whose columns are whole; CampaignError names what the nearest lacks."""
     lacks = {frame: [name for name in names if name not in table] for frame, names in _POSITIONS.items()}
     nearest = min(lacks, key=lambda frame: len(lacks[frame]))
     if lacks[nearest]:
-        raise ValueError(f"no column {lacks[nearest][0]} among {quoted(list(table.columns), 300)}")
+        raise _lacking(lacks[nearest][0], table, log)
     return nearest
 
 
@@ -123,7 +135,7 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
     """Return UTC; what a name says is not overruled by the config."""
     stated = [name for name in _TIMES if name in table]
     if not stated:
-        raise ValueError(f"no column time_utc among {quoted(list(table.columns), 300)}")
+        raise _lacking("time_utc", table, log)
     if len(stated) > 1 and stated[0] != "time_utc":
         raise ValueError("columns time and time_s")
     name, system = stated[0], log.options.time_system

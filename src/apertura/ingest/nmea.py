@@ -58,13 +58,14 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
 
     Positions, their kind and the geoid separation are those of GGA: ellipsoidal height is altitude plus separation. GGA
     has a time of day; its date is that of the RMC (valid) or ZDA before it, or options.start_utc's where there is none,
-    and goes on over midnight. GST states standard deviations. Of one epoch by several talkers GN's is taken.
+    and goes on over midnight; where both are, they must be of one day. GST states standard deviations. Of one epoch by
+    several talkers GN's is taken.
 
     Raises
     ------
     CampaignError
-        If no sentence has a date, none a geoid separation and the config does not say what they leave open, or times do
-        not increase.
+        If no sentence has a date, none a geoid separation and the config does not say what they leave open, or the
+        config says another day than they do, or times do not increase.
 
     Notes
     -----
@@ -78,9 +79,20 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     looked_through = _sentences(_Log(path, node, options))  # as far as the first date: epochs before it have it, too
     dates = (_dated(sentence) for sentence in looked_through if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
+    first_ns = log.now_ns
     for sentence in _sentences(log):
         _take(sentence, log)
+    if first_ns is not None and options.start_utc is not None:
+        _check_day(first_ns, log)
     return _track(log)
+
+
+def _check_day(first_ns: int, log: _Log) -> None:
+    """Raise CampaignError where the config's day is neither that of the first date nor that of the first epoch."""
+    stated = start_time(log.options, "", node=log.node, where=log.path).astype("datetime64[D]")
+    days = [np.datetime64(time_ns, "ns").astype("datetime64[D]") for time_ns in (first_ns, *log.order[:1])]
+    if stated not in days:
+        raise contradicted("start_utc", f"RMC or ZDA date its first epoch {days[-1]}", node=log.node, where=log.path)
 
 
 def _sentences(log: _Log) -> Iterator[Any]:

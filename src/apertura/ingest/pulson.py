@@ -92,7 +92,7 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
         raise _error(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read", path)
     with naming(path):
         content = path.read_bytes()
-    messages = _messages(content)
+    messages, cut = _messages(content)
     if not messages.size:
         raise _error(f"{len(content)} bytes without a message MRM_SCAN_INFO", path)
     total = int(np.median(messages["total"]))
@@ -111,13 +111,15 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
     numbers = np.unique(messages["id"].astype(np.int64) << 32 | messages["time_ms"])
     _check(whole[:, 0], path)
     samples = whole["scan"].reshape(len(whole), -1)[:, :total].astype(np.float64)
-    return whole[:, 0], samples, len(numbers) - len(whole)
+    begun = cut and messages["index"][-1] == count - 1  # else the message cut off is of a scan that is counted already
+    return whole[:, 0], samples, len(numbers) - len(whole) + int(begun)
 
 
-def _messages(content: bytes) -> NDArray[np.void]:
-    """Return the messages of a file, found again behind bytes that are none."""
+def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:
+    """Return the messages of a file, found again behind bytes that are none, and whether it ends within one."""
     size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
     at, found = min(_CONFIG_BYTES, len(content)), []
+    last = at
     while (at := content.find(sign, at)) >= 0 and at + size <= len(content):
         last = at
         while content[last : last + 2] == sign and last + size <= len(content):
@@ -125,7 +127,8 @@ def _messages(content: bytes) -> NDArray[np.void]:
         found.append(np.frombuffer(content[at:last], MESSAGE))
         at = last
     messages = np.concatenate(found) if found else np.empty(0, MESSAGE)
-    return np.asarray(messages[(messages["step_bins"] == _STEP_BINS) & (messages["kind"] == _RAW_SCAN)])
+    scans = messages[(messages["step_bins"] == _STEP_BINS) & (messages["kind"] == _RAW_SCAN)]
+    return np.asarray(scans), len(content) > last and sign.startswith(content[last : last + 2])
 
 
 def _check(scans: NDArray[np.void], path: Path) -> None:

@@ -67,10 +67,12 @@ def read_table(
     Raises
     ------
     ValueError
-        If it is no table, lacks a column or has one twice, or a line has more or fewer cells than the heading.
+        If it is no table, its cells stand between semicolons, it lacks a column or has one twice, or a line has more or
+        fewer cells than the heading.
     """
     if path.stat().st_size > LARGEST_LOG:
         raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read")
+    _check_cells(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # cells beyond the heading would be dropped
         try:
@@ -84,7 +86,6 @@ def read_table(
             )
         except pd.errors.ParserWarning as error:
             raise ValueError("a line has more cells than the heading") from error
-    _check_cells(path, len(table.columns))
     missing = [name for name in required if name not in table.columns]
     if missing:
         raise ValueError(f"no column {missing[0]} among {quoted(list(table.columns), 300)}")
@@ -94,16 +95,20 @@ def read_table(
     return table
 
 
-def _check_cells(path: Path, heading: int) -> None:
-    """Raise ValueError where a line has fewer cells than the heading: a piece is gone, maybe of a number."""
+def _check_cells(path: Path) -> None:
+    """Raise ValueError where a line has fewer cells than the heading, a piece is gone, maybe of a number; or more."""
     with path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.reader(stream, skipinitialspace=True)
         try:
-            short = next((len(row) for row in rows if row and len(row) < heading), None)
+            heading = next((row for row in rows if row), [])
+            if len(heading) == 1 and ";" in heading[0]:
+                raise ValueError(f"line {rows.line_num} has its cells between semicolons, not commas")
+            # one cell that is empty is a comma that ends the line
+            odd = next((row for row in rows if row and len(row) - (row[-1] == "") != len(heading) != len(row)), None)
         except csv.Error as error:
             raise ValueError(f"line {rows.line_num}: {error}") from error
-    if short is not None:
-        raise ValueError(f"line {rows.line_num} has {short} cells, the heading {heading}")
+    if odd is not None:
+        raise ValueError(f"line {rows.line_num} has {len(odd)} cells, the heading {len(heading)}")
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:

@@ -23,13 +23,15 @@ PHASE_HISTORY = "phase_history"
 """waveform.kind of samples that say themselves what was transmitted."""
 
 
-def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Report:
+def history_report(here: Path, files: Sequence[Path], kind: str, beside: Surroundings) -> Report:
     """Return what is told of phase history.
 
     Parameters
     ----------
+    here
+        The file or folder.
     files
-        A file, or all of a folder.
+        It and the one beside that belongs to it, or all of the folder.
     kind
         A key of `apertura.ingest.PHASE_HISTORIES`.
     beside
@@ -38,9 +40,11 @@ def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Re
     Raises
     ------
     CampaignError
-        If they are none, or only the config of a campaign says what was transmitted, and there is none.
+        If there are none, they are not of that kind, or only the config of a campaign says what was transmitted, and
+        there is none.
     """
-    here = files[0] if len(files) == 1 else Path(*files[0].parts[: _depth(files)])
+    if not files:
+        raise CampaignError(f"no {kind} group, the folder is empty", here, "phase history", "Copy the folder again.")
     described = beside.waveform if beside.waveform.get("format") == kind else {}
     if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
         raise CampaignError(
@@ -60,12 +64,6 @@ def history_report(files: Sequence[Path], kind: str, beside: Surroundings) -> Re
         tuple(_missing(echo, kind, beside)),
         picture=lambda: draw_history(echo, here.name),
     )
-
-
-def _depth(files: Sequence[Path]) -> int:
-    """Return how many parts the paths of files have in common."""
-    alike = [len(set(parts)) == 1 for parts in zip(*(file.parts for file in files), strict=False)]
-    return alike.index(False) if False in alike else len(alike)
 
 
 def _read(files: Sequence[Path], kind: str, node: str, described: Mapping[str, Any]) -> "xr.Dataset":

@@ -95,7 +95,11 @@ def _told(error: Exception, path: Path) -> CampaignError:
 
 
 def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    """Yield kind, format and reader for every row of the tables that a name fits; of a format typed that alone."""
+    """Yield kind, format and reader for every row of the tables that a name fits; of a format stated that alone."""
+    stated = "" if "format" in beside.asked or ".track." in path.name else str(beside.waveform.get("format", ""))
+    if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
+        yield "phase history", stated, partial(_history, path, stated, beside)
+        return  # it is what the campaign will read: that another reader knows the file would be no comfort
     if "format" not in beside.asked:
         yield from _of_recorders(path, beside)
     if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.asked):
@@ -123,8 +127,8 @@ def _recording(path: Path, node: str, beside: Surroundings) -> Report:
 def _history(path: Path, name: str, beside: Surroundings) -> Report:
     from apertura.inspection.history import history_report
 
-    files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
-    return history_report(files, name, beside)
+    files = PHASE_HISTORIES[name].files_of(path)
+    return history_report(path if path.is_dir() else files[0], files, name, beside)
 
 
 def _log(path: Path, beside: Surroundings) -> Report:

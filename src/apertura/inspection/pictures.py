@@ -128,8 +128,9 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     window = np.hanning(frequency.size + 2)[1:-1]
     profile = np.fft.fftshift(np.fft.ifft(transfer * window, axis=1), axes=1)
     reach_m = SPEED_OF_LIGHT_M_S * (frequency.size - 1) / max(float(np.ptp(frequency)), 1.0) / 2
-    _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest")
-    _named(profiles, "path beyond the reference, m", f"pulse ({len(pulses)} of {echo.sizes['pulse']})")
+    count = echo.sizes["pulse"]
+    _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest", rows=count)
+    _named(profiles, "path beyond the reference, m", f"pulse, {len(pulses)} of {count} are drawn")
     if placed:
         _antennas(figure.add_subplot(grid[1]), echo)
     return figure
@@ -204,7 +205,8 @@ def _decibels(values: NDArray[np.complexfloating]) -> Floats:
     return np.asarray(20 * np.log10(np.maximum(coarse / largest, 10 ** (_FLOOR_DB / 20))))
 
 
-def _image(axes: "Axes", level_db: Floats, across: tuple[float, float], label: str) -> None:
-    extent = (*across, len(level_db), 0)
+def _image(axes: "Axes", level_db: Floats, across: tuple[float, float], label: str, *, rows: int | None = None) -> None:
+    """Draw levels; of more rows than are drawn the axis counts all."""
+    extent = (*across, rows or len(level_db), 0)
     drawn = axes.imshow(level_db, extent=extent, aspect="auto", cmap="viridis", vmin=_FLOOR_DB, vmax=0)
     axes.figure.colorbar(drawn, ax=axes, label=label)

@@ -39,6 +39,8 @@ class Report:
         What a folder holds.
     columns
         Facts of the parts that a table of them shows.
+    spelt
+        Facts of the parts that are too long for a table, a line each.
     picture
         Draws a preview.
     """
@@ -51,6 +53,7 @@ class Report:
     problem: CampaignError | None = None
     parts: tuple["Report", ...] = ()
     columns: tuple[str, ...] = ()
+    spelt: tuple[str, ...] = ()
     picture: "Callable[[], Figure] | None" = None
 
     @property
@@ -139,6 +142,9 @@ def print_report(report: Report, name: Path | None = None) -> None:
         console.print(grid)
     if report.parts:
         console.print(_table(report))
+    for part in report.parts:
+        for fact, value in (worded(name, part.facts[name]) for name in report.spelt if name in part.facts):
+            console.print(Text(f"  {shown(part.path.name)}, {part.title}, {fact}: {value}"))
     if report.problem:
         problem = report.problem
         told = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
@@ -157,7 +163,7 @@ def _table(report: Report) -> Any:
 
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in ("", "is", *(worded(name, None)[0] for name in report.columns)):
-        table.add_column(heading)
+        table.add_column(heading, overflow="fold")  # a narrow terminal wraps what is told, and cuts nothing
     for part in report.parts:
         cells = [worded(name, part.facts[name])[1] if name in part.facts else "" for name in report.columns]
         title = f"{part.title}, refused: {part.problem.found}" if part.problem else part.title

@@ -4,10 +4,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from apertura.errors import CampaignError
-from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
+from apertura.ingest.log_options import AS_IT_SAYS, LogOptions, TimeSystem
 from apertura.settings import CLOCKS, CONFIG, read_settings
 from apertura.settings.log import Log
 from apertura.validation import validated
@@ -17,7 +17,12 @@ NODE = "<node>"
 
 _KEY = re.compile(r"\bnodes\.\S+?\.log\.(\w+)")
 _OPTIONS = {one.name for one in fields(LogOptions)}
-_TYPED = {"columns": "columns.NAME='COLUMN OF THE LOG'", "base": "base=LATITUDE,LONGITUDE,HEIGHT"}
+_TYPED = {
+    "columns": "columns.NAME='COLUMN OF THE LOG'",
+    "base": "base=LATITUDE,LONGITUDE,HEIGHT",
+    "time_system": f"time_system={'|'.join(get_args(TimeSystem))}",
+    "start_utc": "start_utc=YYYY-MM-DDTHH:MM:SS",
+}
 _EXPECTED = f"--set KEY=VALUE, a key of {', '.join(sorted(_OPTIONS))}"
 
 
@@ -112,7 +117,7 @@ def retries(problem: CampaignError) -> list[str]:
     Examples
     --------
     >>> retries(CampaignError("times of day only", "a.nmea", "key nodes.u.log.start_utc in config.yaml", "Add it."))
-    ['set nodes.<node>.log.start_utc in the config; to try a value now: --set start_utc=VALUE']
+    ['set nodes.<node>.log.start_utc in the config; to try a value now: --set start_utc=YYYY-MM-DDTHH:MM:SS']
     """
     told = f"{problem.found} {problem.expected} {problem.remedy}"
     keys = [key for key in dict.fromkeys(_KEY.findall(told)) if key in _OPTIONS]

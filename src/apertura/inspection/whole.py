@@ -22,13 +22,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+_SPANS = ("recorded", "logged")
 _COLUMNS = (
-    "recorded",
     "captures",
     "pulses",
     "prf_hz",
     "lost",
-    "logged",
     "log_rate_hz",
     "log_gaps",
     "fix",
@@ -66,6 +65,7 @@ def campaign_report(root: Path) -> Report:
         lines,
         parts=parts,
         columns=tuple(name for name in _COLUMNS if any(name in part.facts for part in parts)),
+        spelt=_SPANS,
         picture=lambda: draw_campaign(spans, campaign.settings.campaign),
     )
 
@@ -87,7 +87,7 @@ def _node(inspected: Inspected, key: Key, spans: dict[str, Span], wrong: list[Ca
     if ends.size:
         first, last = clock.utc(ends)[[0, -1]]
         spans["recorded"] = (first, last)
-        facts = {"recorded": _clock(first, last), **facts}
+        facts = {"recorded": _span(first, last), **facts}
     if track is not None:
         times = track.time.values
         spans["logged"] = (times[0], times[-1])
@@ -130,10 +130,10 @@ def _rate(times: Times) -> dict[str, Any]:
 
 def _logged(track: "xr.Dataset") -> dict[str, Any]:
     found = timing(track.time.values, longer=LONG_GAP)
-    logged = {"logged": _clock(*track.time.values[[0, -1]]), "log_rate_hz": found["rate_hz"], "log_gaps": found["gaps"]}
+    logged = {"logged": _span(*track.time.values[[0, -1]]), "log_rate_hz": found["rate_hz"], "log_gaps": found["gaps"]}
     return {**logged, "fix": fixes(track)}
 
 
-def _clock(first: np.datetime64, last: np.datetime64) -> str:
-    """Return two times, the day once, to a second."""
-    return f"{np.datetime_as_string(first, 's')}…{np.datetime_as_string(last, 's')[11:]}"
+def _span(first: np.datetime64, last: np.datetime64) -> dict[str, str]:
+    """Return two times, ISO 8601, with every digit that they have."""
+    return {name: f"{time.astype('datetime64[ns]')}Z" for name, time in (("first_utc", first), ("last_utc", last))}
