@@ -11,8 +11,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from apertura.focus.engines import ENGINES, load_engine
 from apertura.errors import CampaignError, quoted
+from apertura.focus.engines import ENGINES, load_engine
 from apertura.settings import Node, Settings
 from apertura.settings.waveform import Waveform
 
