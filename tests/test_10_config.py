@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from typer.main import get_command
+from typer.testing import CliRunner
 
+from apertura.cli import app
 from apertura.errors import CampaignError
 from apertura.settings import Processing, Settings, validated
-from apertura.settings.template import config_schema, config_template, flights_template
+from apertura.settings.template import WAVEFORMS, config_schema, config_template, flights_template
 
 ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}
@@ -31,6 +34,29 @@ def test_the_template_is_a_valid_config_and_comments_every_key():
     uncommented = [lines[n] for n in keys if not lines[n - 1].lstrip().startswith("#")]
     assert len(keys) > 30
     assert uncommented == []
+
+
+@pytest.mark.parametrize("kind", WAVEFORMS)
+def test_init_writes_a_valid_config_of_the_kind_asked_and_names_the_others(tmp_path, kind):
+    run = CliRunner().invoke(app, ["init", str(tmp_path / "new"), "--kind", kind])
+    assert run.exit_code == 0, run.output
+    text = (tmp_path / "new/config/config.yaml").read_text(encoding="utf-8")
+    assert validated(yaml.safe_load(text), where="config.yaml").waveform.kind == kind
+    comment, line = re.search(r"^ *# (.*)\n( *kind: .*)$", text, re.M).groups()
+    assert line.strip() == f"kind: {kind}"
+    named = re.sub(r"\(.*?\)", "", comment)  # what each is may use the name of another
+    assert [other for other in WAVEFORMS if not re.search(rf"\b{other}\b", named)] == []
+    assert set(yaml.safe_load(text)["waveform"]) == set(WAVEFORMS[kind].model_fields)
+    asked = next(one for one in get_command(app).commands["init"].params if one.name == "kind")
+    assert set(re.findall(r"\w+", asked.help)) >= set(WAVEFORMS)
+
+
+def test_a_kind_of_waveform_that_there_is_not_is_refused_and_nothing_is_written(tmp_path):
+    error = CliRunner().invoke(app, ["init", str(tmp_path / "new"), "--kind", "chirp"]).exception
+    assert isinstance(error, CampaignError)
+    assert "'chirp'" in str(error)
+    assert "ofdm, samples, phase_history, fmcw" in str(error)
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_schema_accepts_the_template_and_refuses_a_misspelt_key():

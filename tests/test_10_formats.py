@@ -16,7 +16,7 @@ from apertura.ingest.sigmf_collection import Collection
 from apertura.ingest.sigmf_meta import Capture, Framing, Global
 from apertura.ingest.track import FIXES
 from apertura.leap_seconds import gps_ahead_s
-from apertura.settings import Flight, read_flights, read_segments
+from apertura.settings import Flight, PulseWaveform, read_flights, read_segments
 from apertura.settings.clocks import read_clocks
 
 TEXT = (Path(__file__).parents[1] / "docs/formats.md").read_text(encoding="utf-8")
@@ -67,6 +67,13 @@ def test_the_datatypes_that_are_told_are_those_that_are_read():
     assert kinds == read
     assert f"{SETTLING} samples" in TEXT
     assert f"{100 * EDGE:g} % of the rate" in TEXT
+
+
+def test_every_key_of_a_pulse_is_told_and_what_must_be_there():
+    shared = {"kind", "carrier_hz", "sample_rate_hz", "prf_hz"}
+    own = {name: field.is_required() for name, field in PulseWaveform.model_fields.items() if name not in shared}
+    assert names("## Pulse") == list(own)
+    assert required("## Pulse") == {name for name, must in own.items() if must}
 
 
 ROWS = {

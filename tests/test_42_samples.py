@@ -1,9 +1,12 @@
 """Campaigns whose waveform is a pulse given by its samples: from the recording to images, as with OFDM."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from folders import edit_config, run_steps
 
 from apertura.campaign import Campaign
@@ -13,8 +16,10 @@ from apertura.errors import CampaignError
 from apertura.load.budget import budget_of
 from apertura.load.pair import open_pair
 from apertura.load.scene import open_scene
+from apertura.load.transmitted import read_pulse
 from apertura.quality.point_targets import find_peak
 from apertura.resources import Resources
+from apertura.settings import validated
 from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
 from apertura.simulation.impairments import Timing
 from apertura.simulation.specification import specification_text
@@ -22,6 +27,7 @@ from apertura.steps import echo, ingest
 from apertura.steps.suspect import hypotheses
 from apertura.store import open_stage
 
+ROOT = Path(__file__).parents[1]
 PAIRS = "uav1-uav1", "uav1-uav2"
 TARGETS = (PointTarget((0.0, 0.0, 0.0)), PointTarget((-4.0, -4.0, 0.0)), PointTarget((4.0, 4.0, 0.0)))
 SIZES = {"carrier_hz": 1.4048e9, "listen_s": 0.5e-6, "sample_rate_hz": 1.024e9, "prf_hz": 20.0, "lead_s": 0.1e-6}
@@ -203,3 +209,23 @@ def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
 def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
     with pytest.raises(ValueError, match=told):
         PulseSpecification(**({"pulse": "chirp", "bandwidth_hz": 400e6, "pulse_s": 1e-6, **SIZES} | changed))
+
+
+def test_the_pulse_of_the_how_to_is_the_one_that_its_config_states(tmp_path, monkeypatch):
+    text = (ROOT / "docs/howto/samples.md").read_text(encoding="utf-8")
+    code, config = (re.findall(rf"```{name}\n(.*?)```", text, re.S) for name in ("python", "yaml"))
+    assert (len(code), len(config)) == (1, 1)
+    waveform = validated(
+        {"campaign": "c", "nodes": {"a": {}}, **yaml.safe_load(config[0])}, where="samples.md"
+    ).waveform
+    assert waveform.kind == "samples"
+    (tmp_path / "raw").mkdir()
+    monkeypatch.chdir(tmp_path)
+    exec(code[0], {})
+    pulse = read_pulse(tmp_path / waveform.pulse, waveform)
+    spectrum = np.abs(np.fft.fft(pulse, waveform.capture_samples)) ** 2
+    frequency_hz = np.fft.fftfreq(waveform.capture_samples, 1 / waveform.sample_rate_hz)
+    inside = (frequency_hz >= waveform.band_hz[0]) & (frequency_hz <= waveform.band_hz[1])
+    assert spectrum[inside].sum() > 0.95 * spectrum.sum()
+    told_m = float(re.search(r"up to (\d+) m of total path", text)[1])
+    assert told_m == pytest.approx(299792458 * waveform.longest_delay_s, rel=0.01)

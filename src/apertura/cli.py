@@ -211,12 +211,15 @@ def verify(
 
 
 @app.command()
-def init(directory: Annotated[Path, typer.Argument(help="folder to make")]) -> None:
+def init(
+    directory: Annotated[Path, typer.Argument(help="folder to make")],
+    kind: Annotated[str, typer.Option(help="of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
+) -> None:
     """Write the commented config of a new campaign folder."""
     from apertura.settings.template import config_template, flights_template
 
     folder = directory / "config"
-    for path, text in ((folder / "config.yaml", config_template()), (folder / "flights.tsv", flights_template())):
+    for path, text in ((folder / "config.yaml", config_template(kind)), (folder / "flights.tsv", flights_template())):
         if path.exists():
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
         path.parent.mkdir(parents=True, exist_ok=True)

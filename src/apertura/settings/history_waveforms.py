@@ -5,7 +5,7 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from apertura.ingest import PHASE_HISTORIES
-from apertura.settings.section import Section
+from apertura.settings.section import WAVEFORM_KINDS, Section
 
 _MOST_SAMPLES = 1_000_000
 """Of a sweep; ramps of real radars have 100 to 100 000."""
@@ -26,9 +26,10 @@ def _known(name: str, kind: str) -> str:
 class PhaseHistoryWaveform(Section):
     """Frequency-domain samples with antenna positions, recorded by another radar."""
 
-    kind: Literal["phase_history"] = Field(description="recorded frequency-domain samples with antenna positions")
+    kind: Literal["phase_history"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
         description=f"format of the files raw/<flight>/<node>.*: {', '.join(_formats('phase_history'))}",
+        examples=["hdf5"],
         json_schema_extra={"enum": [*_formats("phase_history")]},
     )
 
@@ -60,15 +61,20 @@ class Trigger(Section):
 class FmcwWaveform(Section):
     """Linear sweeps, mixed with their echoes when received: the beat signal was recorded."""
 
-    kind: Literal["fmcw"] = Field(description="beat signals of linear sweeps, dechirped when received")
+    kind: Literal["fmcw"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
         description=f"format of the files raw/<flight>/<node>.*: {', '.join(_formats('fmcw'))}",
+        examples=["beat_npy"],
         json_schema_extra={"enum": [*_formats("fmcw")]},
     )
-    start_hz: float = Field(gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz")
-    bandwidth_hz: float = Field(description="what frequency rises by in sweep_s, Hz; negative: sweeps that fall")
-    sweep_s: float = Field(gt=0, description="how long a sweep is linear, s")
-    sample_rate_hz: float = Field(gt=0, description="of the beat signal, Hz")
+    start_hz: float = Field(
+        gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz", examples=[2.2e9]
+    )
+    bandwidth_hz: float = Field(
+        description="what frequency rises by in sweep_s, Hz; negative: sweeps that fall", examples=[400e6]
+    )
+    sweep_s: float = Field(gt=0, description="how long a sweep is linear, s", examples=[20e-6])
+    sample_rate_hz: float = Field(gt=0, description="of the beat signal, Hz", examples=[25e6])
     iq: Literal["real", "complex", "conjugate"] = Field(
         "real",
         description="real: one mixer; complex: I+jQ of echo times conjugate sweep, whose beats are negative in a "

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from apertura.settings.section import Section
+from apertura.settings.section import WAVEFORM_KINDS, Section
 
 
 class SampledWaveform(Section):
@@ -19,7 +19,7 @@ class SampledWaveform(Section):
     delay_key: ClassVar[str]
     held_by: ClassVar[str]
 
-    kind: str = Field(description="ofdm, samples for a pulse given by its samples, or phase_history")
+    kind: str = Field(description=WAVEFORM_KINDS)
     carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
@@ -65,9 +65,7 @@ class OfdmWaveform(SampledWaveform):
 
     file_key, delay_key, held_by = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
-    kind: Literal["ofdm"] = Field(
-        description="ofdm, samples for a pulse given by its samples, or phase_history for frequency-domain samples"
-    )
+    kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
     carrier_is: Literal["band_start", "band_centre"] = Field(
         "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
@@ -139,13 +137,13 @@ class PulseWaveform(SampledWaveform):
 
     file_key, delay_key, held_by = "pulse", "listen_s", "the listening time"
 
-    kind: Literal["samples"] = Field(description="a pulse given by its samples")
+    kind: Literal["samples"] = Field(description=WAVEFORM_KINDS)
     pulse: str = Field(
         "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
     )
-    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s")
+    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s", examples=[1e-6])
     lead_s: float = Field(0.0, ge=0, description="how long before the pulse a capture begins, s")
-    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s")
+    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s", examples=[2e-6])
     band_hz: tuple[float, float] | None = Field(
         None, description="baseband frequencies that images are made of, Hz; null: where the pulse has its energy"
     )

@@ -13,6 +13,12 @@ RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt")
 """What files of the results folder end in: scene.json, cube.manifest.json, cube.zarr …"""
 
+WAVEFORM_KINDS = (
+    "ofdm, samples (a pulse given by its samples), fmcw (beat signals of sweeps) or phase_history "
+    "(frequency-domain samples); `apertura init --kind` writes the keys of each"
+)
+"""What the key waveform.kind says of itself, whichever kind it is."""
+
 _LONGEST = 64
 _LONGEST_TITLE = 120
 

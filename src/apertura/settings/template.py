@@ -2,6 +2,8 @@
 
 import json
 import types
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, get_args, get_origin
 
 import yaml
@@ -9,23 +11,44 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from apertura.errors import CampaignError, quoted
 from apertura.focus.engines import ENGINES, load_engine
-from apertura.settings import Node, OfdmWaveform, Settings
+from apertura.settings import Node, Settings
+from apertura.settings.waveform import Waveform
 
-_EXAMPLES: dict[str, Any] = {"waveform": OfdmWaveform, "nodes": {"uav1": Node, "uav2": Node}}
+WAVEFORMS: dict[str, type[BaseModel]] = {
+    get_args(one.model_fields["kind"].annotation)[0]: one for one in get_args(get_args(Waveform)[0])
+}
+"""waveform.kind and the section that it stands for."""
+
 _FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1,uav2\n"
 
 
-def config_template() -> str:
+def config_template(kind: str = "ofdm") -> str:
     """Return config/config.yaml with every key, its meaning as a comment, and its default or an example.
+
+    Parameters
+    ----------
+    kind
+        Of waveform: a key of `WAVEFORMS`.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such kind.
 
     Examples
     --------
     >>> print(config_template().splitlines()[2])
     # name of the campaign
     """
+    if kind not in WAVEFORMS:
+        raise CampaignError(
+            f"kind {quoted(kind)}", where="apertura init", expected=", ".join(WAVEFORMS), remedy="Choose one of them."
+        )
+    examples = {"waveform": WAVEFORMS[kind], "nodes": {"uav1": Node, "uav2": Node}}
     header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
-    return header + "\n".join(_section(Settings, 0)) + "\n"
+    return header + "\n".join(_section(Settings, 0, examples)) + "\n"
 
 
 def flights_template() -> str:
@@ -38,14 +61,14 @@ def config_schema() -> str:
     return json.dumps(Settings.model_json_schema(), indent=1) + "\n"
 
 
-def _section(model: type[BaseModel], depth: int) -> list[str]:
+def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
     lines: list[str] = []
     for name, field in model.model_fields.items():
         indent = "  " * depth
         lines.append(f"{indent}# {field.description}{_choices(field)}")
         if name == "engine_options":
             lines += [f"{indent}#   {line}" for line in _options_of_each_engine()]
-        value = _EXAMPLES.get(name) if depth == 0 and name in _EXAMPLES else _value(field)
+        value = examples[name] if name in examples else _value(field)
         if isinstance(value, type) and issubclass(value, BaseModel):
             lines += [f"{indent}{name}:", *_section(value, depth + 1)]
         elif isinstance(value, dict) and value:
