@@ -164,6 +164,7 @@ def test_a_ulog_is_told_as_its_own_messages_say(shared):
     assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(gps["lat"])
     latitude = gps["lat"] * 1e-7
     assert report.facts["bounds"]["latitude_deg"] == pytest.approx([latitude.min(), latitude.max()], abs=1e-7)
+    assert report.facts["unusable_epochs"] == 0  # a log without RTK is used as it is
     assert any("RTK" in sentence for sentence in report.missing)
 
 

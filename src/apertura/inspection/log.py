@@ -50,7 +50,7 @@ def log_facts(track: "xr.Dataset") -> dict[str, Any]:
     times, position = track.time.values, track.position.values
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / np.diff(seconds(times))
     attitude = np.isfinite(track.attitude.values).all(axis=1)
-    poor = poorer_fix(track.fix.values, "fix") if "fix" in track else np.zeros(len(times), bool)
+    poor = poorer_fix(track.fix.values, "auto") if "fix" in track else np.zeros(len(times), bool)
     checked = check_track(seconds(times), position, poor_fix=poor, tolerated_m=WAVE_M / 16)
     found: dict[str, Any] = {
         "epochs": len(times),
