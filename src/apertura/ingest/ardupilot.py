@@ -160,7 +160,7 @@ def _parameter(fields: Fields, names: tuple[tuple[str, ...], ...], receiver: int
 def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
     """Return UTC of GPS weeks and milliseconds; NaT where a receiver did not know them yet."""
     known = (week > 0) & (week <= _LAST_WEEK) & (milliseconds >= 0) & (milliseconds < _WEEK_MS)
-    utc = np.full(week.size, np.datetime64("NaT"), "datetime64[ns]")
+    utc = np.full(week.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))
     return utc
 

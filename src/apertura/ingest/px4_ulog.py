@@ -138,7 +138,7 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
     for name, good in _STATES.items():
         fixed &= np.asarray(fields.get(f"{source}/{name}", good)) == good
     boot_s = fields[f"{source}/timestamp"] * 1e-6
-    utc = np.full(boot_s.size, np.datetime64("NaT"), "datetime64[ns]")
+    utc = np.full(boot_s.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     if not source.startswith(FUSED):
         boot_s, utc = _arrived(fields, source), _utc(fields, source)
     unknown = np.full(latitude.size, np.nan)
@@ -204,7 +204,7 @@ def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
     size = fields[f"{source}/timestamp"].size
     told = np.zeros(size, np.uint64) if told is None else told
     known = (told > _FIRST_US) & (told < _LAST_US)
-    utc = np.full(size, np.datetime64("NaT"), "datetime64[ns]")
+    utc = np.full(size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     utc[known] = told[known].astype("datetime64[us]")
     return utc
 

@@ -50,4 +50,5 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
 
 def outside(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
     """Return the indices of times that are none, or are before 1980 or after 2199."""
-    return np.flatnonzero(~((times >= FIRST) & (times < LAST)))
+    first, last = (bound.astype(times.dtype) for bound in (FIRST, LAST))  # nanoseconds would not hold all others
+    return np.flatnonzero(~((times >= first) & (times < last)))
