@@ -26,7 +26,11 @@ def listed():
     """Return the midnights (UTC) that leap seconds of GPS time's years end at, and when tzdata's list expires."""
     lines = (files("tzdata") / "zoneinfo" / "leapseconds").read_text().splitlines()
     rows = [line.split() for line in lines]
-    days = [np.datetime64(f"{row[1]}-{MONTHS[row[2]]}-{row[3]}", "D") + np.timedelta64(1, "D") for row in rows if row and row[0] == "Leap"]
+    days = [
+        np.datetime64(f"{row[1]}-{MONTHS[row[2]]}-{row[3]}", "D") + np.timedelta64(1, "D")
+        for row in rows
+        if row and row[0] == "Leap"
+    ]
     expires = next(row[1:4] for row in rows if row and row[0] in {"Expires", "#Expires"})
     since = np.array([day for day in days if day > GPS_EPOCH], "datetime64[ns]")
     return since, np.datetime64(f"{expires[0]}-{MONTHS[expires[1]]}-{expires[2]}", "ns")

@@ -435,7 +435,9 @@ def test_make_demo_leaves_a_folder_of_somebody_else_alone(tmp_path):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    own = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}  # of `make test`
+    own = {
+        name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))
+    }  # of `make test`
     done = subprocess.run(["make", "demo"], cwd=tmp_path, env=own, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "error: demo/ was not made by make demo" in done.stderr

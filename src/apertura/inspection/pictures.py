@@ -167,7 +167,9 @@ def draw_campaign(spans: Mapping[tuple[str, str], Mapping[str, Span]], name: str
     figure = _figure(name, (10, 1.5 + 1.2 * len(spans)))
     for axes, flight in zip(np.ravel(figure.subplots(len(flights), 1)), flights, strict=True):
         own = {node: known for (of, node), known in spans.items() if of == flight}
-        begun = min((first for known in own.values() for first, _ in known.values()), default=np.datetime64("NaT", "ns"))
+        begun = min(
+            (first for known in own.values() for first, _ in known.values()), default=np.datetime64("NaT", "ns")
+        )
         for row, known in enumerate(own.values()):
             for kind, (first, last) in known.items():
                 start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - begun, last - first))
