@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import run_steps
+from folders import complaint, run_steps
 
 from apertura.campaign import Campaign
 from apertura.check import problems
@@ -82,6 +82,11 @@ def test_the_reflector_of_the_rail_pass_is_where_it_was_tracked(rail_pass):
     assert above_db > 20
     assert across_m < 0.15
     assert along_m < 0.10
+
+
+def test_a_drift_without_a_reflector_is_refused(rail_pass):
+    message = complaint(lambda: align(Campaign.load(rail_pass), "passA", "radar", drift=True))
+    assert "--point" in message
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Whether the headers of recordings fit the waveform and the pairs."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 
 import numpy as np
 
@@ -9,7 +8,6 @@ from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.ingest.recording import Recording
 from apertura.load.mixing import check_mixing
-from apertura.load.transmitted import transmitted
 from apertura.paths import inside
 from apertura.settings import CONFIG, OfdmWaveform, SampledWaveform
 
@@ -23,9 +21,7 @@ def check_recordings(inspected: Inspected) -> Iterator[CampaignError]:
     waveform = inspected.waveform
     if waveform is None:
         return
-    sent = None
-    with suppress(CampaignError):  # of the file of what was sent other checks tell
-        sent = transmitted(inspected.campaign, waveform)
+    sent = inspected.sent
     for recording in inspected.recordings.values():
         keys = (("sample_rate_hz", "core:sample_rate"), ("carrier_hz", "core:frequency"))
         recorded = recording.sample_rate_hz, recording.frequency_hz

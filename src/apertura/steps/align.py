@@ -60,6 +60,13 @@ def align(
     CampaignError
         If nothing can be told.
     """
+    if drift and point is None:
+        raise CampaignError(
+            "a drift asked for without a point",
+            where="apertura align --drift",
+            expected="the place of a reflector: sharpness alone does not tell a drift",
+            remedy="Give it by --point, or leave --drift out.",
+        )
     given = unaligned(campaign, campaign.flight(flight).name, node)
     if search_m == 0.0:
         given = given.less_path(campaign.settings.nodes[node].path_offset_m.radar)
