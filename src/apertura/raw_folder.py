@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, log_suffixes, read_track, recording_files
+from apertura.ingest import PHASE_HISTORIES, log_suffixes, read_phase_history, read_track, recording_files
 from apertura.paths import inside
 from apertura.settings import FLIGHTS, SampledWaveform, Settings
 
@@ -78,6 +78,11 @@ class RawFolder:
     def read_log(self, flight: str, node: str) -> "xr.Dataset":
         """Return the `track` stage of a node's flight log."""
         return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
+
+    def read_history(self, flight: str, node: str, *, pair: str) -> "xr.Dataset":
+        """Return the phase history that a node of a pair recorded, as its format says, or the config of its waveform."""
+        described = self.settings.waveform.model_dump()
+        return read_phase_history(described["format"], self.history_files(flight, node), pair=pair, described=described)
 
     def _recorded(self, flight: str, name: str) -> Path:
         return inside(self.root, f"raw/{flight}/{name}", where=self.root)

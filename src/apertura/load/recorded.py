@@ -10,7 +10,6 @@ from apertura.echo.dechirp import sweep_motion_flags
 from apertura.echo.missing_pulses import missing_flags
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
-from apertura.ingest import read_phase_history
 from apertura.load.node_log import raw_log, shortest_wave
 from apertura.load.positions import place, stated_error
 from apertura.settings import CONFIG
@@ -26,15 +25,17 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         frame than theirs.
     """
     tx, rx = pair.split("-")
-    files = campaign.history_files(flight, rx)
-    described = campaign.settings.waveform.model_dump()
-    history = read_phase_history(described["format"], files, pair=pair, described=described)
+    history = campaign.read_history(flight, rx, pair=pair)
     history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
     logged, placed = campaign.logged(flight, tx), "tx_position" in history
     if logged == placed:
         found = "positions both with the samples and in a flight log" if logged else "samples without positions"
         expected = "positions of one source: phase history with positions, or a flight log raw/<flight>/<node>.track.*"
-        raise CampaignError(found, files[0], expected, "Take one away." if logged else "Copy the flight log there.")
+        where, remedy = (
+            campaign.history_files(flight, rx)[0],
+            "Take one away." if logged else "Copy the flight log there.",
+        )
+        raise CampaignError(found, where, expected, remedy)
     if logged:
         return _placed_by_logs(campaign, flight, (tx, rx), history)
     _check_frame(campaign.settings.scene.crs, history.attrs["frame"])

@@ -10,7 +10,6 @@ from apertura.campaign import Campaign
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
-from apertura.ingest import read_phase_history
 from apertura.ingest.times import FIRST
 from apertura.load.node_log import NodeLog, raw_log, shortest_wave
 from apertura.refinement.motion import Logged, Recorded
@@ -92,9 +91,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns
         applied_ppm = clock.drift_ppm
     else:
-        described = campaign.settings.waveform.model_dump()
-        files = campaign.history_files(flight, node)
-        history = _some(read_phase_history(described["format"], files, pair=f"{node}-{node}", described=described))
+        history = _some(campaign.read_history(flight, node, pair=f"{node}-{node}"))
         off_m = 0.0
     times = history.time.values
     log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
