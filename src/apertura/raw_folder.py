@@ -80,7 +80,7 @@ class RawFolder:
         return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
 
     def read_history(self, flight: str, node: str, *, pair: str) -> "xr.Dataset":
-        """Return the phase history that a node of a pair recorded, as its format says, or the config of its waveform."""
+        """Return the phase history that a node of a pair recorded, as its format and the config say."""
         described = self.settings.waveform.model_dump()
         return read_phase_history(described["format"], self.history_files(flight, node), pair=pair, described=described)
 
