@@ -28,7 +28,7 @@ demo: $(SETUP)
 	test -e demo || { rm -rf build/demo && $(BIN)/apertura simulate build/demo && touch build/$(MARK) && mv build/demo demo; }
 	$(BIN)/apertura clean demo --yes
 	$(BIN)/apertura run demo
-	$(BIN)/apertura verify demo
+	$(BIN)/apertura score demo
 
 run: $(SETUP)
 	$(BIN)/apertura run $(or $(CAMPAIGN),$(error which campaign? make run CAMPAIGN=folder))

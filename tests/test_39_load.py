@@ -15,7 +15,7 @@ from apertura.load.results import OpenCampaign, open_campaign
 from apertura.load.scene import expected_scene, settled_scene
 from apertura.steps import echo, scene
 from apertura.steps.plan import first_flight
-from apertura.steps.verify import verify
+from apertura.steps.score import score
 from apertura.store import record_files
 
 PAIR = ("f01", "uav1-uav2")
@@ -72,7 +72,7 @@ def test_what_the_workflow_did_not_make_is_named(finished_tiny, tmp_path):
 
 def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(tiny):
     opened = open_campaign(tiny)
-    for work in (lambda: opened.scene, lambda: verify(opened.campaign)):
+    for work in (lambda: opened.scene, lambda: score(opened.campaign)):
         message = complaint(work)
         assert message.startswith(f"{tiny}/results/scene.json: not there, or not finished")
         assert "`apertura run`" in message

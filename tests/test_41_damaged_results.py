@@ -9,8 +9,8 @@ from apertura.campaign import Campaign
 from apertura.load.results import assessment_of, open_campaign
 from apertura.load.scene import settled_scene
 from apertura.steps.calibration import calibrated
+from apertura.steps.score import score
 from apertura.steps.summary import print_summary
-from apertura.steps.verify import verify
 from apertura.store import manifest_of, record_files, save_document
 
 DAMAGE = [b"", b"{", b"[]", b"{}", b'{"grid": 3}', b"\xff", b"null", b'{"pairs": 3}', b'{"pairs": {"uav1-uav2": {}}}']
@@ -70,4 +70,4 @@ def test_a_scene_whose_grid_is_none_is_damaged(tmp_path):
 
 def test_a_truth_that_is_none_is_one_message(tiny):
     (tiny / "truth.json").write_text('{"targets": [{"x": "left"}]}')
-    assert "truth.json: damaged" in complaint(lambda: verify(Campaign.load(tiny)))
+    assert "truth.json: damaged" in complaint(lambda: score(Campaign.load(tiny)))

@@ -26,7 +26,7 @@ from apertura.refinement.space_variance import MOST_LOSS_DB, SpaceVariance
 from apertura.settings.processing import Processing
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
 from apertura.steps import refine
-from apertura.steps.verify import verify
+from apertura.steps.score import score
 from apertura.store import open_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -101,7 +101,7 @@ def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair
 def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
     """What it leaves the image to be moved by is what the budget says of the logs, one sigma."""
     (line,) = [one for one in quality_of(campaigns["mended"], PAIRS[0])["budget"] if one["cause"] == "positions"]
-    assert max(one.error_m for one in verify(campaigns["mended"])) < 2 * line["shift_m"]
+    assert max(one.error_m for one in score(campaigns["mended"])) < 2 * line["shift_m"]
     assert line["shift_m"] == pytest.approx(0.087, rel=0.05)
 
 

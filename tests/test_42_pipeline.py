@@ -17,7 +17,7 @@ from apertura.load.scene import open_scene
 from apertura.quality.measures import numerical_error
 from apertura.quality.point_targets import Patch, find_peak
 from apertura.steps import echo
-from apertura.steps.verify import verify
+from apertura.steps.score import score
 from apertura.store import open_stage
 
 
@@ -26,7 +26,7 @@ def random_pixels(shape, count, seed):
 
 
 def findings(campaign, image):
-    return [finding for finding in verify(campaign) if finding.image == image]
+    return [finding for finding in score(campaign) if finding.image == image]
 
 
 @pytest.mark.parametrize("image", ["uav1-uav1", "uav1-uav2", "fused"])

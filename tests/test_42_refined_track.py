@@ -32,8 +32,8 @@ from apertura.refinement.outcome import Refinement
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.steps import echo, image, profile, refine, scene
 from apertura.steps.plan import print_plan
+from apertura.steps.score import score
 from apertura.steps.stamping import stamped
-from apertura.steps.verify import verify
 from apertura.store import open_stage, save_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -276,7 +276,7 @@ def test_a_campaign_whose_logs_err_by_2_cm_refines_itself(tmp_path):
         state(root, "processing", autofocus=name)
         campaign = run_steps(root)
         found[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
-        worst_m = max(one.error_m for one in verify(campaign))
+        worst_m = max(one.error_m for one in score(campaign))
     for pair in PAIRS:
         quality = quality_of(campaign, pair)
         assert quality["autofocus"]["accepted"]

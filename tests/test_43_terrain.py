@@ -28,7 +28,7 @@ from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.scene import PointTarget
 from apertura.steps import profile, scene, terrain
 from apertura.steps.plan import expected_plan
-from apertura.steps.verify import verify
+from apertura.steps.score import score
 from apertura.store import open_stage
 
 UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
@@ -78,7 +78,7 @@ def hillside(tmp_path_factory):
 
 
 def test_every_target_on_a_hillside_is_where_it_stands(hillside):
-    findings = verify(hillside)
+    findings = score(hillside)
     assert len(findings) == 9
     assert max(finding.error_m for finding in findings) < 0.03
 
@@ -88,7 +88,7 @@ def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
     root = copy_writable(hillside.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     edit_scene(root, dem=None, dem_datum=None)
-    findings = verify(run_steps(root))
+    findings = score(run_steps(root))
     off = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
     assert min(off) > 0.1
 

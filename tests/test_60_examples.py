@@ -12,7 +12,7 @@ from apertura.campaign import Campaign
 from apertura.check import problems
 from apertura.ingest.optitrack import body_position
 from apertura.steps.align import align, keep
-from apertura.steps.verify import verify
+from apertura.steps.score import score
 from apertura.store import open_stage
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -107,7 +107,7 @@ def test_targets_seen_from_a_real_px4_flight_are_within_a_centimetre(shared, tmp
     )
     assert problems(tmp_path / "replayed") == []
     run_steps(tmp_path / "replayed")
-    found = [row for row in verify(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
+    found = [row for row in score(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
     assert len(found) == 3
     assert max(row.error_m for row in found) < 0.01
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apertura import __version__, raw_commands
+from apertura import __version__, product_commands, raw_commands
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError, explained
 from apertura.paths import leave_working_folder
@@ -27,6 +27,7 @@ app.add_typer(step, name="step")
 app.add_typer(study, name="study")
 app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
+app.command()(product_commands.score)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
@@ -197,17 +198,6 @@ def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = 
     from apertura.steps.summary import print_summary
 
     print_summary(opened)
-
-
-@app.command()
-def verify(
-    campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
-) -> None:
-    """Compare where point targets are found with where they were put, and print the products' paths."""
-    opened = _opened(campaign)
-    from apertura.steps.verify import print_findings
-
-    print_findings(opened, paths=paths)
 
 
 @app.command()

@@ -42,7 +42,7 @@ class Finding:
         return float(np.hypot(self.error_east_m, self.error_north_m))
 
 
-def verify(campaign: Campaign) -> list[Finding]:
+def score(campaign: Campaign) -> list[Finding]:
     """Return where each target of truth.json is found in each SLC of the campaign, and its −3 dB widths.
 
     Raises
@@ -107,12 +107,12 @@ def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[f
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
-    """Print a short table of what `verify` finds, and where the products lie."""
+    """Print a short table of what `score` finds, and where the products lie."""
     console = Console(width=120)
     table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
     for heading in ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range"):
         table.add_column(heading, justify="right" if heading not in {"flight", "image"} else "left")
-    for finding in verify(campaign):
+    for finding in score(campaign):
         numbers = (finding.error_east_m, finding.error_north_m, finding.error_m)
         widths = (finding.cross_range_m, finding.ground_range_m)
         row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]

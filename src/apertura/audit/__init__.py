@@ -1,0 +1,1 @@
+"""Products held against what they claim to be made from: their chain to the raw samples, made again, told apart."""

@@ -1,0 +1,1 @@
+"""A campaign in a browser: one page with its images, served on this machine alone."""
