@@ -22,6 +22,7 @@ from apertura.quality.fused import Amplitude
 from apertura.quality.measures import Raster, survey
 from apertura.quality.point_targets import find_peak
 from apertura.scene.grid import SceneGrid
+from apertura.steps.stamping import tags_of
 from apertura.store import open_stage, record_files
 
 
@@ -50,7 +51,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         {"image": image.image},
         radiometry=report["radiometry"],
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=origin.tags() | _quality_tags(report),
+        tags=tags_of(origin, lineage) | _quality_tags(report),
         **_georeference(settled_scene(campaign).grid),
     )
     return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
@@ -89,7 +90,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         {**sums, "magnitude": cube.magnitude[index]},
         radiometry=report["radiometry"],
         titles={source: f"{name} · {words}" for source, words in titles.items()},
-        tags=_fused_provenance(cube, images, assessed).tags() | _quality_tags(report),
+        tags=tags_of(_fused_provenance(cube, images, assessed), lineage) | _quality_tags(report),
         **_georeference(grid),
     )
     return _finish(folder, written, {"flight": flight, "pairs": list(pairs), **report}, lineage)
@@ -195,6 +196,7 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
         "numerical_error_db": worst["numerical_error_db"],
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
+        "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
         "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
         "redone": [one for quality in qualities for one in quality["redone"]],
     }
@@ -203,6 +205,7 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
 def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
     told = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
     return {
+        "APERTURA_INSTRUCTION_SET": report["instruction_set"],
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
         "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
         "APERTURA_PEAK_ERROR_DB": f"{report['peak_error_db']:.2f}",
