@@ -1,6 +1,6 @@
-"""Run by a Python that has QGIS, never imported: say as JSON what QGIS makes of some rasters, and draw one of them.
+"""Run by a Python that has QGIS, never imported: say what QGIS makes of rasters, sample and draw them.
 
-python in_qgis.py RASTER…  --draw RASTER PNG WIDTH
+What is asked comes as JSON on stdin: {"tell": [raster], "sample": {raster: [[x, y]]}, "draw": {raster: [png, width]}}.
 """
 
 import json
@@ -25,13 +25,16 @@ def told(path: str) -> dict[str, object]:
     """Return what the layer says; its style is the one that QGIS found by itself."""
     layer = QgsRasterLayer(path, "raster")
     provider, renderer, extent = layer.dataProvider(), layer.renderer(), layer.extent()
+    width, height = (
+        size / pixels for size, pixels in ((extent.width(), layer.width()), (extent.height(), layer.height()))
+    )
     found: dict[str, object] = {
         "valid": layer.isValid(),
         "crs": layer.crs().authid(),
         "wkt": layer.crs().toWkt(),
-        "extent": [extent.xMinimum(), extent.yMinimum(), extent.xMaximum(), extent.yMaximum()],
-        "size": [layer.width(), layer.height()],
-        "nodata": str(provider.sourceNoDataValue(1)) if provider.sourceHasNoDataValue(1) else None,
+        "transform": [width, 0.0, extent.xMinimum(), 0.0, -height, extent.yMaximum()],
+        "shape": [layer.height(), layer.width()],
+        "nodata": provider.sourceNoDataValue(1) if provider.sourceHasNoDataValue(1) else None,
         "renderer": renderer.type(),
     }
     if renderer.type() == "singlebandgray" and renderer.contrastEnhancement():
@@ -44,10 +47,12 @@ def told(path: str) -> dict[str, object]:
     return found
 
 
-def sampled(path: str, x: float, y: float) -> float | None:
-    """Return the value of the pixel at a place of the raster's own CRS; None without one."""
-    value, known = QgsRasterLayer(path, "raster").dataProvider().sample(QgsPointXY(x, y), 1)
-    return value if known else None
+def sampled(path: str, places: list[tuple[float, float]]) -> list[float | None]:
+    """Return the values of the pixels at places (x, y) of the raster's own CRS; None without one."""
+    layer = QgsRasterLayer(path, "raster")  # must outlive its provider
+    provider = layer.dataProvider()
+    found = [provider.sample(QgsPointXY(x, y), 1) for x, y in places]
+    return [value if known else None for value, known in found]
 
 
 def draw(path: str, picture: str, width: int) -> list[str]:
@@ -71,11 +76,11 @@ asked = json.load(sys.stdin)
 QgsApplication.setPrefixPath("/usr", True)
 application = QgsApplication([], False)
 application.initQgis()
-print(
+sys.stdout.write(
     json.dumps(
         {
             "told": {path: told(path) for path in asked.get("tell", [])},
-            "sampled": {path: sampled(path, *at) for path, at in asked.get("sample", {}).items()},
+            "sampled": {path: sampled(path, places) for path, places in asked.get("sample", {}).items()},
             "errors": {path: draw(path, *into) for path, into in asked.get("draw", {}).items()},
         }
     )
