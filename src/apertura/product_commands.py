@@ -32,3 +32,15 @@ def verify(
     from apertura.audit.verify import print_verified
 
     raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+) -> None:
+    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    there = second.absolute()
+    path = leave_working_folder(first)
+    from apertura.audit.diff import print_differences
+
+    raise typer.Exit(print_differences(path, there))

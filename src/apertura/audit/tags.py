@@ -50,12 +50,17 @@ def ours(tags: Mapping[Any, Any]) -> dict[str, str]:
 
 def _texts(path: Path) -> dict[Any, Any]:
     """Return the text chunks of a PNG."""
+    return dict(picture(path).info)
+
+
+def picture(path: Path) -> Any:
+    """Return a PNG with its pixels, a `PIL.Image.Image`; raises as `read_tags`."""
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path, formats=["PNG"]) as picture:
-            picture.load()  # texts may follow the pixels
-            return dict(picture.info)
+        with Image.open(path, formats=["PNG"]) as opened:
+            opened.load()  # texts may follow the pixels
+            return opened
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise CampaignError(f"not readable as PNG ({error})", path, EXPECTED, COPY_AGAIN) from error
 
