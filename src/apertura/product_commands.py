@@ -1,4 +1,4 @@
-"""What people ask of finished products: how far off their targets are."""
+"""What people ask of finished products: how far off their targets are, and whether they are what they were."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,3 +16,31 @@ def score(
     from apertura.steps.score import print_findings
 
     print_findings(Campaign.load(leave_working_folder(campaign)), paths=paths)
+
+
+def verify(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    campaign: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
+) -> None:
+    """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    there = None if campaign is None else campaign.absolute()
+    path = leave_working_folder(product)
+    from apertura.audit.verify import print_verified
+
+    raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+) -> None:
+    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    there = second.absolute()
+    path = leave_working_folder(first)
+    from apertura.audit.diff import print_differences
+
+    raise typer.Exit(print_differences(path, there))
