@@ -69,6 +69,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield ("mosaic",)
     yield from (("speed_accuracy",), ("whole",))
 
 
@@ -185,6 +186,16 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
 
 
+def _mosaic(campaign: Campaign) -> Result:
+    made = [
+        campaign.manifest(result, flight.name, folder)
+        for flight in campaign.image_flights
+        for result, folders in (("layers", flight.pairs), ("export", (*flight.pairs, "fused")))
+        for folder in folders
+    ]
+    return Result(campaign.manifest("mosaic", "mosaic"), tuple(made), {"campaign": campaign.settings.campaign})
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -226,6 +237,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "export": _export,
     "cphd": _cphd,
     "fused": _fused,
+    "mosaic": _mosaic,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }
