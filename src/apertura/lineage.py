@@ -69,6 +69,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield ("stac",)
     yield from (("speed_accuracy",), ("whole",))
 
 
@@ -185,6 +186,14 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
 
 
+def _stac(campaign: Campaign) -> Result:
+    flights = campaign.image_flights
+    of_pairs = [(each, one.name, pair) for one in flights for pair in one.pairs for each in ("echo", "layers", "export")]
+    described = [*of_pairs, *(("export", one.name, "fused") for one in flights), ("scene",)]
+    sources = tuple(campaign.manifest(*of) for of in described)
+    return Result(campaign.manifest("stac"), sources, {"campaign": campaign.settings.campaign})
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -226,6 +235,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "export": _export,
     "cphd": _cphd,
     "fused": _fused,
+    "stac": _stac,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }
