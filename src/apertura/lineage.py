@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from apertura.campaign import Campaign
 from apertura.digests import Result
-from apertura.settings import SampledWaveform
+from apertura.paths import shipped
+from apertura.provenance import sha256_tree
+from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
@@ -71,6 +73,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield ("stac",)
     yield from (("speed_accuracy",), ("whole",))
+    yield ("ro_crate",)
 
 
 def _raw(campaign: Campaign, flight: str, node: str) -> Result:
@@ -188,10 +191,19 @@ def _fused(campaign: Campaign, flight: str) -> Result:
 
 def _stac(campaign: Campaign) -> Result:
     flights = campaign.image_flights
-    of_pairs = [(each, one.name, pair) for one in flights for pair in one.pairs for each in ("echo", "layers", "export")]
+    pairs = [(one.name, pair) for one in flights for pair in one.pairs]
+    of_pairs = [(result, *pair) for pair in pairs for result in ("echo", "layers", "export")]
     described = [*of_pairs, *(("export", one.name, "fused") for one in flights), ("scene",)]
     sources = tuple(campaign.manifest(*of) for of in described)
     return Result(campaign.manifest("stac"), sources, {"campaign": campaign.settings.campaign})
+
+
+def _ro_crate(campaign: Campaign) -> Result:
+    made = [result_of(campaign, name, *where).manifest for name, *where in _order(campaign) if name != "ro_crate"]
+    stated = [path.as_posix() for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS) if (campaign.root / path).is_file()]
+    sources = (*stated, *(manifest for manifest in made if not on_demand(manifest)))
+    settings = {"campaign": campaign.settings.campaign, "workflow": sha256_tree(shipped() / "workflow")}
+    return Result(campaign.manifest("ro_crate"), sources, settings)
 
 
 def _speed_accuracy(campaign: Campaign) -> Result:
@@ -236,6 +248,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "cphd": _cphd,
     "fused": _fused,
     "stac": _stac,
+    "ro_crate": _ro_crate,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

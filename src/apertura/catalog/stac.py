@@ -9,11 +9,12 @@ from urllib.parse import quote
 import pystac
 from pystac.layout import CustomLayoutStrategy
 
+from apertura.catalog import CATALOG
 from apertura.catalog.assets import media_type, multihash
 from apertura.catalog.fields import EXTENSIONS, Acquisition
 
-CATALOG = "catalog.json"
-"""Where the catalog begins."""
+RECORDED = "apertura:recorded"
+"""Field of the catalog: the first and the last pulse of all images, UTC."""
 
 _NO_PLACE = "Local axes without a place on Earth: items have no geometry, and there is no collection, which needs one."
 
@@ -137,8 +138,10 @@ def catalog_files(campaign: str, images: Sequence[Image]) -> dict[str, dict[str,
         In any order; their files lie in the folder that holds the catalog's folder.
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
-    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign)
-    parent = _parent(campaign, ordered)
+    times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
+    told = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
+    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=told)
+    parent = _parent(campaign, ordered, times)
     catalog.add_child(parent)
     for image in ordered:
         item = item_of(image, "../../../..")
@@ -161,19 +164,18 @@ def _layout() -> CustomLayoutStrategy:
 
     return CustomLayoutStrategy(
         catalog_func=lambda _, folder, is_root: f"{folder}/{CATALOG if is_root else 'images.json'}",
-        collection_func=lambda _, folder, is_root: f"{folder}/collection.json",
+        collection_func=lambda _, folder, _is_root: f"{folder}/collection.json",
         item_func=item,
     )
 
 
-def _parent(campaign: str, images: Sequence[Image]) -> pystac.Catalog:
+def _parent(campaign: str, images: Sequence[Image], times: tuple[datetime, datetime]) -> pystac.Catalog:
     """Return what holds the items: a collection, or a catalog where the campaign has no place."""
     placed = [image.geometry for image in images if image.geometry is not None]
     title = f"{campaign} · images"
     if not placed:
         return pystac.Catalog("images", f"Radar images of the campaign {campaign}. {_NO_PLACE}", title)
-    times = [[min(image.acquisition.start for image in images), max(image.acquisition.end for image in images)]]
-    extent = pystac.Extent(pystac.SpatialExtent([bounds(placed)]), pystac.TemporalExtent(times))  # type: ignore[arg-type]
+    extent = pystac.Extent(pystac.SpatialExtent([bounds(placed)]), pystac.TemporalExtent([list(times)]))
     return pystac.Collection("images", f"Radar images of the campaign {campaign}.", extent, title, license="other")
 
 

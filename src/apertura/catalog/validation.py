@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlsplit
 
 import pystac
 
-from apertura.catalog.stac import CATALOG
+from apertura.catalog import CATALOG
 from apertura.documents import read_json
 from apertura.errors import CampaignError, shown
 from apertura.paths import inside

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
+from apertura.catalog import CATALOG
 from apertura.catalog.assets import asset_of, told_by
 from apertura.catalog.fields import Acquisition, projection
-from apertura.catalog.stac import CATALOG, Image, catalog_files, instant
+from apertura.catalog.stac import Image, catalog_files, instant
 from apertura.documents import undamaged
 from apertura.environment import lock_sha256, software
 from apertura.errors import CampaignError
@@ -102,16 +103,16 @@ class _Described:
             told, name = told_by(path), quote(self.campaign.relative(path).removeprefix("results/"))
             key = path.stem if path.suffix == ".tif" else path.name
             assets[key] = asset_of(path, f"../../../{name}", sha256=digest, told=told)
-            inputs = inputs or told.inputs
+            inputs = inputs or dict(told.inputs)
         return assets, inputs
 
     def _properties(self, flight: str, name: str) -> dict[str, Any]:
         """Return where an image lies, how it was made, and what it says of itself."""
         path = self.campaign.result(flight, name, "image.json")
         manifest = path.with_name("export.manifest.json")
-        report = open_listed(path, manifest)
+        report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
         code = read_manifest(manifest).get("code", "unknown")
-        with undamaged(path, expected="the report of an image", remedy=f"Delete {manifest} and run the workflow again."):
+        with undamaged(path, expected="the report of an image", remedy=remedy):
             verdict = str(report["focus"]["verdict"])
             return {
                 **self._shared,
@@ -150,6 +151,6 @@ class _Described:
 
 
 def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
-    """Return the widths at -3 dB of an image's brightest point, as they were measured; of a speckle they say nothing."""
+    """Return the widths at -3 dB of an image's brightest point, as they were measured."""
     widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
     return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
