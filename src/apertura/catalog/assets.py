@@ -101,10 +101,7 @@ def told_by(path: Path) -> Told:
             inputs = {str(name): str(digest) for name, digest in told.items()}
             return Told(raster.descriptions[0] or path.name, bands, inputs)
     except (rasterio.RasterioIOError, ValueError, AttributeError) as error:
-        expected, remedy = (
-            "a GeoTIFF as the workflow wrote it",
-            "Delete the manifest beside it, run the workflow again.",
-        )
+        expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
 
 
