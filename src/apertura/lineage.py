@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from apertura.campaign import Campaign
 from apertura.digests import Result
-from apertura.settings import SampledWaveform
+from apertura.paths import shipped
+from apertura.provenance import sha256_tree
+from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
@@ -70,7 +72,9 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield ("mosaic",)
+    yield ("stac",)
     yield from (("speed_accuracy",), ("whole",))
+    yield ("ro_crate",)
 
 
 def _raw(campaign: Campaign, flight: str, node: str) -> Result:
@@ -196,6 +200,23 @@ def _mosaic(campaign: Campaign) -> Result:
     return Result(campaign.manifest("mosaic", "mosaic"), tuple(made), {"campaign": campaign.settings.campaign})
 
 
+def _stac(campaign: Campaign) -> Result:
+    flights = campaign.image_flights
+    pairs = [(one.name, pair) for one in flights for pair in one.pairs]
+    of_pairs = [(result, *pair) for pair in pairs for result in ("echo", "layers", "export")]
+    described = [*of_pairs, *(("export", one.name, "fused") for one in flights), ("scene",)]
+    sources = tuple(campaign.manifest(*of) for of in described)
+    return Result(campaign.manifest("stac"), sources, {"campaign": campaign.settings.campaign})
+
+
+def _ro_crate(campaign: Campaign) -> Result:
+    made = [result_of(campaign, name, *where).manifest for name, *where in _order(campaign) if name != "ro_crate"]
+    stated = [path.as_posix() for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS) if (campaign.root / path).is_file()]
+    sources = (*stated, *(manifest for manifest in made if not on_demand(manifest)))
+    settings = {"campaign": campaign.settings.campaign, "workflow": sha256_tree(shipped() / "workflow")}
+    return Result(campaign.manifest("ro_crate"), sources, settings)
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -238,6 +259,8 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "cphd": _cphd,
     "fused": _fused,
     "mosaic": _mosaic,
+    "stac": _stac,
+    "ro_crate": _ro_crate,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

@@ -115,6 +115,8 @@ DEMANDS: Mapping[str, Demand] = {
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
     "mosaic": Demand(500),
+    "stac": Demand(500),
+    "ro_crate": Demand(500),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
     "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
 }

@@ -134,3 +134,15 @@ def cphd(flight: str, pair: str, campaign: Directory = HERE) -> None:
 def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
     _run("apertura.steps.export:export", campaign, flight, pair)
+
+
+@app.command()
+def stac(campaign: Directory = HERE) -> None:
+    """Describe every image in a static STAC catalog, stac/catalog.json."""
+    _run("apertura.steps.stac:stac", campaign)
+
+
+@app.command()
+def ro_crate(campaign: Directory = HERE) -> None:
+    """Tell the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json."""
+    _run("apertura.steps.ro_crate:ro_crate", campaign)

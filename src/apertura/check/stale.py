@@ -10,6 +10,7 @@ from typing import Any
 
 from apertura.atomic import date
 from apertura.campaign import Campaign
+from apertura.catalog import CATALOG, CRATE
 from apertura.digests import Result, digest_of
 from apertura.errors import CampaignError
 from apertura.export import COVERAGE, PHASE_HISTORY, exports_in
@@ -138,6 +139,8 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
 _PRODUCTS = {
     "coverage": COVERAGE,
     "cphd": (PHASE_HISTORY,),
+    "stac": (f"stac/{CATALOG}",),
+    "ro_crate": (CRATE,),
     **{
         name: tuple(row.file for row in exports_in(kind))
         for name, kind in {"export": "pair", "fused": "fused", "layers": "layers"}.items()
