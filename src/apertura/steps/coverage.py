@@ -40,7 +40,7 @@ def coverage(campaign: Campaign) -> list[Path]:
     picture, features = written = [campaign.result(name) for name in COVERAGE]
     tags = Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs).tags()
     title = f"{campaign.settings.campaign} · coverage"
-    write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
+    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
     found = feature_collection(covered, transform, _place(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
         temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
@@ -55,10 +55,10 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
     if len(set(pair.split("-"))) == 1:
         del legs["receiver"]  # the same node: one track
     tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
-    return Covered(flight, pair, tracks_m, _looks(campaign, flight, pair))
+    return Covered(flight, pair, tracks_m, looks_of(campaign, flight, pair))
 
 
-def _looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
+def looks_of(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
     """Return the looks of a pair, averaged to few places; from the overviews of its file."""
     path = campaign.result(flight, pair, "looks.tif")
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
@@ -84,7 +84,7 @@ def _place(scene: OpenScene) -> Any:
     return place
 
 
-def _crs_name(grid: SceneGrid) -> str:
+def crs_name(grid: SceneGrid) -> str:
     from pyproj import CRS
 
     known = CRS.from_user_input(grid.crs_wkt)
