@@ -184,7 +184,7 @@ def _cphd(campaign: Campaign, flight: str, pair: str) -> Result:
 def _pictures(campaign: Campaign, flight: str, pair: str) -> Result:
     stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile", "image", "layers")]
     if isinstance(campaign.settings.waveform, SampledWaveform):
-        stages.append(campaign.manifest("raw", flight, pair.split("-")[0]))
+        stages.append(campaign.manifest("raw", flight, pair.partition("-")[0]))
     sources = (*stages, campaign.manifest("refined_track", flight), *_ground(campaign))
     return Result(campaign.manifest("pictures", flight, pair), sources, {"campaign": campaign.settings.campaign})
 

@@ -15,6 +15,10 @@ from apertura.report.sheet import BLUE, GREY, RED, sheet
 _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
 _LABELS = {"loss_db": "peak lost, dB", "shift_m": "targets shifted, m", "phase_rad": "phase of the image, rad"}
 NOT_STATED = "not stated"
+_STYLES: Mapping[bool, Any] = {
+    False: {"color": BLUE, "label": "stated or measured"},
+    True: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
+}
 
 
 @dataclass(frozen=True)
@@ -68,10 +72,7 @@ def _draw(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
     least, places = _LEAST[measure], np.arange(len(lines))
     sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
     highest = max([10 * least, *sizes])
-    for silent, style in (
-        (False, {"color": BLUE, "label": "stated or measured"}),
-        (True, {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "nobody stated it: of the size assumed in the table"}),
-    ):
+    for silent, style in _STYLES.items():
         some = [
             place
             for place, line in enumerate(lines)
@@ -92,7 +93,8 @@ def _draw(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
 
 def _draw_measured(axes: Axes, measured: Measured) -> None:
     if measured.expected_db is not None:
-        axes.axvline(max(abs(measured.expected_db), _LEAST["loss_db"]), color=BLUE, ls=":", label="expected, all stated")
+        expected = max(abs(measured.expected_db), _LEAST["loss_db"])
+        axes.axvline(expected, color=BLUE, linestyle=":", label="expected, all stated")
     if measured.loss_db is not None:
         loss = max(abs(measured.loss_db), _LEAST["loss_db"])
         axes.axvline(loss, color=RED, linewidth=1.4, label="measured at bright points")

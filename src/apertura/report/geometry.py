@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from apertura.export.map_layout import from_origin, number, round_length, round_origin
 from apertura.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, sheet
 
-_STYLES: Mapping[str, Mapping[str, object]] = {
+_STYLES: Mapping[str, Any] = {
     "transmitter": {"color": BLUE, "linestyle": "-", "linewidth": 1.6},
     "receiver": {"color": ORANGE, "linestyle": "--", "linewidth": 1.6},
 }
@@ -100,7 +101,8 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
     half, (x, y) = (0.5 + _MARGIN) * side, (low + high) / 2
     y -= _BELOW * side
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", title="plan")
-    axes.add_patch(Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene"))
+    scene = Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene")
+    axes.add_patch(scene)
     for number_of, ring in enumerate(flown.footprint):
         axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if number_of else "footprint")
     for name, track in flown.tracks_m.items():

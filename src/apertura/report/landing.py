@@ -24,7 +24,7 @@ def rst_text(text: str) -> str:
 
 
 def rst_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of text as the directive ``list-table``.
+    r"""Return a table of text as the directive ``list-table``.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def rst_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     <BLANKLINE>
        * - image
          - flags
-       * - a\\-b
+       * - a\-b
          - none
     """
     lines = [".. list-table::", "   :header-rows: 1", ""]

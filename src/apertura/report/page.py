@@ -1,4 +1,4 @@
-"""A page of headings, sentences, tables and pictures as one HTML file that asks nobody for anything and prints on A4."""
+"""A page of headings, sentences, tables and pictures as one HTML file that needs nothing else and prints on A4."""
 
 import base64
 from collections.abc import Iterable, Iterator, Sequence
@@ -7,7 +7,8 @@ from html import escape
 
 _STYLE = """
 @page { size: A4; margin: 18mm 20mm; }
-body { font: 10.5pt/1.45 Georgia, 'DejaVu Serif', serif; color: #111; max-width: 170mm; margin: 12mm auto; padding: 0 4mm; }
+body { font: 10.5pt/1.45 Georgia, 'DejaVu Serif', serif; color: #111; }
+body { max-width: 170mm; margin: 12mm auto; padding: 0 4mm; }
 h1, h2, h3 { font-family: 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif; line-height: 1.2; break-after: avoid; }
 h1 { font-size: 17pt; } h2 { font-size: 13pt; margin-top: 9mm; } h3 { font-size: 11pt; }
 p { text-align: left; hyphens: auto; overflow-wrap: anywhere; }
@@ -88,7 +89,8 @@ class Picture:
         """As HTML, the picture inside."""
         source = base64.b64encode(self.png).decode("ascii")
         caption = escape(self.caption)
-        return f'<figure><img alt="{caption}" src="data:image/png;base64,{source}"><figcaption>{caption}</figcaption></figure>'
+        picture = f'<img alt="{caption}" src="data:image/png;base64,{source}">'
+        return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
 Block = Heading | Paragraph | Table | Picture

@@ -25,7 +25,7 @@ MOST_DOTS = 4000
 BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#666666"
 """Told apart also by who does not see red and green (Okabe and Ito)."""
 
-_STYLE: Mapping[str, Any] = {
+_STYLE: Any = {
     "font.size": 8,
     "axes.titlesize": 8.5,
     "axes.titleweight": "bold",
@@ -64,7 +64,7 @@ def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> 
     ...     (Path(folder) / "one.png").read_bytes()[1:4]
     b'PNG'
     """
-    with matplotlib.style.context("default"), matplotlib.rc_context(dict(_STYLE)):
+    with matplotlib.style.context("default"), matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure

@@ -41,7 +41,8 @@ def verdict_row(name: str, report: Report) -> Row:
 
     Examples
     --------
-    >>> verdict_row("f01 a-b", {"focus": {"verdict": "focused", "loss_db": -0.02}, "flags": {}, "numerical_error_db": -67.8})
+    >>> focus = {"verdict": "focused", "loss_db": -0.02}
+    >>> verdict_row("f01 a-b", {"focus": focus, "flags": {}, "numerical_error_db": -67.8})
     ('f01 a-b', 'focused', '0.02 dB', '', 'below −67.8 dB', '', 'none')
     """
     focus, pulses = report.get("focus") or {}, report.get("pulses") or {}
@@ -109,11 +110,26 @@ def decision_rows(report: Report) -> list[Row]:
     >>> decision_rows({"models": {"presum": "1: the scene is wide"}})
     [('presum', '1', 'the scene is wide')]
     """
-    rows = []
+    rows: list[Row] = []
     for name, line in (report.get("models") or {}).items():
         choice, _, why = str(line).partition(": ")
         rows.append((name.replace("_", " "), choice if why else "", why or choice))
     return rows
+
+
+def shared_rows(reports: Mapping[str, Report]) -> list[Row]:
+    """Return the decisions of several images, each once, with the images that it was made for.
+
+    Examples
+    --------
+    >>> shared_rows({"a-a": {"models": {"degree": "1: cheap"}}, "a-b": {"models": {"degree": "1: cheap"}}})
+    [('a-a, a-b', 'degree', '1', 'cheap')]
+    """
+    made: dict[Row, list[str]] = {}
+    for name, report in reports.items():
+        for row in decision_rows(report):
+            made.setdefault(row, []).append(name)
+    return [(", ".join(names), *row) for row, names in sorted(made.items())]
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Row]:

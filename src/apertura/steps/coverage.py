@@ -59,7 +59,13 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
 
 
 def looks_of(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
-    """Return the looks of a pair, averaged to few places; from the overviews of its file."""
+    """Return the looks of a pair, averaged to few places; from the overviews of its file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is not as step `layers` wrote it.
+    """
     path = campaign.result(flight, pair, "looks.tif")
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     remedy = f"Delete {manifest} and run the workflow again."
@@ -85,6 +91,7 @@ def _place(scene: OpenScene) -> Any:
 
 
 def crs_name(grid: SceneGrid) -> str:
+    """Return the name of a grid's CRS as pictures show it."""
     from pyproj import CRS
 
     known = CRS.from_user_input(grid.crs_wkt)

@@ -12,9 +12,11 @@ from apertura.documents import undamaged
 from apertura.errors import CampaignError, shown
 from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
+from apertura.paths import shipped
 from apertura.provenance import Provenance, sha256_file
 from apertura.report.landing import rst_table, rst_text
-from apertura.report.page import Block, Heading, Paragraph, Picture, Table, page as page_of
+from apertura.report.page import Block, Heading, Paragraph, Picture, Table
+from apertura.report.page import page as page_of
 from apertura.report.panels import draw_panels
 from apertura.report.words import (
     ASKED,
@@ -27,6 +29,7 @@ from apertura.report.words import (
     flag_rows,
     said,
     sentences,
+    shared_rows,
     told,
     verdict_row,
 )
@@ -39,19 +42,6 @@ PAGE = "report.html"
 PANELS = "panels.png"
 _DOTS = 480  # of the longer side of a panel
 _MOST_PANELS = 2  # pairs beside their sums
-
-CAPTIONS: Mapping[str, str] = {
-    "quicklook": "Power of the focused scene in dB, on the campaign's grid.",
-    "geometry": "Tracks of the antennas in plan (dots: where they begin; dotted: ground that pulses make), seen along "
-    "the flight in true proportions, and their heights over time.",
-    "pulses": "Pulses that make the image and pulses left out; where there is a sidelink, its signal over noise and its "
-    "delay beyond the length that the logs give it: clocks and triggers, which it takes out.",
-    "phase": "Phase that each pulse adds at the brightest target, against the mean of all, before and after each "
-    "correction. Neighbouring targets and noise add to it.",
-    "cuts": "Cuts through the brightest target along and across the flight; red: the −3 dB width.",
-    "range_profiles": "Range-compressed echoes over the flight, mean power; dotted: the path to the brightest target.",
-    "budget": "What each cause is expected to cost, beside what the image's bright points measured.",
-}
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
@@ -87,14 +77,15 @@ def reports_of(campaign: Campaign, flight: str) -> dict[str, dict[str, Any]]:
 
 
 def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> Iterator[Block]:
-    yield Table("What was asked, and the grid that it gave; all else is auto and decided below.", ASKED, asked_rows(campaign))
+    yield Table(
+        "What was asked, and the grid that it gave; all else is auto and decided below.", ASKED, asked_rows(campaign)
+    )
     yield Table("What each image says of itself.", VERDICTS, [verdict_row(*one) for one in reports.items()])
     yield Heading(2, "Pairs and their sums")
     yield Paragraph(" ".join(sentences("Sum of the pairs", reports["fused"])))
     yield Picture(
         campaign.result(flight, "fused", PANELS).read_bytes(),
-        "Pairs and what they add up to, each in dB below its own peak and all over the same 40 dB; ring: the brightest "
-        "target of the coherent sum.",
+        _caption("panels"),
     )
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
@@ -112,13 +103,18 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Heading(2, f"Pair {pair}")
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
     for name, of in ({"quicklook.png": "export"} | listed).items():
-        yield Picture(_checked(folder / name, f"{of}.manifest.json", folder), CAPTIONS[Path(name).stem])
+        yield Picture(_checked(folder / name, f"{of}.manifest.json", folder), _caption(Path(name).stem))
     yield Table(
         "Error budget; in brackets what a size assumed would do where nobody stated one.",
         BUDGET,
         budget_rows(report["budget"]),
     )
     yield Table("What the planner decided, and why.", DECISIONS, decision_rows(report))
+
+
+def _caption(name: str) -> str:
+    """Return what the workflow's report says below a picture."""
+    return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
 
 
 def _checked(path: Path, manifest: str, folder: Path) -> bytes:
@@ -134,7 +130,8 @@ def _checked(path: Path, manifest: str, folder: Path) -> bytes:
 def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any]) -> None:
     scene, pairs = settled_scene(campaign), campaign.flight(flight).pairs[:_MOST_PANELS]
     files = {pair: campaign.result(flight, pair, "power.tif") for pair in pairs}
-    files |= {f"{sum_} sum": campaign.result(flight, "fused", f"{sum_}_power.tif") for sum_ in ("coherent", "noncoherent")}
+    for kind in ("coherent", "noncoherent"):
+        files[f"{kind} sum"] = campaign.result(flight, "fused", f"{kind}_power.tif")
     powers = {}
     for name, file in files.items():
         with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
@@ -174,19 +171,19 @@ def _why(scene: OpenScene, name: str) -> str:
 
 def landing(campaign: Campaign) -> dict[str, Any]:
     """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
-    flights = campaign.image_flights
-    reports = {
-        f"{one.name} {name}": report for one in flights for name, report in reports_of(campaign, one.name).items()
-    }
-    decided = [
-        (f"{image} {row[0]}", *row[1:]) for image, report in reports.items() for row in decision_rows(report)
-    ]
+    flights = {one.name: one.pairs for one in campaign.image_flights}
+    reports = {f"{one} {name}": report for one in flights for name, report in reports_of(campaign, one).items()}
+    first, pairs = next(iter(flights.items()))
+    decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports, meanings())
     return {
         "title": rst_text(campaign.settings.campaign),
-        "flights": rst_text(", ".join(f"{one.name} ({', '.join(one.pairs)})" for one in flights)),
+        "flights": rst_text(", ".join(f"{one} ({', '.join(names)})" for one, names in flights.items())),
         "asked": rst_table(ASKED, asked_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
-        "sentences": [rst_text(" ".join(sentences(*one))) for one in reports.items()],
-        "decisions": rst_table(DECISIONS, decided),
-        "flags": rst_table(FLAGS, flag_rows(reports, meanings())) if any(one["flags"] for one in reports.values()) else "",
+        "sentences": [
+            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} fused"]))) for one in flights
+        ],
+        "first": rst_text(first),
+        "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
+        "flags": rst_table(FLAGS, raised) if raised else "",
     }
