@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from apertura.flags import FLAGS
 from apertura.report.budget import NOT_STATED
 
 Report = Mapping[str, Any]
@@ -12,7 +13,7 @@ ASKED = ("key", "value")
 VERDICTS = ("image", "verdict", "peak lost", "expected", "numerical error", "pulses", "flags")
 DECISIONS = ("decision", "choice", "why")
 BUDGET = ("cause", "stated", "peak lost", "targets shifted", "phase")
-FLAGS = ("flag", "images", "what was measured", "what it means", "what to look at first")
+FLAGGED = ("flag", "images", "what was measured", "what it means", "what to look at first")
 """Headings of the tables."""
 
 
@@ -152,29 +153,29 @@ def budget_rows(lines: Sequence[Report]) -> list[Row]:
     return rows
 
 
-def flag_rows(reports: Mapping[str, Report], meanings: Mapping[str, tuple[str, str]]) -> list[Row]:
+def flag_rows(reports: Mapping[str, Report]) -> list[Row]:
     """Return each flag once: which images carry it, what was measured, what it means and what to look at first.
 
     Parameters
     ----------
     reports
         Name of an image → its image.json.
-    meanings
-        Flag → what it means, what to look at first.
+
+    Examples
+    --------
+    >>> flag_rows({"a-a": {"flags": {"saturated_radar": "3 of 5"}}, "a-b": {"flags": {"new": "?"}}})[1]
+    ('new', 'a-b', '?', '', '')
     """
     raised: dict[str, dict[str, list[str]]] = {}
     for name, report in reports.items():
         for flag, line in report["flags"].items():
             raised.setdefault(flag, {}).setdefault(line, []).append(name)
-    return [
-        (
-            flag,
-            ", ".join(dict.fromkeys(name for names in lines.values() for name in names)),
-            "; ".join(lines),
-            *meanings.get(flag, ("", "")),
-        )
-        for flag, lines in raised.items()
-    ]
+    rows = []
+    for flag, lines in raised.items():
+        known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
+        images = ", ".join(dict.fromkeys(name for names in lines.values() for name in names))
+        rows.append((flag, images, "; ".join(lines), *((known.means, known.look) if known else ("", ""))))
+    return rows
 
 
 def _size(value: float, unit: str) -> str:

@@ -22,7 +22,7 @@ from apertura.report.words import (
     ASKED,
     BUDGET,
     DECISIONS,
-    FLAGS,
+    FLAGGED,
     VERDICTS,
     budget_rows,
     decision_rows,
@@ -35,7 +35,6 @@ from apertura.report.words import (
 )
 from apertura.scene.raster import opened_raster
 from apertura.steps.pictures import PICTURES
-from apertura.steps.summary import meanings
 from apertura.store import open_listed, open_stage, read_manifest, record_files
 
 PAGE = "report.html"
@@ -89,10 +88,10 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     )
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
-    raised = flag_rows(reports, meanings())
+    raised = flag_rows(reports)
     yield Heading(2, "Flags")
     if raised:
-        yield Table("What crossed a limit of a method, what it means and what to do.", FLAGS, raised)
+        yield Table("What crossed a limit of a method, what it means and what to do.", FLAGGED, raised)
     else:
         yield Paragraph("No image of this flight carries a flag: nothing known was crossed.")
 
@@ -174,7 +173,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
     flights = {one.name: one.pairs for one in campaign.image_flights}
     reports = {f"{one} {name}": report for one in flights for name, report in reports_of(campaign, one).items()}
     first, pairs = next(iter(flights.items()))
-    decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports, meanings())
+    decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)
     return {
         "title": rst_text(campaign.settings.campaign),
         "flights": rst_text(", ".join(f"{one} ({', '.join(names)})" for one, names in flights.items())),
@@ -185,5 +184,5 @@ def landing(campaign: Campaign) -> dict[str, Any]:
         ],
         "first": rst_text(first),
         "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
-        "flags": rst_table(FLAGS, raised) if raised else "",
+        "flags": rst_table(FLAGGED, raised) if raised else "",
     }
