@@ -142,7 +142,7 @@ def budget_rows(lines: Sequence[Report]) -> list[Row]:
     ...               "phase_rad": None}])
     [('heights', 'not stated; 1 m would do this', '(0.02 dB)', '(0.4 m)', '')]
     """
-    rows = []
+    rows: list[Row] = []
     for line in lines:
         held = "({})" if line["stated"].startswith(NOT_STATED) else "{}"
         sizes = (
@@ -170,7 +170,7 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Row]:
     for name, report in reports.items():
         for flag, line in report["flags"].items():
             raised.setdefault(flag, {}).setdefault(line, []).append(name)
-    rows = []
+    rows: list[Row] = []
     for flag, lines in raised.items():
         known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
         images = ", ".join(dict.fromkeys(name for names in lines.values() for name in names))
