@@ -30,6 +30,7 @@ app.command()(raw_commands.align)
 app.command()(product_commands.score)
 app.command()(product_commands.verify)
 app.command()(product_commands.diff)
+app.command()(product_commands.report)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]

@@ -15,7 +15,7 @@ from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
 
-ON_DEMAND = frozenset({"cphd", "speed_accuracy", "whole"})
+ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
 
 
@@ -40,8 +40,8 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     result
         A key of `RESULTS`.
     *where
-        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd), flight
-        (calibration, refined_track, assessment, fused), nothing (the others).
+        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd, pictures), flight
+        (calibration, refined_track, assessment, fused, page), nothing (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -73,6 +73,9 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield ("mosaic",)
     yield ("stac",)
+    for flight in campaign.image_flights:
+        yield from (("pictures", flight.name, pair) for pair in flight.pairs)
+        yield "page", flight.name
     yield from (("speed_accuracy",), ("whole",))
     yield ("ro_crate",)
 
@@ -183,6 +186,22 @@ def _cphd(campaign: Campaign, flight: str, pair: str) -> Result:
     return Result(campaign.manifest("cphd", flight, pair), sources, {"campaign": campaign.settings.campaign})
 
 
+def _pictures(campaign: Campaign, flight: str, pair: str) -> Result:
+    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile", "image", "layers")]
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        stages.append(campaign.manifest("raw", flight, pair.partition("-")[0]))
+    sources = (*stages, campaign.manifest("refined_track", flight), *_ground(campaign))
+    return Result(campaign.manifest("pictures", flight, pair), sources, {"campaign": campaign.settings.campaign})
+
+
+def _page(campaign: Campaign, flight: str) -> Result:
+    pairs = campaign.flight(flight).pairs
+    made = [campaign.manifest(of, flight, pair) for pair in pairs for of in ("pictures", "export")]
+    images = [campaign.manifest("image", flight, pair) for pair in pairs]
+    sources = (*made, *images, campaign.manifest("export", flight, "fused"), campaign.manifest("scene"))
+    return Result(campaign.manifest("page", flight), sources, campaign.values)
+
+
 def _fused(campaign: Campaign, flight: str) -> Result:
     images = [campaign.manifest("image", flight, pair) for pair in campaign.flight(flight).pairs]
     sources = (*images, campaign.manifest("assessment", flight), campaign.manifest("cube"), campaign.manifest("scene"))
@@ -261,6 +280,8 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "mosaic": _mosaic,
     "stac": _stac,
     "ro_crate": _ro_crate,
+    "pictures": _pictures,
+    "page": _page,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

@@ -131,6 +131,18 @@ def cphd(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def pictures(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget."""
+    _run("apertura.steps.pictures:pictures", campaign, flight, pair)
+
+
+@app.command()
+def page(flight: str, campaign: Directory = HERE) -> None:
+    """Write what the report says of a flight, report.html, which prints."""
+    _run("apertura.steps.page:page", campaign, flight)
+
+
+@app.command()
 def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
     _run("apertura.steps.export:export", campaign, flight, pair)

@@ -9,7 +9,7 @@ rule export:
                 f"results/{{flight}}/{{pair}}/{export.file}",
                 caption="../report/quicklook.rst",
                 category="{flight}",
-                labels={"image": "{pair}"},
+                labels={"image": "{pair}", "shows": "image"},
             )
             for export in exports_in("pair")
             if export.pictured
@@ -71,7 +71,7 @@ rule export_fused:
                 f"results/{{flight}}/fused/{export.file}",
                 caption="../report/quicklook.rst",
                 category="{flight}",
-                labels={"image": "fused"},
+                labels={"image": "fused", "shows": "image"},
             )
             for export in exports_in("fused")
             if export.pictured

@@ -38,7 +38,7 @@ def coverage(campaign: Campaign) -> list[Path]:
     picture, features = written = [campaign.result(name) for name in COVERAGE]
     tags = tags_of(Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
-    write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
+    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
     found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
         temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
@@ -57,7 +57,13 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
 
 
 def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
-    """Return the looks of a pair, averaged to few places; from the overviews of its file."""
+    """Return the looks of a pair, averaged to few places; from the overviews of its file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is not as step `layers` wrote it.
+    """
     path = campaign.result(flight, pair, "looks.tif")
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     remedy = f"Delete {manifest} and run the workflow again."
@@ -89,7 +95,8 @@ def place_of(scene: OpenScene) -> Any:
     return place
 
 
-def _crs_name(grid: SceneGrid) -> str:
+def crs_name(grid: SceneGrid) -> str:
+    """Return the name of a grid's CRS as pictures show it."""
     from pyproj import CRS
 
     known = CRS.from_user_input(grid.crs_wkt)
