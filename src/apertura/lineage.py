@@ -9,9 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from apertura.campaign import Campaign
 from apertura.digests import Result
 from apertura.settings import SampledWaveform
+from apertura.webmap.page import page_sha256
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
+
+_SHOWN = ("layers", "export")
+"""Results of a pair that the map shows."""
 
 ON_DEMAND = frozenset({"cphd", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
@@ -69,6 +73,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield ("map",)
     yield from (("speed_accuracy",), ("whole",))
 
 
@@ -185,6 +190,16 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
 
 
+def _map(campaign: Campaign) -> Result:
+    shown = [(stage, one.name, pair) for one in campaign.image_flights for pair in one.pairs for stage in _SHOWN]
+    shown += [("export", one.name, "fused") for one in campaign.image_flights]
+    made = [campaign.manifest(*of) for of in (*shown, ("coverage",), ("scene",))]
+    truth = ["truth.json"] if (campaign.root / "truth.json").is_file() else []
+    known = {key: campaign.values.get(key) for key in ("campaign", "calibration")}
+    known["reference_points"] = campaign.values["scene"]["reference_points"]
+    return Result(campaign.manifest("map", "map"), (*made, *truth), {**known, "page": page_sha256()})
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -226,6 +241,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "export": _export,
     "cphd": _cphd,
     "fused": _fused,
+    "map": _map,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

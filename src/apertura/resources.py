@@ -114,6 +114,7 @@ DEMANDS: Mapping[str, Demand] = {
     "cphd": Demand(500, pulse_bytes=500, recorded_s=120),
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
+    "map": Demand(500, pixel_s=1),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
     "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
 }

@@ -70,6 +70,12 @@ def coverage(campaign: Directory = HERE) -> None:
     _run("apertura.steps.coverage:coverage", campaign)
 
 
+@app.command("map")
+def step_map(campaign: Directory = HERE) -> None:
+    """Write the page that shows every image in a browser, map/index.html."""
+    _run("apertura.steps.webmap:webmap", campaign)
+
+
 @app.command()
 def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Compress a pair in range over the scene, profile.zarr."""

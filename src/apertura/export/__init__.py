@@ -94,6 +94,10 @@ COVERAGE = ("coverage.png", "coverage.geojson")
 """What shows the whole campaign."""
 
 
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
+
 def exports_in(folder: str) -> Iterator[Export]:
     """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
 
@@ -134,6 +138,7 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
         for folder, kinds in (*((name, ("pair", "layers")) for name in names), ("fused", ("fused",))):
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+    yield MAP
 
 
 def write_exports(
