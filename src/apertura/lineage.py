@@ -11,9 +11,13 @@ from apertura.digests import Result
 from apertura.paths import shipped
 from apertura.provenance import sha256_tree
 from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
+from apertura.webmap.page import page_sha256
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
+
+_SHOWN = ("layers", "export")
+"""Results of a pair that the map shows."""
 
 ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
@@ -76,6 +80,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     for flight in campaign.image_flights:
         yield from (("pictures", flight.name, pair) for pair in flight.pairs)
         yield "page", flight.name
+    yield ("map",)
     yield from (("speed_accuracy",), ("whole",))
     yield ("ro_crate",)
 
@@ -236,6 +241,16 @@ def _ro_crate(campaign: Campaign) -> Result:
     return Result(campaign.manifest("ro_crate"), sources, settings)
 
 
+def _map(campaign: Campaign) -> Result:
+    shown = [(stage, one.name, pair) for one in campaign.image_flights for pair in one.pairs for stage in _SHOWN]
+    shown += [("export", one.name, "fused") for one in campaign.image_flights]
+    made = [campaign.manifest(*of) for of in (*shown, ("coverage",), ("scene",))]
+    truth = ["truth.json"] if (campaign.root / "truth.json").is_file() else []
+    known = {key: campaign.values.get(key) for key in ("campaign", "calibration")}
+    known["reference_points"] = campaign.values["scene"]["reference_points"]
+    return Result(campaign.manifest("map", "map"), (*made, *truth), {**known, "page": page_sha256()})
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -282,6 +297,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "ro_crate": _ro_crate,
     "pictures": _pictures,
     "page": _page,
+    "map": _map,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

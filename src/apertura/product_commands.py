@@ -70,3 +70,15 @@ def report(
         for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
             typer.echo(path)
     raise SystemExit(status)
+
+
+def map_page(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with results")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
+) -> None:
+    """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    from apertura.campaign import Campaign
+    from apertura.load.map_server import served
+
+    served(Campaign.load(leave_working_folder(campaign)), port=port).show(in_browser=open_)

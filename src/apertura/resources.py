@@ -119,6 +119,7 @@ DEMANDS: Mapping[str, Demand] = {
     "ro_crate": Demand(500),
     "pictures": Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
     "page": Demand(500, pixel_s=5),
+    "map": Demand(500, pixel_s=1),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
     "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
 }

@@ -70,6 +70,12 @@ def coverage(campaign: Directory = HERE) -> None:
     _run("apertura.steps.coverage:coverage", campaign)
 
 
+@app.command("map")
+def step_map(campaign: Directory = HERE) -> None:
+    """Write the page that shows every image in a browser, map/index.html."""
+    _run("apertura.steps.webmap:webmap", campaign)
+
+
 @app.command()
 def mosaic(campaign: Directory = HERE) -> None:
     """Lay each product of all flights upon one another, mosaic/<pair>/<product>.vrt."""

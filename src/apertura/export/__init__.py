@@ -117,6 +117,10 @@ MOSAICS = "mosaic"
 """Folder of the rasters of all flights."""
 
 
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
+
 def exports_in(folder: str) -> Iterator[Export]:
     """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
 
@@ -197,6 +201,7 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
     yield from mosaic_files(pairs)
+    yield MAP
 
 
 def write_exports(

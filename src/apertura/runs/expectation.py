@@ -47,7 +47,7 @@ _COSTS = {
 
 _WIDE = frozenset({"image", "tiles"})
 """Rules whose jobs take all cores."""
-_BESIDE = frozenset({"cphd", "layers", "export", "pictures", "scene"})
+_BESIDE = frozenset({"cphd", "layers", "export", "map", "pictures", "scene"})
 """Rules that no other waits for, or hardly."""
 _MOST_BENCHMARKS = 500
 _USUAL_MPX = 0.25
