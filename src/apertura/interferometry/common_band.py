@@ -19,7 +19,7 @@ def common_band(
     Returns
     -------
     float
-        0 to 1, within 0.09 of what bands with sharp edges share.
+        0 to 1, within 0.09 of what equally wide bands with sharp edges share.
 
     Notes
     -----

@@ -12,6 +12,7 @@ import xarray as xr
 from apertura.campaign import Campaign
 from apertura.contracts import STAGES, Window
 from apertura.cube_variables import MEASURED, RASTERS
+from apertura.documents import undamaged
 from apertura.fusion.clutter import clutter_reduction_db
 from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.lineage import result_of
@@ -42,9 +43,11 @@ def cube(campaign: Campaign) -> Path:
     assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
+    with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
+        described = _empty(images, assessed, grid)
     with writing(folder) as wip:
         empty = stamped(
-            _empty(images, assessed, grid),
+            described,
             "cube",
             modules=[__name__],
             parents={"/".join(name): image for name, image in images.items()},
