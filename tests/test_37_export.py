@@ -34,8 +34,8 @@ TAGS = {
     "APERTURA_VERSION": "0.1.0",
     "APERTURA_ERROR_DB": "-61.2",
 }
-IMAGES = {export.file: export.write for export in exports_in("pair")}
-LAYERS = {export.file: export.write for export in exports_in("layers")}
+IMAGES = {export.file: export.write for export in exports_in("pair") if not export.file.endswith(".qml")}
+LAYERS = {export.file: export.write for export in exports_in("layers") if export.file.endswith(".tif")}
 RASTERS = {name: write for name, write in IMAGES.items() if name.endswith(".tif")}
 
 
@@ -149,6 +149,8 @@ from apertura.export import exports_in
 folder, image = Path(sys.argv[1]), np.load(sys.argv[2])
 for export in exports_in("pair"):
     path, tags = folder / export.file, {"B": "2", "A": "1"}
+    if path.suffix == ".qml":
+        continue
     export.write(path, image, transform=Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1), crs="EPSG:32632", tags=tags)
 """
 
