@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages test test-slow attack cluster-test lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages docs test test-slow attack cluster-test lint format lock clean
 
 setup: $(SETUP)
 
@@ -53,6 +53,12 @@ bench: $(SETUP)
 # The pages of docs/ that are written from the code.
 pages: $(SETUP)
 	$(BIN)/python -m website.pages
+
+# The site, into build/site: a link that leads nowhere ends it, so does a page that another host would be asked for.
+# Look at it: python3 -m http.server --bind 127.0.0.1 --directory build/site
+docs: pages
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	$(BIN)/python -m website.check build/site
 
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
