@@ -13,6 +13,9 @@ from apertura.settings import SampledWaveform
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
 
+INTERFEROMETRY = "interferometry"
+"""Folder of what two images tell of each other's phase."""
+
 ON_DEMAND = frozenset({"cphd", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
 
@@ -39,7 +42,8 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `RESULTS`.
     *where
         Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd), flight
-        (calibration, refined_track, assessment, fused), nothing (the others).
+        (calibration, refined_track, assessment, fused), a name of `interferometry.pairs` (interferogram), nothing
+        (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -69,6 +73,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield from (("interferogram", name) for name in campaign.settings.interferometry.pairs)
     yield from (("speed_accuracy",), ("whole",))
 
 
@@ -185,6 +190,20 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
 
 
+def _interferogram(campaign: Campaign, name: str) -> Result:
+    images = campaign.settings.interferometry.images(name)
+    made = [
+        source
+        for flight, pair in images
+        for source in (
+            *_seen(campaign, flight, [pair], "echo", "profile"),
+            *(campaign.manifest(stage, flight, pair) for stage in ("image", "layers")),
+        )
+    ]
+    settings = {"campaign": campaign.settings.campaign, "images": images, **campaign.relevant("interferogram")}
+    return Result(campaign.manifest("interferogram", INTERFEROMETRY, name), tuple(dict.fromkeys(made)), settings)
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -226,6 +245,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "export": _export,
     "cphd": _cphd,
     "fused": _fused,
+    "interferogram": _interferogram,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from apertura.errors import quoted
 
-RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "study", "logs", "benchmarks", "tiles"})
+RESERVED_NAMES = frozenset({"fused", "interferometry", "layers", "stac", "map", "study", "logs", "benchmarks", "tiles"})
 """Names of the results folder that no flight or node may take."""
 
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt")
