@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run bench paper stability test test-slow attack cluster-test lint format lock clean
+.PHONY: setup demo run bench paper stability pages test test-slow attack cluster-test lint format lock clean
 
 setup: $(SETUP)
 
@@ -42,6 +42,10 @@ bench: $(SETUP)
 	$(BIN)/uv pip install --quiet --python $(BIN)/python fastsar
 	$(BIN)/python benchmarks/engines.py
 
+# The pages of docs/ that are written from the code.
+pages: $(SETUP)
+	$(BIN)/python -m website.pages
+
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
 
@@ -62,8 +66,8 @@ cluster-test: $(SETUP)
 	$(BIN)/python -m tests.cluster
 
 lint: $(SETUP)
-	$(BIN)/ruff check src tests benchmarks
-	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/ruff check src tests benchmarks website
+	$(BIN)/ruff format --check src tests benchmarks website
 	$(BIN)/mypy --cache-dir=/dev/null  # what a cache remembers, a fresh clone does not: an error hid behind one
 	$(BIN)/snakefmt --check Snakefile workflow
 	$(BIN)/clang-format --dry-run -Werror native/*.?pp
@@ -72,8 +76,8 @@ lint: $(SETUP)
 	$(BIN)/snakemake --lint --directory build/lint
 
 format: $(SETUP)
-	$(BIN)/ruff check --fix src tests benchmarks
-	$(BIN)/ruff format src tests benchmarks
+	$(BIN)/ruff check --fix src tests benchmarks website
+	$(BIN)/ruff format src tests benchmarks website
 	$(BIN)/snakefmt Snakefile workflow
 	$(BIN)/clang-format -i native/*.?pp
 

@@ -10,12 +10,18 @@ import xarray as xr
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
+from apertura.environment import packages, software
 from apertura.export import exports_in, product_files
-from apertura.provenance import sha256_file
+from apertura.focus.engines import instruction_set
+from apertura.paths import shipped
+from apertura.provenance import Provenance, sha256_file
+from apertura.store import open_stage, read_manifest
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": PAIRS}))
-LAYERS = [f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers")]
+LAYERS = [
+    f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers") if export.file.endswith(".tif")
+]
 RASTERS = [name for name in PRODUCTS if name.endswith(".tif") and name not in LAYERS]
 RECORDED = [
     *(f"raw/f01/uav1.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.csv")),
@@ -30,7 +36,7 @@ def tags_of(campaign, name):
 
 def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
-    opened = {".tif", ".png", ".geojson"}
+    opened = {".tif", ".png", ".geojson", ".qml"}
     files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in opened}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
     assert (len(RASTERS), len(LAYERS)) == (12, 10)
@@ -63,6 +69,30 @@ def test_a_raster_says_where_it_comes_from(finished_tiny, name):
     for role, digest in inputs.items():
         assert digest == sha256_file(finished_tiny.root / role)
     assert re.fullmatch("[0-9a-f]{64}", tags["APERTURA_CODE_SHA256"])
+
+
+@pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
+def test_a_raster_names_what_it_was_made_from_and_with(finished_tiny, name):
+    tags, folder = tags_of(finished_tiny, name), (finished_tiny.results / name).parent
+    manifest = folder / ("layers.manifest.json" if name in LAYERS else "export.manifest.json")
+    sources = json.loads(tags["APERTURA_SOURCES"])
+    assert sources == read_manifest(manifest)["sources"]
+    assert "results/scene.manifest.json" in sources
+    for source, digest in sources.items():
+        assert digest == sha256_file(finished_tiny.root / source)
+    assert json.loads(tags["APERTURA_SOFTWARE"]) == software()
+    assert tags["APERTURA_LOCK_SHA256"] == sha256_file(shipped() / "requirements" / "all.txt")
+    if name in RASTERS:
+        assert tags["APERTURA_INSTRUCTION_SET"] == instruction_set("native")
+
+
+def test_a_product_that_stands_on_a_stage_of_other_versions_names_both(finished_tiny):
+    image = open_stage(finished_tiny.stage("image", "f01", "uav1-uav1"), "image")
+    assert image.attrs["software"] == packages()
+    older = xr.Dataset(attrs=image.attrs | {"software": packages() | {"numpy": "0.1"}})
+    origin = Provenance.of(["apertura.errors"], [older], software=packages())
+    assert origin.software["numpy"] == f"0.1, {packages()['numpy']}"
+    assert origin.software["zarr"] == packages()["zarr"]
 
 
 @pytest.mark.parametrize("name", RASTERS)

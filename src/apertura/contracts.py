@@ -105,6 +105,8 @@ STAGES: Mapping[str, Stage] = {
             "sidelink_delay": Variable(
                 ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
             ),
+            "sidelink_snr": Variable(("pulse",), "float64", "dB", "of the sidelink per subcarrier; NaN: no lock"),
+            "sidelink_phase": Variable(("pulse",), "float64", "rad", "of the sidelink at mid-band; NaN: no lock"),
             "sidelink_vector": Variable(
                 ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
             ),

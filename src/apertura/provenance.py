@@ -7,7 +7,7 @@ import json
 import re
 import sysconfig
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -42,11 +42,14 @@ class Provenance:
         Role → sha256 of each file read from outside the results.
     code_sha256
         Chain of the code hashes of the stages before it and its own.
+    software
+        Name → version of what ran, now and in the stages before it; several where those differ.
     """
 
     runspec: Mapping[str, Any]
     inputs: Mapping[str, str]
     code_sha256: str
+    software: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -56,6 +59,7 @@ class Provenance:
         *,
         settings: Mapping[str, Any] | None = None,
         inputs: Mapping[str, str] | None = None,
+        software: Mapping[str, str] | None = None,
     ) -> "Provenance":
         """Return what is inherited from `parents`, with what comes new.
 
@@ -68,6 +72,8 @@ class Provenance:
             whose settings are kept apart under their names.
         settings, inputs
             What of the config mattered, and role → sha256 of files read, now.
+        software
+            Name → version of what runs now.
 
         Raises
         ------
@@ -96,6 +102,7 @@ class Provenance:
             runspec | dict(settings or {}),
             merged(*(stage.attrs["inputs"] for stage in stages), inputs or {}),
             chained_sha256(code_sha256(*modules), (stage.attrs["code_sha256"] for stage in stages)),
+            joined(*(stage.attrs.get("software", {}) for stage in stages), software or {}),
         )
 
     def tags(self) -> dict[str, str]:
@@ -104,6 +111,7 @@ class Provenance:
             "APERTURA_RUNSPEC": canonical_json(self.runspec),
             "APERTURA_INPUTS": canonical_json(self.inputs),
             "APERTURA_CODE_SHA256": self.code_sha256,
+            "APERTURA_SOFTWARE": canonical_json(self.software),
             "APERTURA_VERSION": __version__,
         }
 
@@ -200,6 +208,21 @@ def merged(*sources: Mapping[str, str]) -> dict[str, str]:
             if union.setdefault(role, digest) != digest:
                 raise ValueError(f"{role} has two hashes: {union[role]} and {digest}")
     return dict(sorted(union.items()))
+
+
+def joined(*sources: Mapping[str, str]) -> dict[str, str]:
+    """Return name → version, all that were found where sources differ.
+
+    Examples
+    --------
+    >>> joined({"numpy": "2.4.6"}, {"numpy": "2.4.6", "zarr": "3.1.6"}, {"zarr": "3.2.0"})
+    {'numpy': '2.4.6', 'zarr': '3.1.6, 3.2.0'}
+    """
+    found: dict[str, set[str]] = {}
+    for source in sources:
+        for name, versions in source.items():
+            found.setdefault(name, set()).update(versions.split(", "))
+    return {name: ", ".join(sorted(versions)) for name, versions in sorted(found.items())}
 
 
 def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:

@@ -11,7 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+
+from apertura.export.radiometry import TAG
+from apertura.provenance import canonical_json
 
 SOURCES: Mapping[str, str] = {
     "image": "pair",
@@ -76,19 +80,27 @@ EXPORTS: tuple[Export, ...] = (
     Export("slc.tif", "image", "apertura.export.cog:write_slc"),
     Export("power.tif", "image", "apertura.export.cog:write_power"),
     Export("db.tif", "image", "apertura.export.db:write_db"),
+    Export("db.qml", "image", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc"),
     Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
     Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
+    Export("coherent_db.qml", "coherent", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "coherent", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("noncoherent_power.tif", "noncoherent", "apertura.export.cog:write_power"),
     Export("noncoherent_db.tif", "noncoherent", "apertura.export.db:write_db"),
+    Export("noncoherent_db.qml", "noncoherent", "apertura.export.style:write_db_style"),
     Export("noncoherent_magnitude.tif", "magnitude", "apertura.export.cog:write_magnitude"),
     Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
+    Export("incidence.qml", "incidence", "apertura.export.style:write_layer_style"),
     Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
+    Export("bistatic_angle.qml", "bistatic_angle", "apertura.export.style:write_layer_style"),
     Export("mask.tif", "mask", "apertura.export.layers:write_mask"),
+    Export("mask.qml", "mask", "apertura.export.style:write_mask_style"),
     Export("looks.tif", "looks", "apertura.export.layers:write_looks"),
+    Export("looks.qml", "looks", "apertura.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
+    Export("nesz.qml", "nesz", "apertura.export.style:write_layer_style"),
     Export("phase.tif", "phase", "apertura.export.interferogram:write_phase"),
     Export("coherence.tif", "coherence", "apertura.export.interferogram:write_coherence"),
     Export("unwrapped.tif", "unwrapped", "apertura.export.interferogram:write_unwrapped"),
@@ -111,8 +123,8 @@ def exports_in(folder: str) -> Iterator[Export]:
 
     Examples
     --------
-    >>> [export.file for export in exports_in("layers")]
-    ['incidence.tif', 'bistatic_angle.tif', 'mask.tif', 'looks.tif', 'nesz.tif']
+    >>> [export.file for export in exports_in("layers")][:4]
+    ['incidence.tif', 'incidence.qml', 'bistatic_angle.tif', 'bistatic_angle.qml']
     """
     return (export for export in EXPORTS if SOURCES[export.source] == folder)
 
@@ -123,7 +135,7 @@ def export_modules(folder: str) -> list[str]:
     Examples
     --------
     >>> export_modules("layers")
-    ['apertura.export.layers']
+    ['apertura.export.layers', 'apertura.export.style']
     """
     return sorted({export.module for export in exports_in(folder)})
 
@@ -149,7 +161,14 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def write_exports(
-    kind: str, folder: Path, rasters: Mapping[str, Any], *, titles: Mapping[str, str], **shared: Any
+    kind: str,
+    folder: Path,
+    rasters: Mapping[str, Any],
+    *,
+    titles: Mapping[str, str],
+    tags: Mapping[str, str],
+    radiometry: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    **shared: Any,
 ) -> list[Path]:
     """Write every file of a kind of folder; return their paths.
 
@@ -161,11 +180,17 @@ def write_exports(
         Where they go.
     rasters, titles
         Source → (y, x) raster on the campaign's grid, and what a person would call it.
+    tags
+        Of every file, name → text.
+    radiometry
+        Source → `apertura.export.radiometry.Radiometry.report`, of images.
     **shared
-        ``transform``, ``crs`` and ``tags``, as `apertura.export.cog.write_slc` takes them.
+        ``transform`` and ``crs``, as `apertura.export.cog.write_slc` takes them.
     """
     written = []
     for export in exports_in(kind):
         written.append(folder / export.file)
-        export.write(written[-1], rasters[export.source], title=titles[export.source], **shared)
+        source = export.source
+        means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
+        export.write(written[-1], rasters[source], title=titles[source], tags={**tags, **means}, **shared)
     return written

@@ -15,6 +15,9 @@ from apertura.interferometry.level import Known, Level, level, levelled
 from apertura.interferometry.sensitivity import Sensitivity
 from apertura.interferometry.unwrapping import Unwrapped, unwrap
 
+LEAST_SPREAD = 2.0
+"""Looks that a window's energy must be spread over: else a point beside its middle is all that it tells."""
+
 Floats = NDArray[np.float64]
 
 
@@ -94,17 +97,24 @@ def compared(
     >>> told.measured.coherent, told.measured.sensitive, bool(np.isnan(told.panels["height"]).all())
     (1024, 0, True)
     """
-    magnitude, phase, looks = formed(first, second, tiles, window=window)
+    both = formed(first, second, tiles, window=window)
+    magnitude, phase, looks = both.magnitude, both.phase, both.looks
     common = ground.plain & np.isfinite(magnitude)
     enough = looks > 1  # coherence of a single look is 1 whatever the images hold
-    valid = common & fits(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
+    energy = looks * both.shared.astype(np.float64)  # looks that the window's energy is spread over
+    told_by_one = energy < LEAST_SPREAD
+    valid = common & ~told_by_one & fits(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
     centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
-    known = [Known(one.name, one.row, one.column, one.phase_rad - centre) for one in ground.known]
+    known = [
+        replace(one, measured_rad=float(phase[one.row, one.column]) - centre)
+        for one in ground.known
+        if common[one.row, one.column]
+    ]
     told = level(unwrapped, known)
     alone = levelled(unwrapped, told) if told else np.full(common.shape, np.nan, np.float32)
-    at_place = _placed(ground, alone, magnitude, looks)
+    at_place = _placed(ground, alone, magnitude, np.minimum(looks, 2 * energy), looks)
     panels = {
         "phase": np.where(common, phase, np.nan).astype(np.float32),
         "coherence": np.where(common, magnitude, np.nan).astype(np.float32),
@@ -117,14 +127,16 @@ def compared(
     return Compared(panels, looks, _unwrapping(counted, unwrapped, alone, told, at_place), told)
 
 
-def _placed(ground: Ground, alone: NDArray[np.float32], magnitude: NDArray[np.float32], looks: float) -> Placed:
+def _placed(
+    ground: Ground, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
+) -> Placed:
     """Return heights at their own places from the phase that height alone has."""
     rise = ground.sensed.height(alone.astype(np.float64))
     std = np.full(rise.shape, np.nan)
     there = np.isfinite(rise)
     if there.any():
         steep = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[there]
-        std[there] = phase_std(unbiased(magnitude[there], looks), looks) / steep
+        std[there] = phase_std(unbiased(magnitude[there], looks), own[there]) / steep
     return placed(ground.height_m, rise, std, ground.shift_px)
 
 

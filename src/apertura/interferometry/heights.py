@@ -30,7 +30,7 @@ def least_coherence(looks: float) -> float:
     return float(np.sqrt(1 - BY_CHANCE ** (1 / max(looks - 1, 1e-6))))
 
 
-def phase_std(coherence: NDArray[np.float32], looks: float) -> NDArray[np.float32]:
+def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the standard deviation of the phase, rad, docs/theory/interferometry.md, eq. 8.
 
     Parameters
@@ -38,7 +38,7 @@ def phase_std(coherence: NDArray[np.float32], looks: float) -> NDArray[np.float3
     coherence
         (...) float32, without what chance adds to it.
     looks
-        Independent samples that the phase is the mean of.
+        Independent samples that the phase is the mean of, of all or of each.
 
     Examples
     --------

@@ -21,12 +21,15 @@ class Known:
         The pixel nearest to where it shows.
     phase_rad
         The phase that its height alone would have there.
+    measured_rad
+        The phase that is measured there, within a turn; NaN where none is.
     """
 
     name: str
     row: int
     column: int
     phase_rad: float
+    measured_rad: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -59,21 +62,21 @@ def level(phase: Unwrapped, known: Sequence[Known]) -> Level | None:
     phase
         Unwrapped.
     known
-        Points of known height; those on pixels without phase do not count.
+        Points of known height; those whose own phase is not known do not count.
 
     Examples
     --------
     >>> phase = np.array([[0.1, 0.2, 0.6]], np.float32)
     >>> told = Unwrapped(phase, np.ones((1, 3), np.uint32), "", 0, 0, 0)
-    >>> level(told, []).phase_rad, level(told, [Known("mast", 0, 2, 0.5)]).phase_rad
-    (0.2, 0.1)
+    >>> level(told, []).phase_rad, round(level(told, [Known("mast", 0, 2, 0.5, 0.7)]).phase_rad, 3)
+    (0.2, 0.2)
     """
-    sizes = np.bincount(phase.part[np.isfinite(phase.phase)])
-    if sizes[1:].sum() == 0:
+    valid = np.argwhere(np.isfinite(phase.phase) & (phase.part > 0))
+    if not len(valid):
         return None
-    told = [(one, float(phase.phase[one.row, one.column]), int(phase.part[one.row, one.column])) for one in known]
-    told = [(one, value, part) for one, value, part in told if part and np.isfinite(value)]
+    told = [(one, *_unwrapped(one, phase, valid)) for one in known if np.isfinite(one.measured_rad)]
     if not told:
+        sizes = np.bincount(phase.part[tuple(valid.T)])
         part = int(np.argmax(sizes[1:])) + 1
         return Level(round(float(np.median(phase.phase[phase.part == part])), 6), part)
     parts = [part for *_, part in told]
@@ -82,6 +85,13 @@ def level(phase: Unwrapped, known: Sequence[Known]) -> Level | None:
     constant = float(np.median(list(apart.values())))
     spread = max(abs(value - constant) for value in apart.values()) if len(apart) > 1 else None
     return Level(round(constant, 6), part, tuple(apart), spread)
+
+
+def _unwrapped(one: Known, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
+    """Return the phase measured at a point, by the turns and in the part of the valid pixel nearest to it."""
+    near = tuple(valid[np.argmin(((valid - (one.row, one.column)) ** 2).sum(axis=1))])
+    turns = np.round((float(phase.phase[near]) - one.measured_rad) / (2 * np.pi))
+    return float(one.measured_rad + 2 * np.pi * turns), int(phase.part[near])
 
 
 def levelled(phase: Unwrapped, told: Level) -> NDArray[np.float32]:

@@ -24,7 +24,7 @@ class Interferometry(Section):
         "two_tracks: [f01/uav1-uav1, f02/uav1-uav1]; none by default",
     )
     window_px: int = Field(
-        11, ge=LEAST_WINDOW_PX, le=255, description="side of the square that coherence and phase are means of, odd"
+        15, ge=LEAST_WINDOW_PX, le=255, description="side of the square that coherence and phase are means of, odd"
     )
 
     @field_validator("pairs")

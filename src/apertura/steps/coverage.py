@@ -19,6 +19,7 @@ from apertura.load.layer import opened_layer
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.provenance import Provenance, canonical_json
 from apertura.scene.grid import SceneGrid
+from apertura.steps.stamping import tags_of
 from apertura.store import open_stage, record_files
 
 _DOTS = 480  # of the longer side of the scene
@@ -37,7 +38,7 @@ def coverage(campaign: Campaign) -> list[Path]:
     down, right = (size * step / dots for size, dots in zip(scene.grid.shape, (rows, columns), strict=True))
     transform = Affine(right, 0, west, 0, -down, north)
     picture, features = written = [campaign.result(name) for name in COVERAGE]
-    tags = Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs).tags()
+    tags = tags_of(Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
     write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
     found = feature_collection(covered, transform, _place(scene), height_m=scene.level.height_m)

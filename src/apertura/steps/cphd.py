@@ -1,6 +1,6 @@
 """Rule `cphd`: the calibrated transfer functions of a pair as a CPHD file, for those who ask for it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.progress import progress
 from apertura.provenance import Provenance, canonical_json
+from apertura.steps.stamping import tags_of
 from apertura.store import blocks_of_rows, open_stage, record_files
 
 _NULL_ISLAND = (0.0, 0.0, 0.0)
@@ -29,7 +30,7 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/phase_history.cphd."""
     lineage = result_of(campaign, "cphd", flight, pair).begin(campaign.root, [__name__])
     echo, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), settled_scene(campaign)
-    collection = _collection(campaign, flight, echo, scene)
+    collection = _collection(campaign, flight, echo, scene, tags_of(Provenance.of([__name__], [echo]), lineage))
     path = campaign.result(flight, pair, PHASE_HISTORY)
     if collection.swath_s[1] <= 0:
         raise CampaignError(
@@ -43,7 +44,9 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
     return path
 
 
-def _collection(campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenScene) -> Collection:
+def _collection(
+    campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenScene, tags: Mapping[str, str]
+) -> Collection:
     """Return what the file says of the echo; a frame without a place on Earth is put at latitude and longitude 0.
 
     There east, north and up are axes of ECEF, and metres keep their value: only the height is rounded, by 1 nm.
@@ -62,7 +65,6 @@ def _collection(campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenSc
     corners = [-0.5, -0.5, rows - 0.5, rows - 0.5], [-0.5, columns - 0.5, -0.5, columns - 0.5]
     edges = (ecef(scene.grid.positions_at(*corners, scene.level.height_m)) - origin) @ axes.T
     (west, south), (east, north) = edges[:, :2].min(axis=0), edges[:, :2].max(axis=0)
-    tags = Provenance.of([__name__], [echo]).tags()
     return Collection(
         f"{campaign.settings.campaign} {flight} {echo.attrs['pair']}",
         echo.attrs["pair"],

@@ -11,7 +11,7 @@ import xarray as xr
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.contracts import Window
-from apertura.focus.engines import ENGINES
+from apertura.focus.engines import ENGINES, instruction_set
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.certify import certified, measures
 from apertura.imaging.focus_check import focus_flags, focus_report
@@ -50,6 +50,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         budget = budget_of(campaign, work.pair, work.scene)
         quality = {
             "engine": plan.engine,
+            "instruction_set": instruction_set(plan.engine),
             "models": plan.reasons,
             "predicted_error_db": round(plan.predicted_error_db, 2),
             **certified(

@@ -17,6 +17,7 @@ from apertura.lineage import INTERFEROMETRY, result_of
 from apertura.load.scene import open_scene
 from apertura.load.two_images import TwoImages, open_two
 from apertura.provenance import Provenance, canonical_json
+from apertura.steps.stamping import tags_of
 from apertura.store import record_files
 
 
@@ -56,7 +57,7 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
         folder,
         {**found.panels, "panels": found.panels},
         titles={source: f"{title} · {source}" for source in found.panels} | {"panels": title},
-        tags=origin.tags() | _tags(report),
+        tags=tags_of(origin, lineage) | _tags(report),
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )

@@ -29,6 +29,7 @@ from apertura.scene.lattice import BLOCK_PX
 from apertura.scene.looks import Looks
 from apertura.scene.terrain import FlatGround, Terrain
 from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.steps.stamping import tags_of
 from apertura.store import open_stage, record_files
 
 
@@ -53,7 +54,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         campaign.result(flight, pair),
         rasters,
         titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
-        tags=origin.tags() | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+        tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
     )

@@ -1,13 +1,16 @@
 """How a step's result inherits where it came from: settings, inputs and code of the stages before it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import xarray as xr
 
 from apertura import __version__
 from apertura.contracts import STAGES, check
-from apertura.provenance import Provenance, canonical_json
+from apertura.digests import Lineage
+from apertura.environment import lock_sha256, packages, software
+from apertura.provenance import Provenance, canonical_json, joined
 
 
 def stamped(
@@ -32,8 +35,24 @@ def stamped(
     parents, settings, inputs
         As `apertura.provenance.Provenance.of`.
     """
-    origin = Provenance.of(modules, parents, settings=settings, inputs=inputs)
-    return stamp(dataset, stage, runspec=origin.runspec, inputs=origin.inputs, code_sha256=origin.code_sha256)
+    origin = Provenance.of(modules, parents, settings=settings, inputs=inputs, software=packages())
+    return stamp(dataset, stage, **vars(origin))
+
+
+def tags_of(origin: Provenance, lineage: Lineage) -> dict[str, str]:
+    """Return the tags of a file of a result: where it comes from, and the hashes of all that it was made from.
+
+    Parameters
+    ----------
+    origin
+        Settings, inputs and code, its own and those of the stages before it.
+    lineage
+        The result; its sources are named with their hashes as they were found.
+    """
+    return replace(origin, software=joined(origin.software, software())).tags() | {
+        "APERTURA_SOURCES": canonical_json(lineage.sources.digests),
+        "APERTURA_LOCK_SHA256": lock_sha256(),
+    }
 
 
 def stamp(
@@ -43,6 +62,7 @@ def stamp(
     runspec: Mapping[str, Any],
     inputs: Mapping[str, str],
     code_sha256: str,
+    software: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
     """Check `dataset` and write units and provenance into its attributes.
 
@@ -58,6 +78,8 @@ def stamp(
         Role → sha256 of each thing read.
     code_sha256
         Chain of the code hashes of this stage and those before it.
+    software
+        Name → version of what this stage and those before it were made with.
 
     Returns
     -------
@@ -83,5 +105,6 @@ def stamp(
         "runspec": canonical_json(runspec),
         "inputs": dict(sorted(inputs.items())),
         "code_sha256": code_sha256,
+        "software": dict(software or {}),
     }
     return stamped

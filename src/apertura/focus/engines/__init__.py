@@ -31,3 +31,19 @@ def load_engine(name: str) -> "Engine":
     'phase_history'
     """
     return cast("Engine", import_module(ENGINES[name]))
+
+
+def instruction_set(name: str) -> str:
+    """Return the instructions that an engine's sums run with on this machine; 'unknown' where it does not say.
+
+    Parameters
+    ----------
+    name
+        A key of `ENGINES`.
+
+    Examples
+    --------
+    >>> instruction_set("reference").split()[0]
+    'numba:'
+    """
+    return str(getattr(load_engine(name), "instruction_set", lambda: "unknown")())

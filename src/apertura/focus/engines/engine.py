@@ -91,6 +91,8 @@ class Engine(Protocol):
     prepare
         (inputs, **options) → what all tiles share; ``[pulses]`` of it, a slice from a multiple of 64 on, is that of
         some pulses.
+    instruction_set
+        Which instructions its sums run with here; an engine may leave it out.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.
@@ -104,6 +106,14 @@ class Engine(Protocol):
 
     @staticmethod
     def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterable[Setting]: ...  # noqa: D102
+
+
+def compiled_for() -> str:
+    """Return the processor that numba compiles for here, as LLVM calls it."""
+    from llvmlite.binding import get_host_cpu_name
+    from numba.core import config
+
+    return f"numba: {getattr(config, 'CPU_NAME', None) or get_host_cpu_name()}"
 
 
 def power_sum_db(*parts_db: float) -> float:

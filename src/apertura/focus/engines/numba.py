@@ -11,13 +11,21 @@ from pydantic import Field
 
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.engine import BEAM_S, EngineOptions, Setting, asked_or, power_sum_db
+from apertura.focus.engines.engine import (
+    BEAM_S,
+    EngineOptions,
+    Setting,
+    asked_or,
+    compiled_for,
+    power_sum_db,
+)
 from apertura.focus.engines.native_tables import BAND, band_error_db
 from apertura.focus.inputs import Profiles
 from apertura.focus.job import Job
 from apertura.geometry.aperture import Aperture
 from apertura.interpolation import kaiser_sinc
 
+instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.engine import BEAM_S, EngineOptions, Setting
+from apertura.focus.engines.engine import BEAM_S, EngineOptions, Setting, compiled_for
 from apertura.focus.inputs import PhaseHistory
 from apertura.focus.job import Job
 
+instruction_set = compiled_for
 READS: Literal["phase_history"] = "phase_history"
 
 _PULSES_AT_ONCE = 16
