@@ -19,6 +19,9 @@ STUDY = "study"
 _SHOWN = ("layers", "export")
 """Results of a pair that the map shows."""
 
+INTERFEROMETRY = "interferometry"
+"""Folder of what two images tell of each other's phase."""
+
 ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
 
@@ -45,7 +48,8 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `RESULTS`.
     *where
         Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd, pictures), flight
-        (calibration, refined_track, assessment, fused, page), nothing (the others).
+        (calibration, refined_track, assessment, fused, page), a name of `interferometry.pairs` (interferogram),
+        nothing (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -75,6 +79,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
         yield from ((result, flight.name, pair) for result in ("export", "cphd") for pair in flight.pairs)
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
+    yield from (("interferogram", name) for name in campaign.settings.interferometry.pairs)
     yield ("mosaic",)
     yield ("stac",)
     for flight in campaign.image_flights:
@@ -251,6 +256,20 @@ def _map(campaign: Campaign) -> Result:
     return Result(campaign.manifest("map", "map"), (*made, *truth), {**known, "page": page_sha256()})
 
 
+def _interferogram(campaign: Campaign, name: str) -> Result:
+    images = campaign.settings.interferometry.images(name)
+    made = [
+        source
+        for flight, pair in images
+        for source in (
+            *_seen(campaign, flight, [pair], "echo", "profile"),
+            *(campaign.manifest(stage, flight, pair) for stage in ("image", "layers")),
+        )
+    ]
+    settings = {"campaign": campaign.settings.campaign, "images": images, **campaign.relevant("interferogram")}
+    return Result(campaign.manifest("interferogram", INTERFEROMETRY, name), tuple(dict.fromkeys(made)), settings)
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -298,6 +317,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "pictures": _pictures,
     "page": _page,
     "map": _map,
+    "interferogram": _interferogram,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

@@ -131,6 +131,12 @@ def cube(campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def interferogram(name: str, campaign: Directory = HERE) -> None:
+    """Compare two images in phase: coherence, unwrapped phase and heights, by a name of interferometry.pairs."""
+    _run("apertura.steps.interferogram:interferogram", campaign, name)
+
+
+@app.command()
 def cphd(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write the calibrated transfer functions of a pair for other processors, phase_history.cphd."""
     _run("apertura.steps.cphd:cphd", campaign, flight, pair)

@@ -145,7 +145,7 @@ _PRODUCTS = {
     "map": (DATA, *FILES),
     **{
         name: tuple(row.file for row in exports_in(kind))
-        for name, kind in {"export": "pair", "fused": "fused", "layers": "layers"}.items()
+        for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()
     },
 }
 """Result → the files that people open."""

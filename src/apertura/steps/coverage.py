@@ -10,18 +10,17 @@ from rasterio.enums import Resampling
 
 from apertura.atomic import replacement
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
 from apertura.export import COVERAGE
 from apertura.export.coverage import Covered, feature_collection, write_coverage
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
 from apertura.imaging.stages import aperture_of
 from apertura.lineage import result_of
+from apertura.load.layer import opened_layer
 from apertura.load.scene import OpenScene, settled_scene
-from apertura.provenance import Provenance, canonical_json, sha256_file
+from apertura.provenance import Provenance, canonical_json
 from apertura.scene.grid import SceneGrid
-from apertura.scene.raster import opened_raster
 from apertura.steps.stamping import tags_of
-from apertura.store import open_stage, read_manifest, record_files
+from apertura.store import open_stage, record_files
 
 _DOTS = 480  # of the longer side of the scene
 _VERTICES = 400  # of a track
@@ -64,12 +63,7 @@ def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]
     CampaignError
         If the file is not as step `layers` wrote it.
     """
-    path = campaign.result(flight, pair, "looks.tif")
-    manifest = campaign.root / campaign.manifest("layers", flight, pair)
-    remedy = f"Delete {manifest} and run the workflow again."
-    if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
-        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
-    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+    with opened_layer(campaign, flight, pair, "looks.tif") as raster:
         fewer = max(1.0, max(raster.shape) / _DOTS)
         shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
         looks: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
