@@ -13,11 +13,11 @@ from apertura.digests import digest_of
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.export import COVERAGE, Export, exports_in
+from apertura.flags import FLAGS
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.scene.raster import opened_raster
-from apertura.steps.summary import meanings
 from apertura.store import open_listed, read_manifest, record_files
 from apertura.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
 from apertura.webmap.page import DATA, page_files
@@ -71,11 +71,11 @@ def _exported(campaign: Campaign, flight: str, image: str) -> Path:
 
 def _explained(flags: Mapping[str, str]) -> dict[str, str]:
     """Return flag → what was measured, what it means and what to look at."""
-    known = meanings()
     told = {}
     for flag, line in flags.items():
-        means, look = known.get(flag, ("", ""))
-        told[flag] = " ".join(f"{words}." for words in (line.rstrip("."), means, look and f"look at: {look}") if words)
+        known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
+        said = [line.rstrip("."), *([known.means, f"look at: {known.look}"] if known else [])]
+        told[flag] = " ".join(f"{words}." for words in said)
     return told
 
 
