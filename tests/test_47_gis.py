@@ -213,3 +213,26 @@ def test_a_mosaic_of_a_product_that_was_edited_or_is_gone_is_refused(finished_ti
     path.unlink()
     with pytest.raises(CampaignError, match=r"coherent_db\.tif: no such file"):
         mosaic.mosaic(Campaign.load(root))
+
+
+@pytest.mark.slow
+@needs_qgis
+def test_qgis_draws_decibels_of_the_sample_where_the_sample_lies(finished_sample, tmp_path):
+    db, picture = finished_sample.results / "f01/uav1-uav1/db.tif", tmp_path / "db.png"
+    answer = ask_qgis(tell=[str(db)], draw={str(db): [str(picture), 560]})
+    told, (west, south, east, north) = answer["told"][str(db)], finished_sample.settings.scene.bounds_m
+    assert (told["crs"], answer["errors"][str(db)]) == ("EPSG:32632", [])
+    right, _, left, _, down, top = told["transform"]
+    rows, columns = told["shape"]
+    edges = (left, top + rows * down, left + columns * right, top)
+    assert edges == pytest.approx((west, south, east, north), rel=0, abs=MILLIMETRE)
+    truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(picture) as png:
+        grey = png.read(1).astype(float)
+    scale = 560 / (east - west)
+    for target in truth:
+        row, column = int((north - target["y"]) * scale), int((target["x"] - west) * scale)
+        near = grey[row - 20 : row + 21, column - 20 : column + 21]  # half a metre to each side
+        brightest = np.subtract(np.unravel_index(near.argmax(), near.shape), 20)
+        assert np.hypot(*brightest) < 3 * scale * right
+        assert near.max() > 220
