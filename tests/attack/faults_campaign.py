@@ -38,6 +38,8 @@ STEPS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "stac",
+    "ro-crate",
 )
 """Every command of a run in its order."""
 
@@ -57,6 +59,8 @@ TARGETS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "stac",
+    "ro-crate",
 )
 """One command of every kind."""
 
