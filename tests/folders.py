@@ -40,12 +40,14 @@ from apertura.steps import (
     image,
     ingest,
     layers,
+    mosaic,
     profile,
     refine,
     ro_crate,
     scene,
     stac,
     terrain,
+    webmap,
 )
 from apertura.store import open_stage
 
@@ -111,6 +113,8 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
                 export.export(campaign, flight.name, pair)
             export.export_fused(campaign, flight.name)
         coverage.coverage(campaign)
+        mosaic.mosaic(campaign)
+        webmap.webmap(campaign)
         stac.stac(campaign)
         ro_crate.ro_crate(campaign)
     return campaign

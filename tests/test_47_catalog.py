@@ -11,7 +11,7 @@ import pystac
 import pytest
 import rasterio
 from crate import validator
-from folders import contents, copy_writable, run_steps
+from folders import contents, copy_writable
 from rasterio.warp import transform_bounds
 from rocrate.rocrate import ROCrate
 
@@ -21,7 +21,7 @@ from apertura.catalog.crate_check import changed_files
 from apertura.catalog.validation import stac_problems
 from apertura.environment import lock_sha256, software
 from apertura.errors import CampaignError
-from apertura.lineage import RESULTS, on_demand, results_of
+from apertura.lineage import RESULTS, on_demand, places_of, results_of
 from apertura.provenance import sha256_file
 from apertura.steps.code import code_of
 from apertura.steps.jobs import job_of
@@ -114,7 +114,7 @@ def test_every_file_of_every_result_is_in_the_crate_with_its_hash_and_size(finis
 def test_recordings_and_config_are_named_by_their_hashes(finished_tiny, told):
     inputs = {name.removeprefix("#input/"): one for name, one in told.items() if name.startswith("#input/")}
     there = [path.relative_to(finished_tiny.root).as_posix() for path in finished_tiny.root.glob("raw/**/*.*")]
-    assert set(inputs) == {*there, "config/config.yaml", "config/flights.tsv"}
+    assert set(inputs) == {*there, "config/config.yaml", "config/flights.tsv", "truth.json"}
     assert all(one["sha256"] == sha256_file(finished_tiny.root / name) for name, one in inputs.items())
 
 
@@ -197,13 +197,13 @@ def test_a_damaged_crate_is_one_message(finished, text):
 
 
 def test_catalog_and_crate_have_the_same_bytes_from_another_folder(finished_tiny, finished):
-    names = {"stac/", "workflow/", CRATE}
+    names = ("stac/", "workflow/", CRATE)
     campaign = Campaign.load(finished)
     shutil.rmtree(finished / "results/stac")
     stac(campaign)
     ro_crate(campaign)
     made, expected = contents(finished / "results"), contents(finished_tiny.results)
-    some = [name for name in expected if name.startswith(tuple(names))]
+    some = [name for name in expected if name.startswith(names)]
     assert len(some) > 10
     assert [name for name in some if made.get(name) != expected[name]] == []
 
@@ -230,13 +230,16 @@ def test_the_crate_is_read_by_its_library(finished_tiny):
 
 
 def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
-    text = "".join(path.read_text() for path in (ROOT / "workflow" / "rules").glob("*.smk"))
-    rules = dict(re.findall(r'(?s)\nrule (\w+):.*?shell:\s+"(apertura step [\w-]+)', "\n" + text))
-    made = [
-        job_of(name, result.manifest) for name, result in results_of(finished_tiny) if not on_demand(result.manifest)
-    ]
-    assert {job.rule: " ".join(job.command.split()[:3]) for job in made}.items() <= rules.items()
-    assert {"ingest", "calibrate"} <= {job_of(name, "results/x/y/z.manifest.json").rule for name in RESULTS}
+    text = "\n".join(path.read_text() for path in (ROOT / "workflow" / "rules").glob("*.smk"))
+    found = re.findall(r'(?s)\nrule (\w+):.*?shell:\s+"apertura (step [^"]+?)(?: --threads| >)', "\n" + text)
+    rules = {rule: re.sub(r"{wildcards\.(\w+)}", r"\1", command) for rule, command in found}
+    kinds = {"raw": ("flight", "node"), "track": ("flight", "node"), "fused": ("flight",), "interferogram": ("two",)}
+    kinds |= dict.fromkeys(("calibration", "refined_track", "assessment", "page"), ("flight",))
+    for name, where, _ in places_of(finished_tiny):
+        if name not in {"speed_accuracy", "whole"}:
+            job = job_of(name, kinds.get(name, ("flight", "pair")[: len(where)]))
+            assert job.command == f"apertura {rules[job.rule]}"
+    assert set(kinds) <= set(RESULTS)
 
 
 @pytest.mark.slow

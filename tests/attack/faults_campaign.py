@@ -38,6 +38,7 @@ STEPS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "mosaic",
     "stac",
     "ro-crate",
 )
@@ -59,6 +60,7 @@ TARGETS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "mosaic",
     "stac",
     "ro-crate",
 )

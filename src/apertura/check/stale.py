@@ -18,6 +18,7 @@ from apertura.lineage import results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest
+from apertura.webmap.page import DATA, FILES
 
 _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
@@ -141,9 +142,10 @@ _PRODUCTS = {
     "cphd": (PHASE_HISTORY,),
     "stac": (f"stac/{CATALOG}",),
     "ro_crate": (CRATE,),
+    "map": (DATA, *FILES),
     **{
         name: tuple(row.file for row in exports_in(kind))
-        for name, kind in {"export": "pair", "fused": "fused", "layers": "layers"}.items()
+        for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()
     },
 }
 """Result → the files that people open."""
