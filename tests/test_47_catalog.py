@@ -257,3 +257,15 @@ def test_roc_validator_passes_and_fails_with_one_file_changed(finished):
     document["@graph"] = [one for one in document["@graph"] if one["@id"] != "workflow/Snakefile"]
     path.write_text(json.dumps(document))
     assert len(validator.issues(finished / "results")) > 1
+
+
+def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):
+    monkeypatch.chdir(finished.parent)
+    page = (ROOT / "docs/howto/catalog.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", page, flags=re.DOTALL)
+    assert len(blocks) == 3
+    names = {}
+    for code, printed in blocks:
+        exec(compile(code, "catalog.md", "exec"), names)
+        said, expected = capsys.readouterr().out, printed.partition("    ...\n")[0]
+        assert said.startswith(expected)
