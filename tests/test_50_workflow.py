@@ -75,6 +75,8 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
         "mosaic",
         "profile",
         "refine",
+        "ro_crate",
+        "stac",
     }
 
 

@@ -47,6 +47,16 @@ def diff(
     raise typer.Exit(print_differences(path, there))
 
 
+def check_crate(
+    folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
+) -> None:
+    """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
+    path = leave_working_folder(folder)
+    from apertura.audit.passed_on import print_checked
+
+    raise typer.Exit(print_checked(path))
+
+
 def report(
     campaign: Annotated[Path, typer.Argument(help="campaign folder")],
     cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,

@@ -39,6 +39,8 @@ STEPS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "stac",
+    "ro-crate",
 )
 """Every command of a run in its order."""
 
@@ -59,6 +61,8 @@ TARGETS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "stac",
+    "ro-crate",
 )
 """One command of every kind."""
 
