@@ -29,6 +29,7 @@ app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
 app.command()(product_commands.score)
 app.command()(product_commands.verify)
+app.command()(product_commands.reproduce)
 app.command()(product_commands.diff)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
