@@ -53,6 +53,8 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
         expected = f"one of the {len(known)} results of its campaign"
         raise CampaignError("no result that the config promises", path, expected, "`apertura list` tells them.")
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
+    if not wanted:
+        raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
     with _scratch(product.root, keep) as again:
         status = run_workflow(again, cores, *(["all", *filter(on_demand, wanted)] if whole else wanted))
         if status:
@@ -71,7 +73,7 @@ def _found(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str])
     if not lines:
         count, more = sum(len(_files(root, one)) for one in wanted), len(wanted) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {count} files, byte for byte, of {wanted[0]}{others}"] if wanted else ["same     no result"]
+        return [f"same     {count} files, byte for byte, of {wanted[0]}{others}"]
     begins = next((one for one in known if _differs(root, again, one)), None)
     if begins is None:
         return [*lines, "its manifest is the same: a file was changed after it was made, see `apertura verify`"]
