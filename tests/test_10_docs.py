@@ -119,15 +119,6 @@ def test_the_first_name_of_every_answer_of_the_guide_stands_in_its_file():
             assert re.search(rf"\b{name}\b", text_of(ROOT / file)), f"{question} {file} has no {name}"
 
 
-def test_every_flag_is_explained_and_named_where_it_is_raised():
-    rows = re.findall(r"^\| (`.+`) \|.*\| `([\w/]+\.py)`.*\|$", text_of(ROOT / "docs/flags.md"), re.M)
-    explained = {name: file for names, file in rows for name in re.findall(r"`(\w+)`", names)}
-    for name, file in explained.items():
-        assert re.search(rf"\b{name}\b|\b{name.rpartition('_')[0]}_\{{", text_of(ROOT / file)), f"{file} has no {name}"
-    code = "\n".join(map(text_of, ROOT.glob("src/apertura/*/*.py")))
-    assert set(re.findall(r"(?:flags|crossed)\[\"(\w+)\"\] =", code)) <= explained.keys()
-
-
 def test_every_heading_that_the_code_cites_stands_in_its_document():
     cited = 0
     for source in [*ROOT.glob("src/**/*.py"), *ROOT.glob("native/*.?pp"), *ROOT.glob("tests/*.py")]:

@@ -19,7 +19,9 @@ from apertura.store import open_stage, read_manifest
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": PAIRS}))
-LAYERS = [f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers")]
+LAYERS = [
+    f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers") if export.file.endswith(".tif")
+]
 RASTERS = [name for name in PRODUCTS if name.endswith(".tif") and name not in LAYERS]
 RECORDED = [
     *(f"raw/f01/uav1.{suffix}" for suffix in ("sigmf-meta", "sigmf-data", "track.csv")),
@@ -34,7 +36,7 @@ def tags_of(campaign, name):
 
 def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
-    opened = {".tif", ".png", ".geojson"}
+    opened = {".tif", ".png", ".geojson", ".qml"}
     files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in opened}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
     assert (len(RASTERS), len(LAYERS)) == (12, 10)

@@ -31,6 +31,8 @@ app.command()(product_commands.score)
 app.command()(product_commands.verify)
 app.command()(product_commands.reproduce)
 app.command()(product_commands.diff)
+app.command()(product_commands.report)
+app.command("map")(product_commands.map_page)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]

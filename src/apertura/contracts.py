@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from apertura.cube_variables import COORDINATES, MEASURED, QUOTED, RASTERS
 from apertura.errors import ContractError
 
 if TYPE_CHECKING:
@@ -105,6 +106,8 @@ STAGES: Mapping[str, Stage] = {
             "sidelink_delay": Variable(
                 ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
             ),
+            "sidelink_snr": Variable(("pulse",), "float64", "dB", "of the sidelink per subcarrier; NaN: no lock"),
+            "sidelink_phase": Variable(("pulse",), "float64", "rad", "of the sidelink at mid-band; NaN: no lock"),
             "sidelink_vector": Variable(
                 ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
             ),
@@ -165,15 +168,11 @@ STAGES: Mapping[str, Stage] = {
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
     ),
     "cube": Stage(
+        {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()},
         {
-            "image": Variable(
-                ("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN: not flown, not formed"
-            ),
-            "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
-            "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),
-            "magnitude": Variable(("flight", "y", "x"), "float32", "1", "mean magnitude of the peak-normalised images"),
+            "fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why",
+            "coherence_window": "pixels along a side of the window that coherence is measured in",
         },
-        {"fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why"},
     ),
 }
 

@@ -77,6 +77,17 @@ class SidelinkState:
         """(pulse,) float64, delay of the direct path in cells of 1/B; NaN where it did not lock."""
         return np.where(self.path.locked, self.path.delay_cells, np.nan)
 
+    @property
+    def snr_of_pulses_db(self) -> Floats:
+        """(pulse,) float64, SNR per subcarrier of each pulse, dB; NaN where it did not lock."""
+        snr = self.path.amplitude**2 / np.maximum(self.path.noise_power, 1e-30)
+        return np.where(self.path.locked, 10 * np.log10(np.maximum(snr, 1e-30)), np.nan)
+
+    @property
+    def phase_rad(self) -> Floats:
+        """(pulse,) float64, phase of the direct path at the middle of the band, radians; NaN where it did not lock."""
+        return np.where(self.path.locked, self.path.phase_rad, np.nan)
+
 
 def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     """Measure the sidelink of a flight, (pulse, subcarrier) complex64, the code removed; as `measure_blocks`.

@@ -40,9 +40,9 @@ class Transfer:
         Edge crossed → what was measured, in one line.
     report
         What was decided on the way and why: clock, sidelink, code.
-    sidelink_delay_m
-        (pulse,) float64, measured delay of the sidelink times c in the captures kept, metres; NaN where it did not
-        lock, None without a sidelink.
+    sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
+        (pulse,) float64, what was measured of the sidelink in the captures kept: delay times c, metres, SNR per
+        subcarrier and phase at mid-band; NaN where it did not lock, None without a sidelink.
     form
         Numbers of a few captures, ascending → their transfer functions, (pulse, subcarrier) complex64. The code is
         removed; electrical paths are still in them.
@@ -56,6 +56,8 @@ class Transfer:
     sidelink_delay_m: Floats | None
     form: Callable[[Pulses], Complexes]
     saturation: Saturation
+    sidelink_snr_db: Floats | None = None
+    sidelink_phase_rad: Floats | None = None
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
@@ -169,7 +171,8 @@ def transfer_by_sidelink(
         return METHODS[chosen](radar, sidelink, state.path.select(captures))
 
     report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
-    return Transfer(state.locked, flags, report, delay_m[state.locked], form, saturation)
+    of_pulses = (values[state.locked] for values in (state.snr_of_pulses_db, state.phase_rad))
+    return Transfer(state.locked, flags, report, delay_m[state.locked], form, saturation, *of_pulses)
 
 
 def as_complex(iq: Samples) -> Complexes:

@@ -11,7 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+
+from apertura.export.radiometry import TAG
+from apertura.provenance import canonical_json
 
 SOURCES: Mapping[str, str] = {
     "image": "pair",
@@ -23,12 +27,18 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "phase": "interferogram",
+    "coherence": "interferogram",
+    "unwrapped": "interferogram",
+    "height": "interferogram",
+    "height_std": "interferogram",
+    "panels": "interferogram",
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers that explain a
-pair's image, real; they lie beside it.
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
+lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
 """
 
 
@@ -47,17 +57,25 @@ class Export:
         ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
+    laid
+        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
     """
 
     file: str
     source: str
     function: str
     pictured: bool = False
+    laid: bool = True
 
     @property
     def module(self) -> str:
         """Dotted name of the module that writes the file."""
         return self.function.partition(":")[0]
+
+    @property
+    def style(self) -> bool:
+        """Whether it says how QGIS shows the raster of its name."""
+        return self.module == "apertura.export.style"
 
     @property
     def write(self) -> Callable[..., None]:
@@ -67,22 +85,36 @@ class Export:
 
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.export.cog:write_slc"),
+    Export("slc.tif", "image", "apertura.export.cog:write_slc", laid=False),
     Export("power.tif", "image", "apertura.export.cog:write_power"),
     Export("db.tif", "image", "apertura.export.db:write_db"),
+    Export("db.qml", "image", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
-    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc"),
+    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc", laid=False),
     Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
     Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
+    Export("coherent_db.qml", "coherent", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "coherent", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("noncoherent_power.tif", "noncoherent", "apertura.export.cog:write_power"),
     Export("noncoherent_db.tif", "noncoherent", "apertura.export.db:write_db"),
+    Export("noncoherent_db.qml", "noncoherent", "apertura.export.style:write_db_style"),
     Export("noncoherent_magnitude.tif", "magnitude", "apertura.export.cog:write_magnitude"),
     Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
+    Export("incidence.qml", "incidence", "apertura.export.style:write_layer_style"),
     Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
+    Export("bistatic_angle.qml", "bistatic_angle", "apertura.export.style:write_layer_style"),
     Export("mask.tif", "mask", "apertura.export.layers:write_mask"),
+    Export("mask.qml", "mask", "apertura.export.style:write_mask_style"),
     Export("looks.tif", "looks", "apertura.export.layers:write_looks"),
+    Export("looks.qml", "looks", "apertura.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
+    Export("nesz.qml", "nesz", "apertura.export.style:write_layer_style"),
+    Export("phase.tif", "phase", "apertura.export.interferogram:write_phase"),
+    Export("coherence.tif", "coherence", "apertura.export.interferogram:write_coherence"),
+    Export("unwrapped.tif", "unwrapped", "apertura.export.interferogram:write_unwrapped"),
+    Export("height.tif", "height", "apertura.export.interferogram:write_height"),
+    Export("height_std.tif", "height_std", "apertura.export.interferogram:write_height_std"),
+    Export("quicklook.png", "panels", "apertura.export.interferogram:write_panels", pictured=True),
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
@@ -93,14 +125,21 @@ PHASE_HISTORY = "phase_history.cphd"
 COVERAGE = ("coverage.png", "coverage.geojson")
 """What shows the whole campaign."""
 
+MOSAICS = "mosaic"
+"""Folder of the rasters of all flights."""
+
+
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
 
     Examples
     --------
-    >>> [export.file for export in exports_in("layers")]
-    ['incidence.tif', 'bistatic_angle.tif', 'mask.tif', 'looks.tif', 'nesz.tif']
+    >>> [export.file for export in exports_in("layers")][:4]
+    ['incidence.tif', 'incidence.qml', 'bistatic_angle.tif', 'bistatic_angle.qml']
     """
     return (export for export in EXPORTS if SOURCES[export.source] == folder)
 
@@ -111,9 +150,48 @@ def export_modules(folder: str) -> list[str]:
     Examples
     --------
     >>> export_modules("layers")
-    ['apertura.export.layers']
+    ['apertura.export.layers', 'apertura.export.style']
     """
     return sorted({export.module for export in exports_in(folder)})
+
+
+def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
+
+    Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs, the lowest first.
+
+    Examples
+    --------
+    >>> mosaics({"f01": ["a-b"], "f02": ["a-a", "a-b"]})["a-b/db.vrt"]
+    ['f01/a-b/db.tif', 'f02/a-b/db.tif']
+    """
+    found: dict[str, list[str]] = {}
+    for flight, names in pairs.items():
+        for folder, kinds in _folders(names):
+            for row in (row for kind in kinds for row in exports_in(kind)):
+                if row.laid and row.file.endswith(".tif"):
+                    name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
+                    found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
+    return found
+
+
+def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
+    styles = {row.file for row in EXPORTS if row.style}
+    for name in mosaics(pairs):
+        style = f"{name.removesuffix('.vrt')}.qml"
+        yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
+
+
+def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the folders of a flight, and the kinds of rows that lie in each."""
+    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield "fused", ("fused",)
 
 
 def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
@@ -131,29 +209,44 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """
     yield from COVERAGE
     for flight, names in pairs.items():
-        for folder, kinds in (*((name, ("pair", "layers")) for name in names), ("fused", ("fused",))):
+        for folder, kinds in _folders(names):
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+    yield from mosaic_files(pairs)
+    yield MAP
 
 
 def write_exports(
-    kind: str, folder: Path, rasters: Mapping[str, Any], *, titles: Mapping[str, str], **shared: Any
+    kind: str,
+    folder: Path,
+    rasters: Mapping[str, Any],
+    *,
+    titles: Mapping[str, str],
+    tags: Mapping[str, str],
+    radiometry: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    **shared: Any,
 ) -> list[Path]:
     """Write every file of a kind of folder; return their paths.
 
     Parameters
     ----------
     kind
-        ``pair``, ``fused`` or ``layers``.
+        ``pair``, ``fused``, ``layers`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles
         Source → (y, x) raster on the campaign's grid, and what a person would call it.
+    tags
+        Of every file, name → text.
+    radiometry
+        Source → `apertura.export.radiometry.Radiometry.report`, of images.
     **shared
-        ``transform``, ``crs`` and ``tags``, as `apertura.export.cog.write_slc` takes them.
+        ``transform`` and ``crs``, as `apertura.export.cog.write_slc` takes them.
     """
     written = []
     for export in exports_in(kind):
         written.append(folder / export.file)
-        export.write(written[-1], rasters[export.source], title=titles[export.source], **shared)
+        source = export.source
+        means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
+        export.write(written[-1], rasters[source], title=titles[source], tags={**tags, **means}, **shared)
     return written

@@ -20,6 +20,7 @@ from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
 from apertura.errors import CampaignError, ContractError
+from apertura.export.radiometry import told
 from apertura.export.writing import IN_MEMORY_BYTES, Block, added, blocks_of, check_written, gdal_replacement
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
@@ -45,9 +46,11 @@ class Band:
     dtype, nodata
         Type on disk, and the value of a pixel that holds nothing.
     unit, meaning
-        Written beside the band.
+        Written beside the band and as a tag; see `apertura.export.radiometry.told`.
     overviews
         How the COG driver shrinks it: its OVERVIEW_RESAMPLING.
+    colours
+        Value → (red, green, blue), 0 to 255, of a band of classes.
     """
 
     dtype: str
@@ -55,11 +58,12 @@ class Band:
     unit: str
     meaning: str
     overviews: str
+    colours: Mapping[int, tuple[int, int, int]] | None = None
 
 
-SLC = Band("complex64", np.nan, "1", "focused scene, carrier kept", "AVERAGE_MAGPHASE")
-MAGNITUDE = Band("float32", np.nan, "1", "mean magnitude of the focused scenes", "AVERAGE")
-POWER = Band("float32", np.nan, "1", "power of the focused scene, linear", "AVERAGE")
+SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE")
+MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
+POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 
 
 def write_slc(
@@ -153,6 +157,7 @@ def write_cog(
         As `write_slc`.
     """
     place = placed(image, transform, crs)
+    band, tags = told(band, tags)
     words = described(tags, title)
     with gdal_replacement(path, size=(size := size_of(image, band))) as temporary:
         source = temporary.with_name("source.tif")
@@ -224,6 +229,8 @@ def fill(
         raster.update_tags(**tags)
         raster.set_band_description(1, band.meaning)
         raster.set_band_unit(1, band.unit)
+        if band.colours:
+            raster.write_colormap(1, band.colours)
         for block in blocks_of(raster.shape):
             pixels = read(block).astype(band.dtype, copy=False)
             checksum = added(checksum, pixels)

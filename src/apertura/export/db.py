@@ -11,9 +11,10 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window
 
 from apertura.export.cog import BLOCK, POWER, Band, Pixels, Raster, described, fill, finish, placed, power, size_of
+from apertura.export.radiometry import told
 from apertura.export.writing import IN_MEMORY_BYTES, Block, check_written, gdal_replacement
 
-DB = Band("float32", np.nan, "dB", "power of the focused scene, 10 log10", "AVERAGE")
+DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
 
 
 def write_db(
@@ -39,6 +40,7 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
+    band, tags = told(DB, tags)
     words, size = described(tags, title), size_of(image, POWER)
     with gdal_replacement(path, size=size) as temporary:
         linear = temporary.with_name("power.tif")
@@ -53,8 +55,8 @@ def write_db(
             with rasterio.open(linear, **({"OVERVIEW_LEVEL": level - 1} if level else {})) as mean:
                 smaller = {"height": mean.height, "width": mean.width}
                 file, read = temporary.with_name("source.tif" + level * ".ovr"), partial(_read_decibels, mean)
-                checksums.append(fill(file, read, DB, smaller if level else place, {} if level else words))
-        finish(temporary.with_name("source.tif"), temporary, DB)
+                checksums.append(fill(file, read, band, smaller if level else place, {} if level else words))
+        finish(temporary.with_name("source.tif"), temporary, band)
         if size > IN_MEMORY_BYTES:
             check_written(temporary, checksums[1], words)
 

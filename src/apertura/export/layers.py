@@ -12,10 +12,26 @@ from apertura.export.cog import Band, Pixels, Raster, write_cog
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
 """Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
 
+CLASSES = {
+    0: ("valid", (255, 255, 255)),
+    SHADOW: ("shadow", (45, 55, 115)),
+    LAYOVER: ("layover", (225, 120, 20)),
+    SHADOW | LAYOVER: ("shadow and layover", (150, 20, 60)),
+    OUTSIDE: ("outside, no data", (0, 0, 0)),
+}
+"""Value of the mask → what it means, and its colour."""
+
 INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
 BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")
-MASK = Band("uint8", OUTSIDE, "bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside", "MODE")
-LOOKS = Band("float32", np.nan, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
+MASK = Band(
+    "uint8",
+    OUTSIDE,
+    "bits",
+    "0 valid, 1 shadow, 2 layover, 3 both, 255 outside",
+    "MODE",
+    {value: colour for value, (_, colour) in CLASSES.items()},
+)
+LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
 NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
 
 
@@ -51,7 +67,7 @@ def write_mask(
     ...     write_mask(path, np.ones((2, 3), "u1"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
     ...     with rasterio.open(path) as raster:
     ...         raster.descriptions[0], raster.read(1)[0, 0].item()
-    ('0 seen, 1 shadow, 2 layover, 3 both, 255 outside', 1)
+    ('0 valid, 1 shadow, 2 layover, 3 both, 255 outside', 1)
     """
     check = _only("uint8")
     write_cog(path, bits, MASK, transform=transform, crs=crs, tags=tags, title=title, value=check)
@@ -60,7 +76,7 @@ def write_mask(
 def write_looks(
     path: Path, looks: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write how many pulses make a pixel, (y, x) float32, 0 outside. Else as `apertura.export.cog.write_slc`."""
+    """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `apertura.export.cog.write_slc`."""
     write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 

@@ -107,6 +107,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             "y_m": round(y, 4),
             "amplitude": float(abs(peak.value)),
             "coherence_factor": coherence_factor(terms),
+            "cross_range_direction": [round(part / (float(np.hypot(*along)) or 1.0), 6) for part in along],
             **{
                 f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
                 for name, cut in cuts.items()

@@ -113,7 +113,7 @@ def pair_echo(
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * sent.waveform.longest_delay_s - beyond_m),
-            **({} if measured.sidelink_delay_m is None else {"sidelink_delay": ("pulse", measured.sidelink_delay_m)}),
+            **_sidelink(measured),
             **_axes((tx, rx), at),
             **_sidelink_vector((tx, rx), at),
         },
@@ -177,6 +177,16 @@ def _transfer(
         where=str(rx.files),
     )
     return _of_what_was_sent(measured, sent), length_m[measured.kept]
+
+
+def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
+    """Return what was measured of the sidelink in each pulse; nothing of a node that hears itself."""
+    known = {
+        "sidelink_delay": measured.sidelink_delay_m,
+        "sidelink_snr": measured.sidelink_snr_db,
+        "sidelink_phase": measured.sidelink_phase_rad,
+    }
+    return {name: ("pulse", values) for name, values in known.items() if values is not None}
 
 
 def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:

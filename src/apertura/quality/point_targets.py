@@ -197,11 +197,7 @@ def cut_through(
     >>> round(cut.width_m / 0.5, 2), round(cut.pslr_db, 1)
     (0.89, -13.3)
     """
-    patch = Patch(image, round(peak.row), round(peak.column))
-    reach = min(reach_m, (PATCH_PX // 2 - 1) * spacing_m)
-    along = np.linspace(-reach, reach, 1 + 2 * int(np.ceil(32 * reach / spacing_m)))
-    east, north = np.array(direction) / np.hypot(*direction)
-    line = np.abs(patch.at(peak.row - along * north / spacing_m, peak.column + along * east / spacing_m)) ** 2
+    along, line = line_through(image, peak, direction=direction, spacing_m=spacing_m, reach_m=reach_m)
     middle = len(along) // 2
     left, right = _first_minimum(line[middle::-1]), _first_minimum(line[middle:])
     lobe = slice(middle - left, middle + right + 1)
@@ -211,6 +207,28 @@ def cut_through(
         10 * float(np.log10(beyond.max() / line[middle])) if beyond.size else float("nan"),
         10 * float(np.log10(beyond.sum() / line[lobe].sum())) if beyond.size else float("nan"),
     )
+
+
+def line_through(
+    image: Raster, peak: Peak, *, direction: tuple[float, float], spacing_m: float, reach_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances from a peak along a line, metres, and the power there, (sample,) float64 each.
+
+    Parameters as `cut_through`; 32 samples per pixel, the peak is the one in the middle.
+
+    Examples
+    --------
+    >>> image = np.outer(np.sinc((np.arange(64) - 32) / 8), np.ones(64)).astype(np.complex64)
+    >>> along_m, power = line_through(image, Peak(32, 32, 1), direction=(0, 1), spacing_m=0.1, reach_m=0.8)
+    >>> along_m.size, round(float(along_m[-1]), 6), power[along_m.size // 2].round(3), power[-1].round(3)
+    (513, 0.8, np.float64(1.0), np.float64(0.0))
+    """
+    patch = Patch(image, round(peak.row), round(peak.column))
+    reach = min(reach_m, (PATCH_PX // 2 - 1) * spacing_m)
+    along = np.linspace(-reach, reach, 1 + 2 * int(np.ceil(32 * reach / spacing_m)))
+    east, north = np.array(direction) / np.hypot(*direction)
+    line = np.abs(patch.at(peak.row - along * north / spacing_m, peak.column + along * east / spacing_m)) ** 2
+    return along, line
 
 
 def _first_minimum(line: NDArray[np.float64]) -> int:

@@ -13,6 +13,7 @@ from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.digests import Lineage
 from apertura.export import export_modules, write_exports
+from apertura.export.radiometry import ECHO, Radiometry, of_sums
 from apertura.lineage import result_of
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
@@ -34,11 +35,13 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     image = open_stage(campaign.stage("image", flight, pair), "image")
     assessed = assessment_of(campaign, flight)
     agreed, quality = assessed["pairs"][pair], image.attrs["quality"]
+    peak = quality["brightest"]["amplitude"]
     report = quality | {
         "reference": assessed["reference"],
         "agreement": agreed["agreement"],
         "hypotheses": assessed["hypotheses"],
         "flags": {**image.attrs["flags"], **agreed["flags"]},
+        "radiometry": {"image": ECHO.measured(peak, quality["noise_floor_db"]).report},
     }
     origin = _with_code(Provenance.of(modules, [image]), assessed)
     folder = campaign.result(flight, pair)
@@ -46,6 +49,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "pair",
         folder,
         {"image": image.image},
+        radiometry=report["radiometry"],
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
         tags=tags_of(origin, lineage) | _quality_tags(report),
         **_georeference(settled_scene(campaign).grid),
@@ -64,7 +68,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     folder, grid = campaign.result(flight, "fused"), settled_scene(campaign).grid
     report = {
         **_worst(images, assessed["fusion"]),
-        **_measures(grid, campaign.settings.processing.tile_px, sums),
+        **_measures(grid, campaign.settings.processing.tile_px, sums, _divided(images, assessed["fusion"])),
         "fusion": assessed["fusion"],
         "coherence": _coherence(assessed),
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
@@ -84,6 +88,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "fused",
         folder,
         {**sums, "magnitude": cube.magnitude[index]},
+        radiometry=report["radiometry"],
         titles={source: f"{name} · {words}" for source, words in titles.items()},
         tags=tags_of(_fused_provenance(cube, images, assessed), lineage) | _quality_tags(report),
         **_georeference(grid),
@@ -118,14 +123,25 @@ def _fused_provenance(cube: xr.Dataset, images: Mapping[str, xr.Dataset], assess
     return replace(origin, code_sha256=chained_sha256(code_sha256(*modules), [cube.attrs["code_sha256"]]))
 
 
-def _measures(grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster]) -> dict[str, Any]:
+def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Radiometry]:
+    """Return what the values of the sums mean: which pair was divided by what."""
+    peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
+    return of_sums(peaks, fusion["phases_rad"])
+
+
+def _measures(
+    grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster], radiometry: Mapping[str, Radiometry]
+) -> dict[str, Any]:
     """Return what the pixels of the sums tell."""
     windows = list(grid.tiles(tile_px))
     surveys = {source: survey(layer, windows) for source, layer in sums.items()}
     top = surveys["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
+    peaks = {source: one.peak for source, one in surveys.items()} | {"coherent": float(abs(peak.value))}
+    seen = {source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in surveys.items()}
     return {
+        "radiometry": {source: one.report for source, one in {**radiometry, **seen}.items()},
         "entropy": {source: round(one.entropy, 6) for source, one in surveys.items()},
         "noise_floor_db": top.noise_floor_db,
         "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},

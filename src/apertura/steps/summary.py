@@ -1,14 +1,12 @@
 """`apertura summary`: what every image of a finished campaign says of itself, its flags explained, and what to open."""
 
-import re
 from collections.abc import Iterator, Mapping
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from apertura.campaign import Campaign
 from apertura.documents import undamaged
 from apertura.errors import shown
-from apertura.paths import shipped
+from apertura.flags import FLAGS
 from apertura.store import open_listed
 
 if TYPE_CHECKING:
@@ -26,7 +24,6 @@ _OPENED = {
 }
 _MOST_FLIGHTS = 3
 _NOT_STATED = "not stated"
-_ROW = re.compile(r"^\| (`[a-z_`, ]+`) \| (.+?) \| (.+?) \| `.*\|$", re.MULTILINE)
 
 Reports = Mapping[tuple[str, str], Mapping[str, Any]]
 
@@ -71,20 +68,6 @@ def print_products(campaign: Campaign) -> None:
         print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
 
 
-@cache
-def meanings() -> dict[str, tuple[str, str]]:
-    """Return flag → what it means, and what to look at first, as docs/flags.md tells them.
-
-    Examples
-    --------
-    >>> meanings()["saturated_radar"]
-    ('samples at the end stops of the converter', 'gain')
-    """
-    text = (shipped() / "docs" / "flags.md").read_text(encoding="utf-8")
-    rows = _ROW.findall(text)
-    return {name: (means, look) for names, means, look in rows for name in re.findall(r"[a-z_]+", names)}
-
-
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
     for flight in campaign.image_flights:
         yield from ((flight.name, name) for name in (*flight.pairs, "fused"))
@@ -110,10 +93,10 @@ def _print_flags(console: "Console", reports: Reports) -> None:
             if name != "fused" or not any(known in line for known in images):  # it quotes its pairs
                 images.setdefault(line, []).append(f"{flight} {name}")
     for flag, lines in raised.items():
-        means, look = meanings().get(flag, ("", ""))
-        console.print(Text.assemble((flag, "yellow"), f": {means}" if means else ""))
+        known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
+        console.print(Text.assemble((flag, "yellow"), f": {known.means}" if known else ""))
         told = [f"{_some(images)}: {line}" for line, images in lines.items()]
-        for line in [*told, *([f"look at: {look}"] if look else [])]:
+        for line in [*told, *([f"look at: {known.look}"] if known else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
 
 

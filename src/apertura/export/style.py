@@ -1,0 +1,129 @@
+"""How QGIS shows a raster: a .qml of the raster's name beside it, which QGIS takes up when it opens the raster.
+
+An image spans its own noise floor to its own peak. The usual 2 to 98 % of the pixels would blacken all targets of
+a scene that is mostly noise, and whiten the noise.
+"""
+
+import json
+from collections.abc import Iterable
+from math import ceil, floor
+from pathlib import Path
+from xml.etree import ElementTree as ET  # only written, never parsed
+
+import numpy as np
+import rasterio
+from rasterio.enums import Resampling
+
+from apertura.atomic import write_text
+from apertura.errors import ContractError
+from apertura.export.layers import CLASSES, OUTSIDE
+from apertura.export.radiometry import TAG
+
+_DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+_VERSION = "3.22"
+_RAMP = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")  # viridis
+_DOTS = 1024  # of the longer side of a layer, among which the ends of its colours are looked for
+_LEAST_DB = 1.0  # between black and white, of an image that is all one power
+
+
+def write_db_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of decibels: white at the image's peak, black at its noise floor.
+
+    Parameters
+    ----------
+    path
+        ``….qml``; complete or absent. A raster of that name lies beside it: its `apertura.export.radiometry.TAG` tells
+        peak and noise floor.
+    *_, **__
+        What other products are written from.
+
+    Raises
+    ------
+    ContractError
+        If nobody measured them.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from rasterio import Affine
+    >>> from apertura.export.db import write_db
+    >>> with TemporaryDirectory() as folder:
+    ...     image, path = np.full((2, 3), 1j, "c8"), Path(folder) / "db.qml"
+    ...     tags = {TAG: '{"peak_db": 32.0, "noise_floor_db": -49.0}'}
+    ...     write_db(path.with_suffix(".tif"), image, transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags=tags)
+    ...     write_db_style(path)
+    ...     [line.strip() for line in path.read_text().splitlines() if "Value>" in line]
+    ['<minValue>-17.0</minValue>', '<maxValue>32.0</maxValue>']
+    """
+    with rasterio.open(_beside(path)) as raster:
+        about = json.loads(raster.tags().get(TAG, "{}"))
+    top, below = about.get("peak_db"), about.get("noise_floor_db")
+    if top is None or below is None:
+        raise ContractError(f"{path.name}: no peak and noise floor in tag {TAG}")
+    renderer = _renderer("singlebandgray", grayBand="1", gradient="BlackToWhite")
+    stretch = ET.SubElement(renderer, "contrastEnhancement")
+    ends = {"minValue": round(top + min(below, -_LEAST_DB), 2), "maxValue": round(top, 2)}
+    for name, value in {**ends, "algorithm": "StretchToMinimumMaximum"}.items():
+        ET.SubElement(stretch, name).text = str(value)
+    _write(path, renderer)
+
+
+def write_mask_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of the mask: a colour and a name of each class, valid pixels transparent.
+
+    Parameters as `write_db_style`.
+    """
+    renderer = _renderer("paletted", band="1")
+    palette = ET.SubElement(renderer, "colorPalette")
+    for value, (name, colour) in CLASSES.items():
+        seen_through = value in {0, OUTSIDE}
+        entry = {"value": str(value), "color": _hex(colour), "alpha": "0" if seen_through else "255", "label": name}
+        ET.SubElement(palette, "paletteEntry", entry)
+    _write(path, renderer)
+
+
+def write_layer_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of a layer: colours from its smallest to its largest value.
+
+    Parameters as `write_db_style`.
+    """
+    with rasterio.open(_beside(path)) as raster:
+        fewer = max(1.0, max(raster.shape) / _DOTS)
+        shape = tuple(ceil(size / fewer) for size in raster.shape)
+        values = raster.read(1, out_shape=shape, resampling=Resampling.average)
+        unit = raster.units[0]
+    known = values[np.isfinite(values)]
+    low = floor(known.min()) if known.size else 0
+    high = max(low + 1, ceil(known.max()) if known.size else 0)
+    renderer = _renderer("singlebandpseudocolor", band="1", classificationMin=str(low), classificationMax=str(high))
+    ends = {"minimumValue": str(low), "maximumValue": str(high)}
+    shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
+    shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
+    for share, colour in zip(np.linspace(0, 1, len(_RAMP)), _RAMP, strict=True):
+        value = f"{low + share * (high - low):g}"
+        ET.SubElement(shader, "item", value=value, color=colour, alpha="255", label=f"{value} {unit}")
+    _write(path, renderer)
+
+
+def _beside(path: Path) -> Path:
+    """Return the raster that a style is for."""
+    return next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
+
+
+def _renderer(kind: str, **attributes: str) -> ET.Element:
+    common = {"type": kind, "opacity": "1", "alphaBand": "-1", "nodataColor": ""}
+    return ET.Element("rasterrenderer", common | attributes)
+
+
+def _hex(colour: Iterable[int]) -> str:
+    return "#" + "".join(f"{part:02x}" for part in colour)
+
+
+def _write(path: Path, renderer: ET.Element) -> None:
+    """Write a style that shows pixels as they are: no smoothing, and of overviews the nearest."""
+    style = ET.Element("qgis", version=_VERSION, styleCategories="Symbology")
+    pipe = ET.SubElement(style, "pipe")
+    pipe.append(renderer)
+    ET.SubElement(style, "blendMode").text = "0"
+    ET.indent(style)
+    write_text(path, _DOCTYPE + ET.tostring(style, encoding="unicode") + "\n")

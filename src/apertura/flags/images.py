@@ -1,0 +1,95 @@
+"""Flags of scenes, plans, refined tracks, images and sums."""
+
+from apertura.flags.flag import Flag
+
+OF_IMAGES = {
+    "platform_inside_scene": Flag(
+        "pulses above the scene, of all", "pulses above the scene: echoes of both sides mix", "scene.bounds_m",
+        "planning/checks.py"),
+    "platform_below_scene": Flag(
+        "m below the lowest ground of the scene", "an antenna is lower than all of a DEM beside it",
+        "unit and datum of scene.dem", "scene/clearance.py"),
+    "outside_swath": Flag(
+        "share of the scene, and the integration angle",
+        "a part of the scene is passed by no pulse inside the integration angle: it is zero",
+        "scene.bounds_m; processing.integration", "planning/integration.py"),
+    "integration_turns": Flag(
+        "the angle that places are seen under, and the integration angle",
+        "the track turns, or passes places more than once: they are seen under more than the integration angle, "
+        "and are sharper along some direction",
+        "config/segments.tsv, to image passes apart", "planning/integration.py"),
+    "spacing_coarse": Flag(
+        "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
+        "scene.spacing_m", "planning/checks.py"),
+    "pulses_sparse": Flag(
+        "spread of phase rates over the scene, cycles per pulse; 1 is unambiguous",
+        "the aperture is undersampled: azimuth ambiguities", "scene.bounds_m; speed and waveform.prf_hz",
+        "planning/checks.py"),
+    "pulses_missing": Flag(
+        "missing pulses, of all in the aperture, and dB of the sidelobes they raise",
+        "pulses missing inside the aperture, dropped or never recorded, raise sidelobes above −20 dB along the track",
+        "pulses of the echo: what was dropped and why", "echo/missing_pulses.py"),
+    "beyond_cyclic_prefix": Flag(
+        "share of the scene that arrives too late",
+        "part of the scene lies beyond the prefix, or the listening time, of every pulse", "scene.bounds_m",
+        "planning/checks.py"),
+    "scene_beyond_samples": Flag(
+        "share of the scene's total paths",
+        "from Python: part of the scene's total paths lies beyond the profiles given", "how the profiles were cropped",
+        "imaging/checks.py"),
+    "beam_misses": Flag(
+        "share of the scene", "part of the scene is seen by no antenna beam", "boresights; scene.bounds_m",
+        "antenna/illumination.py"),
+    "prediction_misses": Flag(
+        "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
+        "engine and options asked for", "planning/planner.py"),
+    "refinement_rejected": Flag(
+        "dB of contrast gained on places that were not fitted, and the share of them that got sharper",
+        "tracks, or phases of pulses, refined by the images are not believed: places that were not fitted did "
+        "not get sharper; images are formed from the logs",
+        "position_std_m of the nodes; SNR; docs/howto/refine_tracks.md", "refinement/evidence.py"),
+    "refinement_too_few_patches": Flag(
+        "bright places found, and those needed",
+        "too few bright places to refine tracks by; images are formed from the logs",
+        "reflectors in the scene; processing.autofocus off", "refinement/candidates.py"),
+    "prior_inconsistent": Flag(
+        "how large the motions are against the errors stated",
+        "motions that the images settle are much larger or smaller than the errors that logs or config state",
+        "position_std_m, position_correlation_s; lever arms, heights, times", "refinement/evidence.py"),
+    "cycle_slip_suspected": Flag(
+        "parts of the track, and how far off",
+        "parts of the refined track may be a wavelength off: they see points at another range than the whole",
+        "position_std_m; more bright points", "refinement/evidence.py"),
+    "defocused": Flag(
+        "dB lost at bright points, and dB that the budget expects",
+        "bright points lost more than 1 dB of their peak to phase errors",
+        "the hypothesis named behind it; positions, lever arms, heights, times", "imaging/focus_check.py"),
+    "echo_elsewhere": Flag(
+        "where the pulses hold the strong echo",
+        "nothing bright in the image, and pulses hold a strong echo: at ranges that the scene does not have, or "
+        "that no place gathers",
+        "heights and datum of log and scene; scene.bounds_m; path offsets", "imaging/focus_check.py"),
+    "pairs_apart": Flag(
+        "cm between the places of the points, with its uncertainty, east and north",
+        "two pairs of a flight show the same points at different places",
+        "the hypothesis named behind it; path offsets, lever arms, scene.height_m", "steps/assess.py"),
+    "pairs_out_of_phase": Flag(
+        "phase between the pairs, with its uncertainty",
+        "two pairs show the same points in different phase: one is left out of the coherent sum",
+        "path offsets; processing.fusion.align_phase", "steps/assess.py"),
+    "pair_left_out": Flag(
+        "the pair, and why", "the coherent sum is without a pair that shows other places, or another phase",
+        "the flags of that pair; processing.fusion.align_phase", "steps/export.py"),
+    "flights_apart": Flag(
+        "cm between the places of the points, with its uncertainty, east and north",
+        "two flights show the same points at different places", "base station, datum, time system of one flight",
+        "steps/cube.py"),
+    "pair_unconfirmed": Flag(
+        "bright points in common", "a pair shows none of the bright points of another",
+        "SNR of its echo; names of its channels", "steps/assess.py"),
+    "accuracy_missed": Flag(
+        "bound of the error, and the accuracy asked, dB",
+        "the error is not known to be below the accuracy asked, 95 % sure",
+        "processing.accuracy_db, processing.engine", "imaging/certify.py, imaging/backproject.py"),
+}  # fmt: skip
+"""Name → what it says; see `apertura.flags.FLAGS`."""

@@ -1,0 +1,42 @@
+"""docs/flags.md, from the table of flags."""
+
+import re
+
+from apertura.flags import FLAGS
+
+_HEAD = """# Flags
+
+A flag says that a limit of a method was crossed and what was measured, in one line: in `image.json` under `flags`,
+in the attributes of stages and of `ap.backproject`, in the tag `APERTURA_FLAGS` of its files, below its quicklook, in
+the table that closes a run. It never stops a run. Without one, nothing known was crossed.
+
+| flag | what was measured | what it means | what to look at first | raised in |
+|---|---|---|---|---|
+"""
+
+_FOOT = """
+Limits and how they follow: [echo methods](theory/echo_methods.md), [tracks](theory/tracks.md),
+[planner](theory/planner.md), [terrain](theory/terrain.md), [waveforms](theory/waveforms.md),
+[FMCW](theory/fmcw.md). Files are below `src/apertura`.
+Written by `make pages` from `FLAGS` in `src/apertura/flags/__init__.py`.
+"""
+
+_PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")
+_NAME = re.compile(r"(?<![\w/(.-])((?:[\w]+[./])+[\w<>]+(?:\.[\w<>]+)*|\w+_\w+|--[\w-]+)(?![\w/)])")
+
+
+def flags_page() -> str:
+    """Return docs/flags.md."""
+    rows = [
+        f"| `{name}` | {_marked(flag.measured)} | {_marked(flag.means)} | {_marked(flag.look)} "
+        f"| {', '.join(f'`{file}`' for file in flag.raised.split(', '))} |\n"
+        for name, flag in FLAGS.items()
+    ]
+    return _HEAD + "".join(rows) + _FOOT
+
+
+def _marked(text: str) -> str:
+    """Return a text with its names as code and its pages as links."""
+    pages = [_NAME.sub(r"`\1`", part) for part in re.split(r"docs/[\w/]+\.md", text)]
+    links = [f"[{found[2].replace('_', ' ')}]({found[1]})" for found in _PAGE.finditer(text)]
+    return pages[0] + "".join(link + part for link, part in zip(links, pages[1:], strict=True))
