@@ -8,6 +8,8 @@ import typer
 
 from apertura.paths import leave_working_folder
 
+ALL_CORES = os.cpu_count() or 1
+
 
 def score(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
@@ -33,6 +35,22 @@ def verify(
     from apertura.audit.verify import print_verified
 
     raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def reproduce(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    cores: Annotated[int, typer.Option(min=1, help="cores to use")] = ALL_CORES,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="a new folder to make it in, which stays; else in TMPDIR")
+    ] = None,
+) -> None:
+    """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
+    kept = None if keep is None else keep.absolute()
+    path = leave_working_folder(product)
+    from apertura.audit.reproduce import print_reproduced
+
+    raise typer.Exit(print_reproduced(path, cores=cores, keep=kept))
 
 
 def diff(
