@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.fusion.sums import coherent_sum, noncoherent_sum
+from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
 
 
 def test_images_in_phase_keep_their_peak_and_images_out_of_phase_cancel():
@@ -34,3 +34,10 @@ def test_blocks_add_up_to_the_whole():
 def test_an_empty_image_is_refused():
     with pytest.raises(ValueError, match="empty image"):
         coherent_sum(np.zeros((2, 4, 4), np.complex64), np.array([1.0, 0.0]))
+
+
+@pytest.mark.parametrize(("added", "alone"), [(coherent_sum, 0.5), (noncoherent_sum, 0.5), (magnitude_sum, 0.5)])
+def test_a_pair_adds_nothing_where_it_sees_nothing_and_where_none_does_there_is_no_sum(added, alone):
+    nothing = np.complex64(complex(np.nan, np.nan))
+    images = np.array([[[1, 1, nothing]], [[1, nothing, nothing]]], np.complex64)
+    np.testing.assert_allclose(np.abs(added(images, np.ones(2)))[0], [1, alone, np.nan])

@@ -29,6 +29,8 @@ app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
 app.command()(product_commands.score)
 app.command()(product_commands.report)
+app.command()(product_commands.verify)
+app.command()(product_commands.diff)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]

@@ -72,6 +72,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     for flight in campaign.image_flights:
         yield from (("pictures", flight.name, pair) for pair in flight.pairs)
         yield "page", flight.name
+    yield ("mosaic",)
     yield from (("speed_accuracy",), ("whole",))
 
 
@@ -204,6 +205,16 @@ def _fused(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
 
 
+def _mosaic(campaign: Campaign) -> Result:
+    made = [
+        campaign.manifest(result, flight.name, folder)
+        for flight in campaign.image_flights
+        for result, folders in (("layers", flight.pairs), ("export", (*flight.pairs, "fused")))
+        for folder in folders
+    ]
+    return Result(campaign.manifest("mosaic", "mosaic"), tuple(made), {"campaign": campaign.settings.campaign})
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     image, pair = _image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), image.sources, {"pair": pair, **image.settings})
@@ -247,6 +258,7 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "fused": _fused,
     "pictures": _pictures,
     "page": _page,
+    "mosaic": _mosaic,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,
 }

@@ -1,4 +1,4 @@
-"""What people ask of finished products: how far off their targets are, and a report on all of them."""
+"""What people ask of finished products: how far off their targets are, what they are made from, a report on all."""
 
 import os
 from pathlib import Path
@@ -42,3 +42,31 @@ def report(
         for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
             typer.echo(path)
     raise SystemExit(status)
+
+
+def verify(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    campaign: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
+) -> None:
+    """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    there = None if campaign is None else campaign.absolute()
+    path = leave_working_folder(product)
+    from apertura.audit.verify import print_verified
+
+    raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+) -> None:
+    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    there = second.absolute()
+    path = leave_working_folder(first)
+    from apertura.audit.diff import print_differences
+
+    raise typer.Exit(print_differences(path, there))

@@ -116,6 +116,7 @@ DEMANDS: Mapping[str, Demand] = {
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
     "pictures": Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
     "page": Demand(500, pixel_s=5),
+    "mosaic": Demand(500),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
     "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
 }

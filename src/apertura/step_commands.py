@@ -71,6 +71,12 @@ def coverage(campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def mosaic(campaign: Directory = HERE) -> None:
+    """Lay each product of all flights upon one another, mosaic/<pair>/<product>.vrt."""
+    _run("apertura.steps.mosaic:mosaic", campaign)
+
+
+@app.command()
 def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Compress a pair in range over the scene, profile.zarr."""
     _run("apertura.steps.profile:profile", campaign, flight, pair)

@@ -121,3 +121,28 @@ rule coverage:
         "drawing what the flights cover"
     shell:
         "apertura step coverage > {log} 2>&1"
+
+
+rule mosaic:
+    input:
+        lambda wildcards: result_of(campaign, "mosaic").sources,
+    output:
+        [f"results/{file}" for file in mosaic_files({one.name: one.pairs for one in campaign.image_flights})],
+        "results/mosaic/mosaic.manifest.json",
+    log:
+        "results/logs/mosaic.log",
+    benchmark:
+        "results/benchmarks/mosaic.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["mosaic"].threads
+    resources:
+        mem_mb=asked["mosaic"].mem_mb,
+        runtime=asked["mosaic"].runtime,
+    params:
+        settings=campaign.settings.campaign,
+        code=code_of("mosaic"),
+    message:
+        "laying the files of all flights upon one another"
+    shell:
+        "apertura step mosaic > {log} 2>&1"

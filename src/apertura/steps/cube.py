@@ -57,7 +57,6 @@ def cube(campaign: Campaign) -> Path:
                 there = ~np.isnan(stack).all(axis=(1, 2))
                 for pair, block in zip(compress(flight.pairs, there), stack[there], strict=True):
                     arrays["image"][place, pairs.index(pair), *window] = block
-                stack[~there] = 0  # what a pair does not see it adds nothing to
                 if there[added].any():
                     arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
                 if there.any():
