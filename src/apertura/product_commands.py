@@ -1,4 +1,4 @@
-"""What people ask of finished products: how far off their targets are, what they are made from, a report on all."""
+"""What people ask of finished products: targets against truth, what products were made from, a report, a map."""
 
 import os
 from pathlib import Path
@@ -17,31 +17,6 @@ def score(
     from apertura.steps.score import print_findings
 
     print_findings(Campaign.load(leave_working_folder(campaign)), paths=paths)
-
-
-def report(
-    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
-    cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,
-) -> None:
-    """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
-    from apertura.atomic import replacement
-    from apertura.campaign import Campaign
-    from apertura.paths import shipped
-    from apertura.steps.page import PAGE
-    from apertura.workflow import run_workflow
-
-    campaign = campaign.absolute()
-    status = run_workflow(campaign, cores, "all", "pages")
-    if status == 0:
-        opened = Campaign.load(leave_working_folder(campaign))
-        style = ["--report-stylesheet", str(shipped() / "workflow" / "report" / "report.css")]
-        with replacement(opened.result(PAGE)) as temporary:
-            status = run_workflow(campaign, 1, "all", "pages", "--report", str(temporary), *style, show="errors")
-            if status:
-                raise SystemExit(status)
-        for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
-            typer.echo(path)
-    raise SystemExit(status)
 
 
 def verify(
@@ -70,3 +45,40 @@ def diff(
     from apertura.audit.diff import print_differences
 
     raise typer.Exit(print_differences(path, there))
+
+
+def report(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,
+) -> None:
+    """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
+    from apertura.atomic import replacement
+    from apertura.campaign import Campaign
+    from apertura.paths import shipped
+    from apertura.steps.page import PAGE
+    from apertura.workflow import run_workflow
+
+    campaign = campaign.absolute()
+    status = run_workflow(campaign, cores, "all", "pages")
+    if status == 0:
+        opened = Campaign.load(leave_working_folder(campaign))
+        style = ["--report-stylesheet", str(shipped() / "workflow" / "report" / "report.css")]
+        with replacement(opened.result(PAGE)) as temporary:
+            status = run_workflow(campaign, 1, "all", "pages", "--report", str(temporary), *style, show="errors")
+            if status:
+                raise SystemExit(status)
+        for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
+            typer.echo(path)
+    raise SystemExit(status)
+
+
+def map_page(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with results")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
+) -> None:
+    """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    from apertura.campaign import Campaign
+    from apertura.load.map_server import served
+
+    served(Campaign.load(leave_working_folder(campaign)), port=port).show(in_browser=open_)

@@ -146,3 +146,29 @@ rule mosaic:
         "laying the files of all flights upon one another"
     shell:
         "apertura step mosaic > {log} 2>&1"
+
+
+# What the package can show a browser is part of what the map is made from: a page bundled later makes it again.
+rule map:
+    input:
+        lambda wildcards: result_of(campaign, "map").sources,
+    output:
+        [f"results/map/{file}" for file in (DATA, *page_files())],
+        "results/map/map.manifest.json",
+    log:
+        "results/logs/map.log",
+    benchmark:
+        "results/benchmarks/map.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["map"].threads
+    resources:
+        mem_mb=asked["map"].mem_mb,
+        runtime=asked["map"].runtime,
+    params:
+        settings=lambda _: result_of(campaign, "map").settings,
+        code=code_of("map"),
+    message:
+        "making the map"
+    shell:
+        "apertura step map > {log} 2>&1"

@@ -27,12 +27,18 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "phase": "interferogram",
+    "coherence": "interferogram",
+    "unwrapped": "interferogram",
+    "height": "interferogram",
+    "height_std": "interferogram",
+    "panels": "interferogram",
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers that explain a
-pair's image, real; they lie beside it.
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
+lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
 """
 
 
@@ -103,6 +109,12 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", "apertura.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
     Export("nesz.qml", "nesz", "apertura.export.style:write_layer_style"),
+    Export("phase.tif", "phase", "apertura.export.interferogram:write_phase"),
+    Export("coherence.tif", "coherence", "apertura.export.interferogram:write_coherence"),
+    Export("unwrapped.tif", "unwrapped", "apertura.export.interferogram:write_unwrapped"),
+    Export("height.tif", "height", "apertura.export.interferogram:write_height"),
+    Export("height_std.tif", "height_std", "apertura.export.interferogram:write_height_std"),
+    Export("quicklook.png", "panels", "apertura.export.interferogram:write_panels", pictured=True),
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
@@ -117,8 +129,12 @@ MOSAICS = "mosaic"
 """Folder of the rasters of all flights."""
 
 
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
+
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
 
     Examples
     --------
@@ -197,6 +213,7 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
     yield from mosaic_files(pairs)
+    yield MAP
 
 
 def write_exports(
@@ -214,7 +231,7 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused`` or ``layers``.
+        ``pair``, ``fused``, ``layers`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles

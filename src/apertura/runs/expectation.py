@@ -38,6 +38,7 @@ _COSTS = {
     "assess": _Cost(1.3, mpx=0.5),
     "cube": _Cost(2.5, mpx=1.0),
     "cphd": _Cost(2.0, mb=0.02),
+    "interferogram": _Cost(3.0, mpx=20.0),
     "export": _Cost(3.0, mpx=1.0),
     "export_fused": _Cost(3.0, mpx=2.0),
     "pictures": _Cost(5.0, mb=0.01),
@@ -47,7 +48,7 @@ _COSTS = {
 
 _WIDE = frozenset({"image", "tiles"})
 """Rules whose jobs take all cores."""
-_BESIDE = frozenset({"cphd", "layers", "export", "pictures", "scene"})
+_BESIDE = frozenset({"cphd", "interferogram", "layers", "export", "map", "pictures", "scene"})
 """Rules that no other waits for, or hardly."""
 _MOST_BENCHMARKS = 500
 _USUAL_MPX = 0.25

@@ -7,7 +7,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from apertura.errors import quoted
 
-RESERVED_NAMES = frozenset({"fused", "layers", "stac", "map", "mosaic", "study", "logs", "benchmarks", "tiles"})
+RESERVED_NAMES = frozenset(
+    {"fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles", "workflow"}
+)
 """Names of the results folder that no flight or node may take."""
 
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt", ".qml")

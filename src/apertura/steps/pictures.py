@@ -32,7 +32,7 @@ from apertura.report.pulses import PulseRecord, draw_pulses
 from apertura.report.sheet import thinned
 from apertura.report.waterfall import Waterfall, draw_waterfall
 from apertura.settings import SampledWaveform
-from apertura.steps.coverage import crs_name, looks_of
+from apertura.steps.coverage import crs_name, few_looks
 from apertura.store import blocks_of_rows, open_stage, record_files
 
 Floats = NDArray[np.float64]
@@ -129,7 +129,7 @@ class Shown:
         if len(set(self.pair.split("-"))) == 1:
             del legs["receiver"]  # the same node: one track
         step, _, west, _, _, north = grid.transform
-        looks = looks_of(self.campaign, self.flight, self.pair)
+        looks = few_looks(self.campaign, self.flight, self.pair)
         down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
         rings = footprint(looks, Affine(right, 0, west, 0, -down, north))
         return FlownGeometry(
