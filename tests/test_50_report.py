@@ -39,6 +39,12 @@ def test_one_command_writes_the_report_and_a_page_of_every_flight(written):
     text = (root / "results" / "report.html").read_text()
     assert text.count("results/f01/uav1-uav2/pictures/phase.png") > 0
     assert str(root) not in text
+    (root / "results" / "report.html").write_text("mine")
+    done = apertura("report", root, "--cores", "2")
+    assert done.returncode == 2
+    assert "results/report.html: not as it was written" in done.stderr
+    assert (root / "results" / "report.html").read_text() == "mine"
+    (root / "results" / "report.html").write_text(text)
 
 
 @pytest.mark.slow
