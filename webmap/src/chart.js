@@ -100,6 +100,11 @@ export class Chart {
     return made;
   }
 
+  /** Whether the raster's own file has been opened. */
+  get drawn() {
+    return !this.raster || this.raster.getSource()?.getState() === 'ready';
+  }
+
   stretch(low, high) {
     this.raster?.updateStyleVariables({ low, high });
   }
