@@ -211,7 +211,9 @@ async function start() {
   const data = await answer.json();
   if (data.format !== FORMAT) throw new Error('map.json is of another version than this page: run the workflow again');
   const page = new Page(data);
-  page.chart.map.on('rendercomplete', () => page.chart.drawn && document.documentElement.setAttribute('data-drawn', ''));
+  page.chart.map.on('rendercomplete', () => {
+    if (page.chart.drawn) document.documentElement.setAttribute('data-drawn', '');
+  });
 }
 
 start().catch((error) => notice(`No map: ${error.message}`));
