@@ -1,5 +1,6 @@
 """The map in a browser: what it draws, tells and measures, and that it asks no other host for anything."""
 
+import io
 import json
 import signal
 import subprocess
@@ -7,8 +8,11 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from folders import copy_writable, run_steps
+from matplotlib.image import imread
+from pyproj import Transformer
 
 from apertura.simulation import preset, simulate
 from apertura.webmap.page import is_built
@@ -95,11 +99,6 @@ def browser(tool):
 
 def pixels(page):
     """Grey values of the map's picture, as the reader sees it, by a canvas of the test's own."""
-    import io
-
-    import numpy as np
-    from matplotlib.image import imread
-
     return np.asarray(imread(io.BytesIO(page.locator("#view").screenshot()))[..., :3])
 
 
@@ -128,8 +127,7 @@ def test_a_targets_coordinates_read_from_the_page_are_within_a_pixel_of_the_trut
             peak = row.locator(".peak[data-east]")
             peak.wait_for(timeout=10_000)
             found = [float(peak.get_attribute(f"data-{axis}")) for axis in ("east", "north")]
-            assert abs(found[0] - target["x"]) < spacing_m
-            assert abs(found[1] - target["y"]) < spacing_m
+            assert found == pytest.approx((target["x"], target["y"]), abs=spacing_m / 4)
         page.wait_for_timeout(500)  # the map has come to the last target
         box = page.locator("#map").bounding_box()
         page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -138,10 +136,29 @@ def test_a_targets_coordinates_read_from_the_page_are_within_a_pixel_of_the_trut
         latitude, longitude = (float(one.strip(" °NE")) for one in page.inner_text("#geographic").split("°")[:2])
         assert wrong == []
     assert (east, north) == pytest.approx((truth[-1]["x"], truth[-1]["y"]), abs=spacing_m)
-    from pyproj import Transformer
-
     to_wgs84 = Transformer.from_crs("EPSG:32632", "EPSG:4326")
     assert (latitude, longitude) == pytest.approx(to_wgs84.transform(east, north), abs=2e-8)
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_target_is_drawn_where_it_is(browser, address, finished, number):
+    target = json.loads((finished.root / "truth.json").read_text())["targets"][number]
+    metres, spacing_m = 0.005, finished.settings.scene.spacing_m
+    view = f"{target['x']},{target['y']},{metres}"
+    with shown(browser, f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}") as (page, wrong):
+        peak_db = float(page.inner_text("#high-value").split()[0].replace("−", "-"))
+    level = peak_db + 20 * np.log10(target["amplitude"]) - 6
+    link = f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}&stretch={level},{level + 0.1}"
+    with shown(browser, link) as (page, wrong):
+        page.wait_for_timeout(300)
+        seen = pixels(page).mean(axis=-1) > 0.99
+        assert wrong == []
+    rows, columns = np.nonzero(seen)
+    middle = [(size - 1) / 2 for size in seen.shape]
+    near = np.hypot(rows - middle[0], columns - middle[1]) * metres < 0.5
+    assert near.sum() > 1000
+    off = np.array([rows[near].mean() - middle[0], columns[near].mean() - middle[1]]) * metres
+    assert np.abs(off).max() < spacing_m / 2, off
 
 
 def test_a_link_shows_what_it_was_taken_from_and_a_wrong_one_shows_the_map(browser, address, finished):
