@@ -169,6 +169,7 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
         ("f01/fused/image.json", "f01/fused/export"),
         ("f01/uav1-uav1/mask.tif", "f01/uav1-uav1/layers"),
         ("coverage.geojson", "coverage"),
+        ("map/map.json", "map/map"),
         ("scene.json", "scene"),
         ("f01/assessment.json", "f01/assessment"),
         ("cube.zarr/zarr.json", "cube"),

@@ -1,5 +1,6 @@
 """`apertura summary`: what every image of a finished campaign says of itself, its flags explained, and what to open."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +65,8 @@ def print_products(campaign: Campaign) -> None:
             path = campaign.result(flight.name, "fused", name)
             if path.is_file():
                 print(f"  {campaign.relative(path)}  {why}")
+    if campaign.result("map", "index.html").is_file():
+        print(f"  all of them on a map: apertura map {shlex.quote(str(campaign.root))}")
     if len(flights) > _MOST_FLIGHTS:
         print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
 
