@@ -18,6 +18,7 @@ from apertura.settings import (
     Flight,
     Node,
     Segment,
+    check_interferometry,
     read_clocks,
     read_flights,
     read_segments,
@@ -50,6 +51,8 @@ class Campaign(RawFolder):
         )
         settings = read_settings(config)
         flights = tuple(read_flights(table, nodes=settings.nodes))
+        images = [f"{one.name}/{pair}" for one in flights if one.kind == "image" for pair in one.pairs]
+        check_interferometry(settings.interferometry, images, where=CONFIG)
         imaging = tuple(read_segments(segments, flights=flights))
         return cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
 
@@ -186,6 +189,11 @@ class Campaign(RawFolder):
             }
             | antennas,
             "layers": {"integration": processing["integration"], **antennas},
+            "interferogram": {
+                "window_px": settings["interferometry"]["window_px"],
+                "reference_points": settings["scene"]["reference_points"],
+                "integration": processing["integration"],
+            },
         }
         return chosen.get(stage, {})
 

@@ -27,12 +27,18 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "phase": "interferogram",
+    "coherence": "interferogram",
+    "unwrapped": "interferogram",
+    "height": "interferogram",
+    "height_std": "interferogram",
+    "panels": "interferogram",
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
-complex amplitude without phase, ``magnitude`` the sum of their magnitudes; the others are layers that explain a
-pair's image, real; they lie beside it.
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
+lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
 """
 
 
@@ -51,17 +57,25 @@ class Export:
         ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
+    laid
+        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
     """
 
     file: str
     source: str
     function: str
     pictured: bool = False
+    laid: bool = True
 
     @property
     def module(self) -> str:
         """Dotted name of the module that writes the file."""
         return self.function.partition(":")[0]
+
+    @property
+    def style(self) -> bool:
+        """Whether it says how QGIS shows the raster of its name."""
+        return self.module == "apertura.export.style"
 
     @property
     def write(self) -> Callable[..., None]:
@@ -71,12 +85,12 @@ class Export:
 
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.export.cog:write_slc"),
+    Export("slc.tif", "image", "apertura.export.cog:write_slc", laid=False),
     Export("power.tif", "image", "apertura.export.cog:write_power"),
     Export("db.tif", "image", "apertura.export.db:write_db"),
     Export("db.qml", "image", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
-    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc"),
+    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc", laid=False),
     Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
     Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
     Export("coherent_db.qml", "coherent", "apertura.export.style:write_db_style"),
@@ -95,6 +109,12 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", "apertura.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
     Export("nesz.qml", "nesz", "apertura.export.style:write_layer_style"),
+    Export("phase.tif", "phase", "apertura.export.interferogram:write_phase"),
+    Export("coherence.tif", "coherence", "apertura.export.interferogram:write_coherence"),
+    Export("unwrapped.tif", "unwrapped", "apertura.export.interferogram:write_unwrapped"),
+    Export("height.tif", "height", "apertura.export.interferogram:write_height"),
+    Export("height_std.tif", "height_std", "apertura.export.interferogram:write_height_std"),
+    Export("quicklook.png", "panels", "apertura.export.interferogram:write_panels", pictured=True),
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
@@ -105,9 +125,16 @@ PHASE_HISTORY = "phase_history.cphd"
 COVERAGE = ("coverage.png", "coverage.geojson")
 """What shows the whole campaign."""
 
+MOSAICS = "mosaic"
+"""Folder of the rasters of all flights."""
+
+
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
 
 def exports_in(folder: str) -> Iterator[Export]:
-    """Yield the rows of a kind: ``pair``, ``fused`` or ``layers``.
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
 
     Examples
     --------
@@ -128,6 +155,45 @@ def export_modules(folder: str) -> list[str]:
     return sorted({export.module for export in exports_in(folder)})
 
 
+def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
+
+    Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs, the lowest first.
+
+    Examples
+    --------
+    >>> mosaics({"f01": ["a-b"], "f02": ["a-a", "a-b"]})["a-b/db.vrt"]
+    ['f01/a-b/db.tif', 'f02/a-b/db.tif']
+    """
+    found: dict[str, list[str]] = {}
+    for flight, names in pairs.items():
+        for folder, kinds in _folders(names):
+            for row in (row for kind in kinds for row in exports_in(kind)):
+                if row.laid and row.file.endswith(".tif"):
+                    name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
+                    found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
+    return found
+
+
+def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
+    styles = {row.file for row in EXPORTS if row.style}
+    for name in mosaics(pairs):
+        style = f"{name.removesuffix('.vrt')}.qml"
+        yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
+
+
+def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the folders of a flight, and the kinds of rows that lie in each."""
+    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield "fused", ("fused",)
+
+
 def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield every file that a finished campaign offers its user, relative to the results.
 
@@ -143,9 +209,11 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """
     yield from COVERAGE
     for flight, names in pairs.items():
-        for folder, kinds in (*((name, ("pair", "layers")) for name in names), ("fused", ("fused",))):
+        for folder, kinds in _folders(names):
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+    yield from mosaic_files(pairs)
+    yield MAP
 
 
 def write_exports(
@@ -163,7 +231,7 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused`` or ``layers``.
+        ``pair``, ``fused``, ``layers`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles

@@ -84,7 +84,7 @@ def write_quicklook(
             vmax=top_db,
             interpolation="nearest",
         )
-        layout.draw_frame(_crs_name(crs))
+        layout.draw_frame(crs_name(crs))
         averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
         beyond = "both" if top_db else "min"  # 0 dB is the peak: nothing lies above it
         layout.draw_colour_bar(picture, f"power re peak, dB{averaged}", beyond=beyond)
@@ -94,19 +94,33 @@ def write_quicklook(
             layout.axes.text(
                 0.5, 0.5, "no power in any pixel", transform=layout.axes.transAxes, ha="center", va="center"
             )
-        layout.write_words(title, subtitle, _footer(tags))
+        layout.write_words(title, subtitle, footer(tags))
         if "APERTURA_FLAGS" in tags:
             layout.write_flags(list(json.loads(tags["APERTURA_FLAGS"])))
         with replacement(path) as temporary:
             layout.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
 
 
-def _crs_name(crs: str) -> str:
+def crs_name(crs: str) -> str:
+    """Return what people call a coordinate reference system.
+
+    Examples
+    --------
+    >>> crs_name("EPSG:32632")
+    'WGS 84 / UTM zone 32N'
+    """
     known = CRS.from_user_input(crs)
     return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")
 
 
-def _footer(tags: Mapping[str, str]) -> str:
+def footer(tags: Mapping[str, str]) -> str:
+    """Return the line below a picture: version, focus, numerical error and code, as far as its tags say them.
+
+    Examples
+    --------
+    >>> footer({"APERTURA_VERSION": "1.0", "APERTURA_CODE_SHA256": "0123456789abcdef"})
+    'apertura 1.0 · code 0123456789ab'
+    """
     known = (
         ("APERTURA_VERSION", "apertura {}"),
         ("APERTURA_ERROR_DB", "numerical error below {} dB"),

@@ -55,8 +55,8 @@ def coherence(
         raise ValueError(f"{first.shape=}, {second.shape=}, {window=}: one shape and an odd window are needed")
     there = np.isfinite(first) & np.isfinite(second)
     one, other = (np.where(there, image, 0).astype(np.complex128) for image in (first, second))
-    crossed = _boxed(one * other.conj(), window)
-    power = _boxed(np.abs(one) ** 2, window) * _boxed(np.abs(other) ** 2, window)
+    crossed = boxed(one * other.conj(), window)
+    power = boxed(np.abs(one) ** 2, window) * boxed(np.abs(other) ** 2, window)
     told = there & (power > 0)
     magnitude, phase = np.full(first.shape, np.nan, np.float32), np.full(first.shape, np.nan, np.float32)
     magnitude[told] = np.minimum(np.abs(crossed[told]) / np.sqrt(power[told]), 1)
@@ -106,7 +106,7 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     return np.sqrt(np.maximum(square, 0)).astype(np.float32)
 
 
-def _boxed(values: NDArray[Any], window: int) -> NDArray[Any]:
+def boxed(values: NDArray[Any], window: int) -> NDArray[Any]:
     """Return the sum over a window about each element of a plane; beside the plane there is nothing.
 
     No running sum: that would leave rounding of a bright point in all that follows it.

@@ -7,6 +7,7 @@ from apertura.settings.clocks import CLOCK_COLUMNS, CLOCKS, Clock, read_clocks
 from apertura.settings.config import CONFIG, Settings, located, read_settings, validated
 from apertura.settings.flights import FLIGHTS, Flight, read_flights
 from apertura.settings.history_waveforms import FmcwWaveform, PhaseHistoryWaveform
+from apertura.settings.interferometry import Interferometry, check_interferometry
 from apertura.settings.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.sampled_waveforms import OfdmWaveform, PulseWaveform, SampledWaveform
@@ -27,6 +28,7 @@ __all__ = [
     "Clock",
     "Flight",
     "FmcwWaveform",
+    "Interferometry",
     "LeverArms",
     "Name",
     "Node",
@@ -41,6 +43,7 @@ __all__ = [
     "Segment",
     "Settings",
     "Waveform",
+    "check_interferometry",
     "located",
     "read_clocks",
     "read_flights",

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from apertura import validation
 from apertura.documents import read_yaml
 from apertura.settings.history_waveforms import PhaseHistoryWaveform
+from apertura.settings.interferometry import Interferometry
 from apertura.settings.nodes import Node
 from apertura.settings.processing import Calibration, Processing
 from apertura.settings.scene import Scene
@@ -28,6 +29,10 @@ class Settings(Section):
     processing: Processing = Field(default_factory=Processing, description="how to compute")
     calibration: Calibration | None = Field(
         None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+    )
+
+    interferometry: Interferometry = Field(
+        default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
     )
 
     @model_validator(mode="after")

@@ -129,6 +129,9 @@ class Clutter:
     reflectivity: float = Field(ge=0, description="mean power per square metre; 1: one unit point target per m²")
     density_per_m2: float = Field(default=10.0, gt=0, description="points per m²; several per cell look like ground")
     up_m: float = Field(default=0.0, description="height above the origin, m")
+    slope: tuple[float, float] = Field(
+        default=(0.0, 0.0), description="rise per metre east and north of the origin: a ramp"
+    )
     kind: Literal["clutter"] = Field(default="clutter", kw_only=True, repr=False)
 
     def points(self, generator: Generator) -> Scatterers:
@@ -137,7 +140,7 @@ class Clutter:
         count = round((east_max - east) * (north_max - north) * self.density_per_m2)
         plan = generator.uniform((east, north), (east_max, north_max), (count, 2))
         parts = generator.standard_normal((count, 2)) * np.sqrt(self.reflectivity / self.density_per_m2 / 2)
-        position = np.column_stack([plan, np.full(count, self.up_m)])
+        position = np.column_stack([plan, self.up_m + plan @ np.array(self.slope)])
         return Scatterers(position, parts[:, 0] + 1j * parts[:, 1])
 
 

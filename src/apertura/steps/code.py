@@ -10,6 +10,7 @@ _MODULES = {
     "refined_track": "apertura.steps.refine",
     "assessment": "apertura.steps.assess",
     "fused": "apertura.steps.export",
+    "map": "apertura.steps.webmap",
     "speed_accuracy": "apertura.study.chart.speed_accuracy",
     "whole": "apertura.study.chart.whole",
 }
@@ -25,5 +26,5 @@ def code_of(result: str) -> str:
     True
     """
     tables = {"image": ENGINES.values(), "refined_track": ENGINES.values(), "export": export_modules("pair")}
-    tables |= {kind: export_modules(kind) for kind in ("fused", "layers")}
+    tables |= {kind: export_modules(kind) for kind in ("fused", "layers", "interferogram")}
     return code_sha256(_MODULES.get(result, f"apertura.steps.{result}"), *tables.get(result, ()))

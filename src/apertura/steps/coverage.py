@@ -10,18 +10,17 @@ from rasterio.enums import Resampling
 
 from apertura.atomic import replacement
 from apertura.campaign import Campaign
-from apertura.errors import CampaignError
 from apertura.export import COVERAGE
 from apertura.export.coverage import Covered, feature_collection, write_coverage
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
 from apertura.imaging.stages import aperture_of
 from apertura.lineage import result_of
+from apertura.load.layer import opened_layer
 from apertura.load.scene import OpenScene, settled_scene
-from apertura.provenance import Provenance, canonical_json, sha256_file
+from apertura.provenance import Provenance, canonical_json
 from apertura.scene.grid import SceneGrid
-from apertura.scene.raster import opened_raster
 from apertura.steps.stamping import tags_of
-from apertura.store import open_stage, read_manifest, record_files
+from apertura.store import open_stage, record_files
 
 _DOTS = 480  # of the longer side of the scene
 _VERTICES = 400  # of a track
@@ -34,15 +33,12 @@ def coverage(campaign: Campaign) -> list[Path]:
     covered = [
         _covered(campaign, flight.name, pair, scene.grid) for flight in campaign.image_flights for pair in flight.pairs
     ]
-    step, _, west, _, _, north = scene.grid.transform
-    rows, columns = covered[0].looks.shape
-    down, right = (size * step / dots for size, dots in zip(scene.grid.shape, (rows, columns), strict=True))
-    transform = Affine(right, 0, west, 0, -down, north)
+    transform = transform_of(scene.grid, covered[0].looks)
     picture, features = written = [campaign.result(name) for name in COVERAGE]
     tags = tags_of(Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
-    write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
-    found = feature_collection(covered, transform, _place(scene), height_m=scene.level.height_m)
+    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
+    found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
         temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
     record_files(campaign.root / lineage.result.manifest, written, lineage)
@@ -56,24 +52,32 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
     if len(set(pair.split("-"))) == 1:
         del legs["receiver"]  # the same node: one track
     tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
-    return Covered(flight, pair, tracks_m, _looks(campaign, flight, pair))
+    return Covered(flight, pair, tracks_m, few_looks(campaign, flight, pair))
 
 
-def _looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
-    """Return the looks of a pair, averaged to few places; from the overviews of its file."""
-    path = campaign.result(flight, pair, "looks.tif")
-    manifest = campaign.root / campaign.manifest("layers", flight, pair)
-    remedy = f"Delete {manifest} and run the workflow again."
-    if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
-        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
-    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
+    """Return the looks of a pair, averaged to few places; from the overviews of its file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is not as step `layers` wrote it.
+    """
+    with opened_layer(campaign, flight, pair, "looks.tif") as raster:
         fewer = max(1.0, max(raster.shape) / _DOTS)
         shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
         looks: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
     return looks
 
 
-def _place(scene: OpenScene) -> Any:
+def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:
+    """Return where the places of `few_looks` lie on the map."""
+    step, _, west, _, _, north = grid.transform
+    down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
+    return Affine(right, 0, west, 0, -down, north)
+
+
+def place_of(scene: OpenScene) -> Any:
     """Return what turns map coordinates into longitude, latitude and height; None in a local frame."""
     if scene.grid.crs == LOCAL:
         return None
@@ -85,7 +89,8 @@ def _place(scene: OpenScene) -> Any:
     return place
 
 
-def _crs_name(grid: SceneGrid) -> str:
+def crs_name(grid: SceneGrid) -> str:
+    """Return the name of a grid's CRS as pictures show it."""
     from pyproj import CRS
 
     known = CRS.from_user_input(grid.crs_wkt)

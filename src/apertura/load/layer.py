@@ -1,0 +1,34 @@
+"""A layer of a pair, opened as the workflow left it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.provenance import sha256_file
+from apertura.scene.raster import opened_raster
+from apertura.store import read_manifest
+
+
+@contextmanager
+def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Iterator[Any]:
+    """Open a GeoTIFF that step `layers` wrote, such as 'mask.tif'.
+
+    Yields
+    ------
+    rasterio.DatasetReader
+        The raster.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there as the step wrote it.
+    """
+    path = campaign.result(flight, pair, file)
+    manifest = campaign.root / campaign.manifest("layers", flight, pair)
+    remedy = f"Delete {manifest} and run the workflow again."
+    if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
+        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
+    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+        yield raster
