@@ -36,8 +36,8 @@ def api_page() -> str:
     parts = [_HEAD]
     for group, what in _GROUPS.items():
         parts.append(f"\n## {group}\n\n{what}\n")
-        names = [name for name in (*_OF, *apertura.__all__) if _OF.get(name, _OTHERS) == group]
-        parts += [f"\n::: {_place(name)}\n" for name in dict.fromkeys(names)]
+        names = dict.fromkeys(name for name in (*_OF, *apertura.__all__) if _OF.get(name, _OTHERS) == group)
+        parts += [f"\n::: {_place(name)}\n" for name in names]
         parts += [f"\n::: {_GIVEN[name]}\n" for name in names if name in _GIVEN]
     return "".join(parts)
 
