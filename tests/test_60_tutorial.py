@@ -13,6 +13,7 @@ from walked import walk
 from apertura.focus.engines import native
 
 TUTORIAL = Path(__file__).parents[1] / "docs/tutorial.md"
+PROJECT = Path(__file__).parents[1] / "examples/qgis_project.py"
 
 
 @pytest.mark.skipif(not native.available(), reason="the plan that is shown takes the compiled engine")
@@ -35,15 +36,16 @@ def test_the_tutorial_ends_with_a_qgis_project_of_every_image_in_its_place(finis
     python = with_qgis()
     if python is None:
         pytest.skip("no QGIS: its Python is not on this machine")
-    script = re.search(r"^```py\n(.*?)^```\n", TUTORIAL.read_text(encoding="utf-8"), re.M | re.S)[1]
-    (tmp_path / "project.py").write_text(script, encoding="utf-8")
     campaign = tmp_path / "a campaign"
     for path in finished_tiny.root.glob("results/*/*/*db.tif"):
         copied = campaign / path.relative_to(finished_tiny.root)
         copied.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(path, copied)
-    done = subprocess.run([python, "project.py", campaign], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run([python, PROJECT, campaign], capture_output=True, text=True, check=False)
     assert done.stdout.splitlines()[-1:] == ["4 images, EPSG:32632"], done.stderr
+    again = subprocess.run([python, PROJECT, campaign], capture_output=True, text=True, check=False)
+    assert again.returncode == 1
+    assert "there already" in again.stderr
     with zipfile.ZipFile(campaign / "campaign.qgz") as project:
         text = project.read("campaign.qgs").decode()
     layers = re.findall(r"<maplayer .*?</maplayer>", text, re.S)
