@@ -93,7 +93,7 @@ def two_tracks(rise_m, along_m=0.0, common=1.0, marked=False):
     second = common * first + np.sqrt(1 - common**2) * drawn()
     if marked:
         east, north = (np.append(at, marks) for at, marks in zip((east, north), np.array(MARKS).T, strict=True))
-        first, second = (np.append(one, [60.0, 60.0]) for one in (first, second))
+        first, second = (np.append(one, [47.0, 47.0]) for one in (first, second))
     points = np.stack([east, north, ramp_m(east, north)], -1)
     flown = [ap.Aperture(one, one) for one in (track(25.0), track(25.0 + rise_m, along_m))]
     images = [image(one, points, amplitude) for one, amplitude in zip(flown, (first, second), strict=True)]
