@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup demo run bench paper stability pages test test-slow attack cluster-test lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages docs test test-slow attack cluster-test lint format lock clean
 
 setup: $(SETUP)
 
@@ -19,7 +19,15 @@ $(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMa
 	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
 	$(BIN)/python -m compileall -q src
+	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; fi
 	touch $@
+
+# The page of `apertura map`, into the package. Its libraries come by hash, as Python's do; none runs a script of its own.
+PAGE := src/apertura/webmap/page/index.html
+webmap: $(PAGE)
+$(PAGE): webmap/build.mjs webmap/package-lock.json $(wildcard webmap/src/*)
+	npm ci --prefix webmap --ignore-scripts --no-audit --no-fund --loglevel=error
+	node webmap/build.mjs
 
 # Nothing is deleted but results that a run before has made: a folder `demo` without the mark is somebody's own.
 MARK := demo/.simulated-by-make
@@ -45,6 +53,12 @@ bench: $(SETUP)
 # The pages of docs/ that are written from the code.
 pages: $(SETUP)
 	$(BIN)/python -m website.pages
+
+# The site, into build/site: a link that leads nowhere ends it, so does a page that another host would be asked for.
+# Look at it: python3 -m http.server --bind 127.0.0.1 --directory build/site
+docs: pages
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	$(BIN)/python -m website.check build/site
 
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
@@ -90,4 +104,4 @@ lock: $(SETUP)
 
 clean:
 	test ! -e $(MARK) || rm -rf demo
-	rm -rf $(VENV) build
+	rm -rf $(VENV) build webmap/node_modules $(dir $(PAGE))

@@ -8,6 +8,8 @@ from apertura.signals import STATUS_FILE
 module apertura:
     snakefile:
         "workflow/Snakefile"
+    config:
+        config
 
 
 use rule * from apertura

@@ -31,7 +31,21 @@ from apertura.simulation import (
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.steps import assess, coverage, cube, echo, export, image, ingest, layers, profile, refine, scene, terrain
+from apertura.steps import (
+    assess,
+    coverage,
+    cube,
+    echo,
+    export,
+    image,
+    ingest,
+    layers,
+    mosaic,
+    profile,
+    refine,
+    scene,
+    terrain,
+)
 from apertura.store import open_stage
 
 ROOT = Path(__file__).parents[1]
@@ -96,6 +110,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
                 export.export(campaign, flight.name, pair)
             export.export_fused(campaign, flight.name)
         coverage.coverage(campaign)
+        mosaic.mosaic(campaign)
     return campaign
 
 

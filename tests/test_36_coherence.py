@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.interferometry.coherence import chance, coherence, unbiased
+from apertura.interferometry.common_band import common_band, window_px
 
 SIDE = 256
 INSIDE = (slice(8, -8), slice(8, -8))
@@ -47,6 +48,22 @@ def test_bands_without_a_common_part_are_incoherent_however_still_the_ground():
     first, second = (imaged(scene, middle=(0.0, at), width=0.3) for at in (-0.16, 0.16))
     magnitude, _, looks = coherence(first, second, window=9)
     assert magnitude[INSIDE].mean() == pytest.approx(chance(looks), rel=0.05)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.1, 0.25, 0.4])
+def test_the_common_band_is_what_still_ground_shows(apart):
+    first, second = imaged(ground(20)), imaged(ground(20), middle=(0.0, apart))
+    shared, spectrum = 1 - apart / 0.5, np.eye(2) * 0.5**2 / 12
+    assert coherence(first, second, window=15)[0][INSIDE].mean() == pytest.approx(shared, abs=0.02)
+    assert common_band((np.zeros(2), np.array([0.0, apart])), (spectrum, spectrum)) == pytest.approx(shared, abs=0.09)
+
+
+@pytest.mark.parametrize("width", [0.3, 0.6, 0.95])
+def test_the_window_that_is_chosen_holds_the_looks_asked_for(width):
+    side = window_px(np.eye(2) * width**2 / 12, 1.0, looks=16)
+    looks = coherence(imaged(ground(21), width=width), imaged(ground(22), width=width), window=side)[2]
+    assert 16 <= looks < 45
+    assert window_px(np.zeros((2, 2)), 1.0, most=31) == 31
 
 
 @pytest.mark.parametrize(("width", "window"), [(0.99, 9), (0.5, 9), (0.5, 15)])

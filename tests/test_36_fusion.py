@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from apertura.fusion.sums import coherent_sum, noncoherent_sum
+from apertura.fusion.clutter import clutter_reduction_db
+from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
 
 
 def test_images_in_phase_keep_their_peak_and_images_out_of_phase_cancel():
@@ -34,3 +35,49 @@ def test_blocks_add_up_to_the_whole():
 def test_an_empty_image_is_refused():
     with pytest.raises(ValueError, match="empty image"):
         coherent_sum(np.zeros((2, 4, 4), np.complex64), np.array([1.0, 0.0]))
+
+
+@pytest.mark.parametrize(("added", "alone"), [(coherent_sum, 0.5), (noncoherent_sum, 0.5), (magnitude_sum, 0.5)])
+def test_a_pair_adds_nothing_where_it_sees_nothing_and_where_none_does_there_is_no_sum(added, alone):
+    nothing = np.complex64(complex(np.nan, np.nan))
+    images = np.array([[[1, 1, nothing]], [[1, nothing, nothing]]], np.complex64)
+    np.testing.assert_allclose(np.abs(added(images, np.ones(2)))[0], [1, alone, np.nan])
+
+
+def with_a_target(clutter, phase_rad=0.0):
+    """Images of a target among clutter 30 dB below it."""
+    images = (0.0316 * clutter).astype(np.complex64)
+    images[:, 30, 30] = np.exp(1j * phase_rad * np.arange(len(images)))
+    return images
+
+
+def reduced_db(images):
+    """What the coherent sum of images does to their clutter."""
+    peaks = np.abs(images).max(axis=(1, 2))
+    floor_db = [10 * np.log10(np.median(np.abs(one) ** 2) / (np.abs(one) ** 2).max()) for one in images]
+    total = np.abs(coherent_sum(images, peaks)) ** 2
+    return clutter_reduction_db(floor_db, 10 * np.log10(np.median(total) / total.max()))
+
+
+def speckle(pairs):
+    generator = np.random.default_rng(3)
+    return (generator.normal(size=(pairs, 128, 128)) + 1j * generator.normal(size=(pairs, 128, 128))) / np.sqrt(2)
+
+
+@pytest.mark.parametrize("pairs", [2, 3, 6])
+def test_a_coherent_sum_lowers_independent_clutter_by_the_number_of_its_images(pairs):
+    assert reduced_db(with_a_target(speckle(pairs))) == pytest.approx(10 * np.log10(pairs), abs=0.15)
+
+
+def test_clutter_that_all_images_show_stays():
+    assert reduced_db(with_a_target(np.repeat(speckle(1), 3, axis=0))) == pytest.approx(0.0, abs=0.01)
+
+
+def test_targets_out_of_phase_cost_the_sum_what_its_peak_loses():
+    lost_db = 20 * np.log10(np.cos(0.6))
+    assert reduced_db(with_a_target(speckle(2), phase_rad=1.2)) == pytest.approx(3.01 + lost_db, abs=0.15)
+
+
+def test_a_sum_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="no image"):
+        clutter_reduction_db([], -40.0)

@@ -262,7 +262,7 @@ def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
     bits = np.full((600, 600), SHADOW, np.uint8)
     bits[300:, :300], bits[300:, 300:], bits[:10] = LAYOVER, SHADOW | LAYOVER, OUTSIDE
     for name, write in LAYERS.items():
-        layer = bits if name == "mask.tif" else angle
+        layer = {"mask.tif": bits, "looks.tif": np.nan_to_num(angle)}.get(name, angle)
         write(tmp_path / name, layer, **UTM, tags=TAGS)
         with rasterio.open(tmp_path / name) as raster:
             assert np.array_equal(raster.read(1), layer, equal_nan=name != "mask.tif")

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from folders import complaint, copy_writable, edit_config, quality_of
 
 from apertura.campaign import Campaign
+from apertura.export.layers import OUTSIDE
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.simulation import (
     GaussianBeam,
@@ -21,7 +23,7 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.presets import DEMO_ORIGIN
-from apertura.steps import echo, image, ingest, profile, refine, scene
+from apertura.steps import echo, image, ingest, layers, profile, refine, scene
 from apertura.steps.plan import expected_plan
 from apertura.store import open_stage
 
@@ -202,13 +204,17 @@ def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beam
 @pytest.mark.parametrize(("turn_deg", "misses"), [(0.0, False), (28.0, True)])
 def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_deg, misses):
     turned = BEAM | {"boresight_deg": [90.0 + turn_deg, -DEPRESSION_DEG]}
-    pixels, report = imaged(stated(beamed, turned))
-    dark = float((pixels == 0).mean())
+    campaign = stated(beamed, turned)
+    pixels, report = imaged(campaign)
+    dark = float(np.isnan(pixels).mean())
     assert ("beam_misses" in report["flags"]) is misses
     assert (dark > 0) is misses
     if misses:
         assert float(report["flags"]["beam_misses"].split()[0]) / 100 == pytest.approx(dark, abs=0.02)
         assert report["antennas"]["pulses_seeing"]["least"] == 0
+        layers.layers(campaign, "f01", "uav1-uav1")
+        with rasterio.open(campaign.result("f01", "uav1-uav1", "mask.tif")) as mask:
+            np.testing.assert_array_equal(np.isnan(pixels), mask.read(1) == OUTSIDE)
 
 
 def test_only_the_image_depends_on_what_the_beam_is(beamed):

@@ -73,7 +73,19 @@ def test_a_long_recording_is_given_time_and_bounded_memory(tiny):
 @pytest.mark.slow
 def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more_than_four_times_that(tiny):
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    command = [sys.executable, "-m", "snakemake", "--directory", str(tiny), "--cores", "2", "--set-scatter", "tiles=2"]
+    command = [
+        sys.executable,
+        "-m",
+        "snakemake",
+        "--directory",
+        str(tiny),
+        "--cores",
+        "2",
+        "--set-scatter",
+        "tiles=2",
+        "all",
+        "pages",
+    ]
     done = subprocess.run(command, cwd=ROOT, env=environment, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     asked, seen = Resources(Campaign.load(tiny)), set()

@@ -17,7 +17,8 @@ the table that closes a run. It never stops a run. Without one, nothing known wa
 _FOOT = """
 Limits and how they follow: [echo methods](theory/echo_methods.md), [tracks](theory/tracks.md),
 [planner](theory/planner.md), [terrain](theory/terrain.md), [waveforms](theory/waveforms.md),
-[FMCW](theory/fmcw.md). Written by `make pages` from `FLAGS` in `src/apertura/flags/__init__.py`.
+[FMCW](theory/fmcw.md). Files are below `src/apertura`.
+Written by `make pages` from `FLAGS` in `src/apertura/flags/__init__.py`.
 """
 
 _PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")
@@ -28,7 +29,7 @@ def flags_page() -> str:
     """Return docs/flags.md."""
     rows = [
         f"| `{name}` | {_marked(flag.measured)} | {_marked(flag.means)} | {_marked(flag.look)} "
-        f"| {', '.join(f'`src/apertura/{file}`' for file in flag.raised.split(', '))} |\n"
+        f"| {', '.join(f'`{file}`' for file in flag.raised.split(', '))} |\n"
         for name, flag in FLAGS.items()
     ]
     return _HEAD + "".join(rows) + _FOOT

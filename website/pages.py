@@ -3,11 +3,17 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from website.api import api_page
+from website.cli import cli_page
 from website.flags import flags_page
 
 ROOT = Path(__file__).parents[1]
 
-PAGES: dict[str, Callable[[], str]] = {"docs/flags.md": flags_page}
+PAGES: dict[str, Callable[[], str]] = {
+    "docs/api.md": api_page,
+    "docs/cli.md": cli_page,
+    "docs/flags.md": flags_page,
+}
 """File → what it must hold."""
 
 if __name__ == "__main__":

@@ -28,6 +28,10 @@ app.add_typer(study, name="study")
 app.command()(raw_commands.inspect)
 app.command()(raw_commands.align)
 app.command()(product_commands.score)
+app.command()(product_commands.verify)
+app.command()(product_commands.diff)
+app.command()(product_commands.report)
+app.command("map")(product_commands.map_page)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from apertura.cube_variables import COORDINATES, MEASURED, QUOTED, RASTERS
 from apertura.errors import ContractError
 
 if TYPE_CHECKING:
@@ -167,15 +168,11 @@ STAGES: Mapping[str, Stage] = {
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
     ),
     "cube": Stage(
+        {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()},
         {
-            "image": Variable(
-                ("flight", "pair", "y", "x"), "complex64", "1", "every image; NaN: not flown, not formed"
-            ),
-            "coherent": Variable(("flight", "y", "x"), "complex64", "1", "mean of the peak-normalised images"),
-            "noncoherent": Variable(("flight", "y", "x"), "float32", "1", "mean power of the peak-normalised images"),
-            "magnitude": Variable(("flight", "y", "x"), "float32", "1", "mean magnitude of the peak-normalised images"),
+            "fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why",
+            "coherence_window": "pixels along a side of the window that coherence is measured in",
         },
-        {"fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why"},
     ),
 }
 

@@ -8,15 +8,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from apertura.campaign import Campaign
 from apertura.digests import Result
-from apertura.settings import SampledWaveform
+from apertura.paths import shipped
+from apertura.provenance import sha256_tree
+from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
+from apertura.webmap.page import page_sha256
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
 
+_SHOWN = ("layers", "export")
+"""Results of a pair that the map shows."""
+
 INTERFEROMETRY = "interferometry"
 """Folder of what two images tell of each other's phase."""
 
-ON_DEMAND = frozenset({"cphd", "speed_accuracy", "whole"})
+ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
 
 
@@ -41,9 +47,9 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     result
         A key of `RESULTS`.
     *where
-        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd), flight
-        (calibration, refined_track, assessment, fused), a name of `interferometry.pairs` (interferogram), nothing
-        (the others).
+        Flight and node (raw, track), flight and pair (echo, profile, image, layers, export, cphd, pictures), flight
+        (calibration, refined_track, assessment, fused, page), a name of `interferometry.pairs` (interferogram),
+        nothing (the others).
     """
     return RESULTS[result](campaign, *where)
 
@@ -74,7 +80,14 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     yield from (("coverage",), ("cube",))
     yield from (("fused", flight.name) for flight in campaign.image_flights)
     yield from (("interferogram", name) for name in campaign.settings.interferometry.pairs)
+    yield ("mosaic",)
+    yield ("stac",)
+    for flight in campaign.image_flights:
+        yield from (("pictures", flight.name, pair) for pair in flight.pairs)
+        yield "page", flight.name
+    yield ("map",)
     yield from (("speed_accuracy",), ("whole",))
+    yield ("ro_crate",)
 
 
 def _raw(campaign: Campaign, flight: str, node: str) -> Result:
@@ -183,11 +196,64 @@ def _cphd(campaign: Campaign, flight: str, pair: str) -> Result:
     return Result(campaign.manifest("cphd", flight, pair), sources, {"campaign": campaign.settings.campaign})
 
 
+def _pictures(campaign: Campaign, flight: str, pair: str) -> Result:
+    stages = [campaign.manifest(stage, flight, pair) for stage in ("echo", "profile", "image", "layers")]
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        stages.append(campaign.manifest("raw", flight, pair.partition("-")[0]))
+    sources = (*stages, campaign.manifest("refined_track", flight), *_ground(campaign))
+    return Result(campaign.manifest("pictures", flight, pair), sources, {"campaign": campaign.settings.campaign})
+
+
+def _page(campaign: Campaign, flight: str) -> Result:
+    pairs = campaign.flight(flight).pairs
+    made = [campaign.manifest(of, flight, pair) for pair in pairs for of in ("pictures", "export")]
+    images = [campaign.manifest("image", flight, pair) for pair in pairs]
+    sources = (*made, *images, campaign.manifest("export", flight, "fused"), campaign.manifest("scene"))
+    return Result(campaign.manifest("page", flight), sources, campaign.values)
+
+
 def _fused(campaign: Campaign, flight: str) -> Result:
     images = [campaign.manifest("image", flight, pair) for pair in campaign.flight(flight).pairs]
     sources = (*images, campaign.manifest("assessment", flight), campaign.manifest("cube"), campaign.manifest("scene"))
     settings = {"campaign": campaign.settings.campaign, "tile_px": campaign.settings.processing.tile_px}
     return Result(campaign.manifest("export", flight, "fused"), sources, settings)
+
+
+def _mosaic(campaign: Campaign) -> Result:
+    made = [
+        campaign.manifest(result, flight.name, folder)
+        for flight in campaign.image_flights
+        for result, folders in (("layers", flight.pairs), ("export", (*flight.pairs, "fused")))
+        for folder in folders
+    ]
+    return Result(campaign.manifest("mosaic", "mosaic"), tuple(made), {"campaign": campaign.settings.campaign})
+
+
+def _stac(campaign: Campaign) -> Result:
+    flights = campaign.image_flights
+    pairs = [(one.name, pair) for one in flights for pair in one.pairs]
+    of_pairs = [(result, *pair) for pair in pairs for result in ("echo", "layers", "export")]
+    described = [*of_pairs, *(("export", one.name, "fused") for one in flights), ("scene",)]
+    sources = tuple(campaign.manifest(*of) for of in described)
+    return Result(campaign.manifest("stac"), sources, {"campaign": campaign.settings.campaign})
+
+
+def _ro_crate(campaign: Campaign) -> Result:
+    made = [result_of(campaign, name, *where).manifest for name, *where in _order(campaign) if name != "ro_crate"]
+    stated = [path.as_posix() for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS) if (campaign.root / path).is_file()]
+    sources = (*stated, *(manifest for manifest in made if not on_demand(manifest)))
+    settings = {"campaign": campaign.settings.campaign, "workflow": sha256_tree(shipped() / "workflow")}
+    return Result(campaign.manifest("ro_crate"), sources, settings)
+
+
+def _map(campaign: Campaign) -> Result:
+    shown = [(stage, one.name, pair) for one in campaign.image_flights for pair in one.pairs for stage in _SHOWN]
+    shown += [("export", one.name, "fused") for one in campaign.image_flights]
+    made = [campaign.manifest(*of) for of in (*shown, ("coverage",), ("scene",))]
+    truth = ["truth.json"] if (campaign.root / "truth.json").is_file() else []
+    known = {key: campaign.values.get(key) for key in ("campaign", "calibration")}
+    known["reference_points"] = campaign.values["scene"]["reference_points"]
+    return Result(campaign.manifest("map", "map"), (*made, *truth), {**known, "page": page_sha256()})
 
 
 def _interferogram(campaign: Campaign, name: str) -> Result:
@@ -245,6 +311,12 @@ RESULTS: Mapping[str, Callable[..., Result]] = {
     "export": _export,
     "cphd": _cphd,
     "fused": _fused,
+    "mosaic": _mosaic,
+    "stac": _stac,
+    "ro_crate": _ro_crate,
+    "pictures": _pictures,
+    "page": _page,
+    "map": _map,
     "interferogram": _interferogram,
     "speed_accuracy": _speed_accuracy,
     "whole": _whole,

@@ -1,5 +1,6 @@
-"""What people ask of finished products: how far off their targets are."""
+"""What people ask of finished products: targets against truth, what products were made from, a report, a map."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -16,3 +17,68 @@ def score(
     from apertura.steps.score import print_findings
 
     print_findings(Campaign.load(leave_working_folder(campaign)), paths=paths)
+
+
+def verify(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    campaign: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
+) -> None:
+    """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    there = None if campaign is None else campaign.absolute()
+    path = leave_working_folder(product)
+    from apertura.audit.verify import print_verified
+
+    raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+) -> None:
+    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    there = second.absolute()
+    path = leave_working_folder(first)
+    from apertura.audit.diff import print_differences
+
+    raise typer.Exit(print_differences(path, there))
+
+
+def report(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder")],
+    cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,
+) -> None:
+    """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
+    from apertura.atomic import replacement
+    from apertura.campaign import Campaign
+    from apertura.paths import shipped
+    from apertura.steps.page import PAGE
+    from apertura.workflow import run_workflow
+
+    campaign = campaign.absolute()
+    status = run_workflow(campaign, cores, "all", "pages")
+    if status == 0:
+        opened = Campaign.load(leave_working_folder(campaign))
+        style = ["--report-stylesheet", str(shipped() / "workflow" / "report" / "report.css")]
+        with replacement(opened.result(PAGE)) as temporary:
+            status = run_workflow(campaign, 1, "all", "pages", "--report", str(temporary), *style, show="errors")
+            if status:
+                raise SystemExit(status)
+        for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
+            typer.echo(path)
+    raise SystemExit(status)
+
+
+def map_page(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with results")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
+) -> None:
+    """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    from apertura.campaign import Campaign
+    from apertura.load.map_server import served
+
+    served(Campaign.load(leave_working_folder(campaign)), port=port).show(in_browser=open_)

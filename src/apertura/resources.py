@@ -115,6 +115,12 @@ DEMANDS: Mapping[str, Demand] = {
     "cphd": Demand(500, pulse_bytes=500, recorded_s=120),
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
+    "mosaic": Demand(500),
+    "stac": Demand(500),
+    "ro_crate": Demand(500),
+    "pictures": Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
+    "page": Demand(500, pixel_s=5),
+    "map": Demand(500, pixel_s=1),
     "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
     "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
 }

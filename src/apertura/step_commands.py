@@ -70,6 +70,18 @@ def coverage(campaign: Directory = HERE) -> None:
     _run("apertura.steps.coverage:coverage", campaign)
 
 
+@app.command("map")
+def step_map(campaign: Directory = HERE) -> None:
+    """Write the page that shows every image in a browser, map/index.html."""
+    _run("apertura.steps.webmap:webmap", campaign)
+
+
+@app.command()
+def mosaic(campaign: Directory = HERE) -> None:
+    """Lay each product of all flights upon one another, mosaic/<pair>/<product>.vrt."""
+    _run("apertura.steps.mosaic:mosaic", campaign)
+
+
 @app.command()
 def profile(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Compress a pair in range over the scene, profile.zarr."""
@@ -131,6 +143,30 @@ def cphd(flight: str, pair: str, campaign: Directory = HERE) -> None:
 
 
 @app.command()
+def pictures(flight: str, pair: str, campaign: Directory = HERE) -> None:
+    """Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget."""
+    _run("apertura.steps.pictures:pictures", campaign, flight, pair)
+
+
+@app.command()
+def page(flight: str, campaign: Directory = HERE) -> None:
+    """Write what the report says of a flight, report.html, which prints."""
+    _run("apertura.steps.page:page", campaign, flight)
+
+
+@app.command()
 def export(flight: str, pair: str, campaign: Directory = HERE) -> None:
     """Write GeoTIFFs and the quicklook of a pair, or of 'fused'."""
     _run("apertura.steps.export:export", campaign, flight, pair)
+
+
+@app.command()
+def stac(campaign: Directory = HERE) -> None:
+    """Describe every image in a static STAC catalog, stac/catalog.json."""
+    _run("apertura.steps.stac:stac", campaign)
+
+
+@app.command()
+def ro_crate(campaign: Directory = HERE) -> None:
+    """Tell the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json."""
+    _run("apertura.steps.ro_crate:ro_crate", campaign)

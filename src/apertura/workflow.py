@@ -120,8 +120,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         return _formed(root, command, files, screen, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         files = _Files.apart(scratch)
-        if show != "snakemake" and any(map(_DRY_RUN.fullmatch, arguments)):
-            return _previewed(root, command, files)
+        dry = any(map(_DRY_RUN.fullmatch, arguments))
+        if show == "errors" or (dry and show == "steps"):
+            return _looked_at(root, command, files, told=dry)
         return files.status_of(_supervised(command, files.environment))
 
 
@@ -153,14 +154,14 @@ def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen,
     return status
 
 
-def _previewed(root: Path, command: Sequence[str], files: "_Files") -> int:
-    """Say briefly what a run would do."""
+def _looked_at(root: Path, command: Sequence[str], files: "_Files", *, told: bool) -> int:
+    """Have snakemake look at the workflow, and say briefly what a run would do where that is to be `told`."""
     with files.log.open("wb") as output:
         status = files.status_of(_supervised(command, files.environment, output))
     run = Reader(files.journal).news()
     if status:
         _say(*failures(root, run, files.log))
-    else:
+    elif told:
         print(f"{run.total} steps to do: {listed(run.planned)}" if run.planned else NOTHING)
     return status
 

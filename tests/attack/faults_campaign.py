@@ -38,6 +38,7 @@ STEPS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "mosaic",
 )
 """Every command of a run in its order."""
 
@@ -57,6 +58,7 @@ TARGETS = (
     "export f01 uav1-uav2",
     "export f01 fused",
     "coverage",
+    "mosaic",
 )
 """One command of every kind."""
 

@@ -9,7 +9,7 @@ rule export:
                 f"results/{{flight}}/{{pair}}/{export.file}",
                 caption="../report/quicklook.rst",
                 category="{flight}",
-                labels={"image": "{pair}"},
+                labels={"image": "{pair}", "shows": "image"},
             )
             for export in exports_in("pair")
             if export.pictured
@@ -71,7 +71,7 @@ rule export_fused:
                 f"results/{{flight}}/fused/{export.file}",
                 caption="../report/quicklook.rst",
                 category="{flight}",
-                labels={"image": "fused"},
+                labels={"image": "fused", "shows": "image"},
             )
             for export in exports_in("fused")
             if export.pictured
@@ -121,3 +121,54 @@ rule coverage:
         "drawing what the flights cover"
     shell:
         "apertura step coverage > {log} 2>&1"
+
+
+rule mosaic:
+    input:
+        lambda wildcards: result_of(campaign, "mosaic").sources,
+    output:
+        [f"results/{file}" for file in mosaic_files({one.name: one.pairs for one in campaign.image_flights})],
+        "results/mosaic/mosaic.manifest.json",
+    log:
+        "results/logs/mosaic.log",
+    benchmark:
+        "results/benchmarks/mosaic.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["mosaic"].threads
+    resources:
+        mem_mb=asked["mosaic"].mem_mb,
+        runtime=asked["mosaic"].runtime,
+    params:
+        settings=campaign.settings.campaign,
+        code=code_of("mosaic"),
+    message:
+        "laying the files of all flights upon one another"
+    shell:
+        "apertura step mosaic > {log} 2>&1"
+
+
+# What the package can show a browser is part of what the map is made from: a page bundled later makes it again.
+rule map:
+    input:
+        lambda wildcards: result_of(campaign, "map").sources,
+    output:
+        [f"results/map/{file}" for file in (DATA, *page_files())],
+        "results/map/map.manifest.json",
+    log:
+        "results/logs/map.log",
+    benchmark:
+        "results/benchmarks/map.tsv"
+    conda:
+        "../../environment.yml"
+    threads: asked["map"].threads
+    resources:
+        mem_mb=asked["map"].mem_mb,
+        runtime=asked["map"].runtime,
+    params:
+        settings=lambda _: result_of(campaign, "map").settings,
+        code=code_of("map"),
+    message:
+        "making the map"
+    shell:
+        "apertura step map > {log} 2>&1"

@@ -10,6 +10,7 @@ from typing import Any
 
 from apertura.atomic import date
 from apertura.campaign import Campaign
+from apertura.catalog import CATALOG, CRATE
 from apertura.digests import Result, digest_of
 from apertura.errors import CampaignError
 from apertura.export import COVERAGE, PHASE_HISTORY, exports_in
@@ -17,6 +18,7 @@ from apertura.lineage import results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest
+from apertura.webmap.page import DATA, FILES
 
 _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
@@ -138,6 +140,9 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
 _PRODUCTS = {
     "coverage": COVERAGE,
     "cphd": (PHASE_HISTORY,),
+    "stac": (f"stac/{CATALOG}",),
+    "ro_crate": (CRATE,),
+    "map": (DATA, *FILES),
     **{
         name: tuple(row.file for row in exports_in(kind))
         for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()

@@ -57,17 +57,25 @@ class Export:
         ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
+    laid
+        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
     """
 
     file: str
     source: str
     function: str
     pictured: bool = False
+    laid: bool = True
 
     @property
     def module(self) -> str:
         """Dotted name of the module that writes the file."""
         return self.function.partition(":")[0]
+
+    @property
+    def style(self) -> bool:
+        """Whether it says how QGIS shows the raster of its name."""
+        return self.module == "apertura.export.style"
 
     @property
     def write(self) -> Callable[..., None]:
@@ -77,12 +85,12 @@ class Export:
 
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.export.cog:write_slc"),
+    Export("slc.tif", "image", "apertura.export.cog:write_slc", laid=False),
     Export("power.tif", "image", "apertura.export.cog:write_power"),
     Export("db.tif", "image", "apertura.export.db:write_db"),
     Export("db.qml", "image", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
-    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc"),
+    Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc", laid=False),
     Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
     Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
     Export("coherent_db.qml", "coherent", "apertura.export.style:write_db_style"),
@@ -117,6 +125,13 @@ PHASE_HISTORY = "phase_history.cphd"
 COVERAGE = ("coverage.png", "coverage.geojson")
 """What shows the whole campaign."""
 
+MOSAICS = "mosaic"
+"""Folder of the rasters of all flights."""
+
+
+MAP = "map/index.html"
+"""The page that shows all of them in a browser."""
+
 
 def exports_in(folder: str) -> Iterator[Export]:
     """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
@@ -140,6 +155,45 @@ def export_modules(folder: str) -> list[str]:
     return sorted({export.module for export in exports_in(folder)})
 
 
+def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
+
+    Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs, the lowest first.
+
+    Examples
+    --------
+    >>> mosaics({"f01": ["a-b"], "f02": ["a-a", "a-b"]})["a-b/db.vrt"]
+    ['f01/a-b/db.tif', 'f02/a-b/db.tif']
+    """
+    found: dict[str, list[str]] = {}
+    for flight, names in pairs.items():
+        for folder, kinds in _folders(names):
+            for row in (row for kind in kinds for row in exports_in(kind)):
+                if row.laid and row.file.endswith(".tif"):
+                    name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
+                    found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
+    return found
+
+
+def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
+    styles = {row.file for row in EXPORTS if row.style}
+    for name in mosaics(pairs):
+        style = f"{name.removesuffix('.vrt')}.qml"
+        yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
+
+
+def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the folders of a flight, and the kinds of rows that lie in each."""
+    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield "fused", ("fused",)
+
+
 def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield every file that a finished campaign offers its user, relative to the results.
 
@@ -155,9 +209,11 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """
     yield from COVERAGE
     for flight, names in pairs.items():
-        for folder, kinds in (*((name, ("pair", "layers")) for name in names), ("fused", ("fused",))):
+        for folder, kinds in _folders(names):
             files = [row.file for kind in kinds for row in exports_in(kind)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+    yield from mosaic_files(pairs)
+    yield MAP
 
 
 def write_exports(

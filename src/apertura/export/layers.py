@@ -31,7 +31,7 @@ MASK = Band(
     "MODE",
     {value: colour for value, (_, colour) in CLASSES.items()},
 )
-LOOKS = Band("float32", np.nan, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
+LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
 NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
 
 
@@ -76,7 +76,7 @@ def write_mask(
 def write_looks(
     path: Path, looks: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write how many pulses make a pixel, (y, x) float32, 0 outside. Else as `apertura.export.cog.write_slc`."""
+    """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `apertura.export.cog.write_slc`."""
     write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 

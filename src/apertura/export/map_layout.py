@@ -82,9 +82,9 @@ class MapLayout:
             origin = round_origin(low, high)
             length = (high - low) * self.inch_per_m
             axis.set_major_locator(MaxNLocator(max(1, floor(1.2 * length)), steps=[1, 2, 5, 10]))
-            axis.set_major_formatter(FuncFormatter(partial(_from_origin, origin)))
+            axis.set_major_formatter(FuncFormatter(partial(from_origin, origin)))
             separator = " " if length > 2.2 else "\n"
-            axis.set_label_text(f"{name}{separator}− {_number(origin)}, m" if origin else f"{name}, m")
+            axis.set_label_text(f"{name}{separator}− {number(origin)}, m" if origin else f"{name}, m")
         self._write(LEFT, 0.58, crs_name, size=8)
 
     def draw_colour_bar(self, picture: AxesImage, label: str, *, beyond: str = "both") -> Colorbar:
@@ -106,7 +106,7 @@ class MapLayout:
             bar = Rectangle(corner, length / 2, 0.06, facecolor=colour, edgecolor="black", linewidth=0.8)
             bar.set_transform(self.figure.dpi_scale_trans)
             self.figure.add_artist(bar)
-        self._write(LEFT + length + 0.1, 0.85, f"{_number(metres)} m", size=9)
+        self._write(LEFT + length + 0.1, 0.85, f"{number(metres)} m", size=9)
         x = self.figure.get_size_inches()[0] - 0.4
         arrow = Polygon(
             [(x, 0.98), (x - 0.09, 0.62), (x, 0.7), (x + 0.09, 0.62)],
@@ -194,10 +194,17 @@ def round_length(most_m: float) -> float:
     return float(max(digit * decade for digit in (1, 2, 5) if digit * decade <= most_m))
 
 
-def _from_origin(origin: float, value: float, _position: int | None) -> str:
-    return _number(value - origin)
+def from_origin(origin: float, value: float, _position: int | None) -> str:
+    """Return the label of a tick that counts from an origin, as matplotlib asks for it."""
+    return number(value - origin)
 
 
-def _number(value: float) -> str:
-    """Return a number with thin spaces between thousands and a true minus."""
+def number(value: float) -> str:
+    """Return a number with thin spaces between thousands and a true minus.
+
+    Examples
+    --------
+    >>> number(-12345.5)
+    '−12\u2009345.5'
+    """
     return f"{round(value, 6) + 0.0:,.10g}".replace(",", "\u2009").replace("-", "−")

@@ -24,6 +24,8 @@ from apertura.scene.terrain import Terrain
 if TYPE_CHECKING:
     from dask.array.core import Array
 
+_NOTHING = np.complex64(complex(np.nan, np.nan))
+
 
 def image_array(
     inputs: PhaseHistory | Profiles,
@@ -196,6 +198,8 @@ def compute_tiles(
 ) -> None:
     """Compute some tiles of an image and write each as soon as it is done.
 
+    A pixel to which no pulse adds anything is written as NaN: nothing was measured there, and 0 would be a measure.
+
     Parameters
     ----------
     image
@@ -212,10 +216,10 @@ def compute_tiles(
     Examples
     --------
     >>> import dask.array
-    >>> target = np.zeros((4, 6))
+    >>> target = np.zeros((4, 6), np.complex64)
     >>> compute_tiles(dask.array.ones((4, 6), chunks=2), [(slice(0, 2), slice(4, 6))], target, threads=1)
-    >>> target.sum()
-    np.float64(4.0)
+    >>> target.sum().item()
+    (4+0j)
     """
     from dask.callbacks import Callback
     from dask.threaded import get
@@ -233,7 +237,7 @@ def compute_tiles(
 
         with progress("tiles", len(keys)) as done:
             for number, tile in formed_elsewhere(graph, keys, scheduler):
-                target[windows[number]] = tile
+                _write(target, windows[number], tile)
                 done(1)
         return
     written = {
@@ -246,4 +250,4 @@ def compute_tiles(
 
 def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
     """Write one tile where it belongs."""
-    target[window] = tile
+    target[window] = np.where(tile == 0, _NOTHING, tile)

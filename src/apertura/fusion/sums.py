@@ -1,5 +1,7 @@
 """What the pairs of one flight add up to."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,8 @@ def coherent_sum(
     Parameters
     ----------
     images
-        (pair, y, x) complex64 on one grid or a block of it, carriers kept.
+        (pair, y, x) complex64 on one grid or a block of it, carriers kept; NaN where a pair sees nothing, to which it
+        adds nothing.
     peaks
         (pair,) float64, largest magnitude of each whole image.
     phases_rad
@@ -24,7 +27,7 @@ def coherent_sum(
     Returns
     -------
     ndarray
-        (y, x) complex64, 1 where every image peaks in phase.
+        (y, x) complex64, 1 where every image peaks in phase, NaN where no pair sees anything.
 
     Raises
     ------
@@ -37,7 +40,7 @@ def coherent_sum(
     array([[0.5+0.5j, 0. +0.j ]], dtype=complex64)
     """
     turned = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
-    return np.asarray((_normalised(images, peaks) * turned.reshape(-1, 1, 1)).mean(axis=0), np.complex64)
+    return np.asarray(_mean(_normalised(images, peaks) * turned.reshape(-1, 1, 1)), np.complex64)
 
 
 def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -51,7 +54,7 @@ def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -
     array([[1.   , 0.125]], dtype=float32)
     """
     power = np.abs(_normalised(images, peaks)).astype(np.float64) ** 2
-    return np.asarray(power.mean(axis=0), np.float32)
+    return np.asarray(_mean(power), np.float32)
 
 
 def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -64,7 +67,15 @@ def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> 
     >>> magnitude_sum(np.array([[[2.0, 1.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0]))
     array([[1.  , 0.25]], dtype=float32)
     """
-    return np.asarray(np.abs(_normalised(images, peaks)).mean(axis=0), np.float32)
+    return np.asarray(_mean(np.abs(_normalised(images, peaks))), np.float32)
+
+
+def _mean(images: NDArray[Any]) -> NDArray[Any]:
+    """Return the mean over all pairs; one that sees nothing of a pixel counts as zero, and NaN if none does."""
+    unseen = np.isnan(images)
+    mean: NDArray[Any] = np.where(unseen, 0, images).mean(axis=0)
+    mean[unseen.all(axis=0)] = np.nan
+    return mean
 
 
 def _normalised(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.complex64]:

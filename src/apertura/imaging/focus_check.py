@@ -12,6 +12,7 @@ from apertura.geometry.aperture import Weigh
 from apertura.imaging.echo_place import echo_elsewhere
 from apertura.imaging.formation import Formation
 from apertura.imaging.parts import PART_PX, part_images
+from apertura.imaging.view import ground_axes
 from apertura.quality.bright_points import BrightPoint, bright_points
 from apertura.quality.focus import Focus, PointFocus, judge, judge_parts, point_focus
 from apertura.quality.sub_apertures import SubApertures, compare_parts
@@ -53,7 +54,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     """Return the covariance of the spatial spectrum of a point in the scene's middle, east and north."""
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
-    here, axes = _axes(formation, row, column)
+    here, axes = ground_axes(formation, row, column)
     half = _half_band_hz(profiles)
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
     return profiles.aperture.spectrum(here, axes, frequency_hz=band, weigh=_sector_of(formation))
@@ -128,17 +129,10 @@ def _places(formation: Formation, point: BrightPoint, step_px: float) -> NDArray
     return formation.positions_at(rows, columns)
 
 
-def _axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a place on the ground, and unit vectors east and north from it along the grid."""
-    here, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
-    axes = np.stack([east - here, north - here])
-    return here, axes / np.linalg.norm(axes, axis=1, keepdims=True)
-
-
 def _carrier(formation: Formation, point: BrightPoint) -> list[float]:
     """Return the spatial frequency of a point, east and north, at the middle of aperture and band, cycles per metre."""
     profiles = formation.profiles
-    here, axes = _axes(formation, max(1.0, point.row), min(point.column, formation.grid.shape[1] - 2.0))
+    here, axes = ground_axes(formation, max(1.0, point.row), min(point.column, formation.grid.shape[1] - 2.0))
     weigh, some = _sector_of(formation), profiles.aperture.sample(64 if _sector_of(formation) is None else 1024)
     gradient = profiles.aperture[some].path_gradient(here)
     weight = np.ones(len(gradient)) if weigh is None else weigh(some, here[None])[:, 0]

@@ -172,10 +172,10 @@ def _inside(pixels: NDArray[np.int64], window: Window) -> NDArray[np.bool_]:
 
 
 def values_at(image: Raster, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
-    """Return an image at (pixel, 2) rows and columns; each block of it is read once."""
+    """Return an image at (pixel, 2) rows and columns, 0 where no pulse made it; each block of it is read once."""
     values, blocks = np.empty(len(pixels), np.complex64), pixels // _BLOCK_PX
     for block in np.unique(blocks, axis=0):
         inside, first = (blocks == block).all(axis=1), block * _BLOCK_PX
         rows, columns = (slice(int(at), int(at) + _BLOCK_PX) for at in first)
-        values[inside] = np.asarray(image[rows, columns])[tuple((pixels[inside] - first).T)]
+        values[inside] = np.nan_to_num(np.asarray(image[rows, columns]))[tuple((pixels[inside] - first).T)]
     return values

@@ -41,12 +41,14 @@ _COSTS = {
     "interferogram": _Cost(3.0, mpx=20.0),
     "export": _Cost(3.0, mpx=1.0),
     "export_fused": _Cost(3.0, mpx=2.0),
+    "pictures": _Cost(5.0, mb=0.01),
+    "page": _Cost(2.5, mpx=0.5),
 }
 """Rule → what it costs, on two cores of 2023; only its form counts once a step has been timed."""
 
 _WIDE = frozenset({"image", "tiles"})
 """Rules whose jobs take all cores."""
-_BESIDE = frozenset({"cphd", "layers", "export", "scene", "interferogram"})
+_BESIDE = frozenset({"cphd", "interferogram", "layers", "export", "map", "pictures", "scene"})
 """Rules that no other waits for, or hardly."""
 _MOST_BENCHMARKS = 500
 _USUAL_MPX = 0.25
@@ -192,9 +194,9 @@ class Outlook:
         flights = self._campaign.flights
         if rule == "ingest":
             return [(flight.name, node) for flight in flights for node in flight.participants]
-        if rule in {"echo", "profile", "image", "tiles", "export"}:
+        if rule in {"echo", "profile", "image", "tiles", "export", "pictures"}:
             return [(flight.name, pair) for flight in flights for pair in flight.pairs]
-        if rule in {"assess", "calibrate", "export_fused", "refine"}:
+        if rule in {"assess", "calibrate", "export_fused", "page", "refine"}:
             return [(flight.name,) for flight in flights]
         return [()]
 

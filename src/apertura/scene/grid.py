@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
-from apertura.scene.map_crs import check_crs
+from apertura.scene.map_crs import check_crs, grid_mapping
 from apertura.scene.pixel_positions import BLOCK_PX, block
 
 Floats = NDArray[np.float64]
@@ -95,10 +95,14 @@ class SceneGrid:
 
     @property
     def coordinates(self) -> dict[str, Any]:
-        """Coordinates y, x and spatial_ref (CF grid mapping) of an xarray raster on this grid."""
+        """Coordinates y, x and spatial_ref of an xarray raster on this grid, as CF wants them."""
         step, _, west, _, _, north = self.transform
-        reference = {"crs_wkt": self.crs_wkt, "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
-        return {"y": self.y_m, "x": self.x_m, "spatial_ref": ((), 0, reference)}
+        reference = {**grid_mapping(self.crs_wkt), "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+        axes = {
+            side: {"units": "m", "axis": side.upper(), "standard_name": f"projection_{side}_coordinate"}
+            for side in "yx"
+        }
+        return {"y": ("y", self.y_m, axes["y"]), "x": ("x", self.x_m, axes["x"]), "spatial_ref": ((), 0, reference)}
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:

@@ -17,6 +17,19 @@ RETURN_M = 1e-3
 _WHERE = "scene"
 
 
+def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
+    """Return the attributes of a CF grid mapping: the CRS as it is written elsewhere, and its parameters by name.
+
+    Examples
+    --------
+    >>> grid_mapping(CRS("EPSG:32632").to_wkt())["grid_mapping_name"]
+    'transverse_mercator'
+    >>> grid_mapping('LOCAL_CS["local",UNIT["metre",1]]')
+    {'crs_wkt': 'LOCAL_CS["local",UNIT["metre",1]]'}
+    """
+    return {**CRS(crs_wkt).to_cf(), "crs_wkt": crs_wkt}
+
+
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
 

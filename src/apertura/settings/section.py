@@ -7,10 +7,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from apertura.errors import quoted
 
-RESERVED_NAMES = frozenset({"fused", "interferometry", "layers", "stac", "map", "study", "logs", "benchmarks", "tiles"})
+RESERVED_NAMES = frozenset(
+    {"fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles", "workflow"}
+)
 """Names of the results folder that no flight or node may take."""
 
-_RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt")
+_RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt", ".qml")
 """What files of the results folder end in: scene.json, cube.manifest.json, cube.zarr …"""
 
 WAVEFORM_KINDS = (

@@ -33,15 +33,12 @@ def coverage(campaign: Campaign) -> list[Path]:
     covered = [
         _covered(campaign, flight.name, pair, scene.grid) for flight in campaign.image_flights for pair in flight.pairs
     ]
-    step, _, west, _, _, north = scene.grid.transform
-    rows, columns = covered[0].looks.shape
-    down, right = (size * step / dots for size, dots in zip(scene.grid.shape, (rows, columns), strict=True))
-    transform = Affine(right, 0, west, 0, -down, north)
+    transform = transform_of(scene.grid, covered[0].looks)
     picture, features = written = [campaign.result(name) for name in COVERAGE]
     tags = tags_of(Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
-    write_coverage(picture, covered, transform, crs_name=_crs_name(scene.grid), title=title, tags=tags)
-    found = feature_collection(covered, transform, _place(scene), height_m=scene.level.height_m)
+    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
+    found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
         temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
     record_files(campaign.root / lineage.result.manifest, written, lineage)
@@ -55,11 +52,17 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
     if len(set(pair.split("-"))) == 1:
         del legs["receiver"]  # the same node: one track
     tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
-    return Covered(flight, pair, tracks_m, _looks(campaign, flight, pair))
+    return Covered(flight, pair, tracks_m, few_looks(campaign, flight, pair))
 
 
-def _looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
-    """Return the looks of a pair, averaged to few places; from the overviews of its file."""
+def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
+    """Return the looks of a pair, averaged to few places; from the overviews of its file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is not as step `layers` wrote it.
+    """
     with opened_layer(campaign, flight, pair, "looks.tif") as raster:
         fewer = max(1.0, max(raster.shape) / _DOTS)
         shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
@@ -67,7 +70,14 @@ def _looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
     return looks
 
 
-def _place(scene: OpenScene) -> Any:
+def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:
+    """Return where the places of `few_looks` lie on the map."""
+    step, _, west, _, _, north = grid.transform
+    down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
+    return Affine(right, 0, west, 0, -down, north)
+
+
+def place_of(scene: OpenScene) -> Any:
     """Return what turns map coordinates into longitude, latitude and height; None in a local frame."""
     if scene.grid.crs == LOCAL:
         return None
@@ -79,7 +89,8 @@ def _place(scene: OpenScene) -> Any:
     return place
 
 
-def _crs_name(grid: SceneGrid) -> str:
+def crs_name(grid: SceneGrid) -> str:
+    """Return the name of a grid's CRS as pictures show it."""
     from pyproj import CRS
 
     known = CRS.from_user_input(grid.crs_wkt)

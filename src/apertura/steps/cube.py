@@ -1,6 +1,7 @@
-"""Rule `cube`: every image of the campaign on one grid, and each flight's pairs added up."""
+"""Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -9,62 +10,129 @@ import numpy as np
 import xarray as xr
 
 from apertura.campaign import Campaign
+from apertura.contracts import STAGES, Window
+from apertura.cube_variables import MEASURED, RASTERS
+from apertura.documents import undamaged
+from apertura.fusion.clutter import clutter_reduction_db
 from apertura.fusion.sums import coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.lineage import result_of
 from apertura.load.agreement import agreement_of, agreement_report
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
+from apertura.quality.measures import survey
 from apertura.scene.grid import SceneGrid
+from apertura.steps.cube_labels import Images, labels, reference_flights
+from apertura.steps.cube_phases import compared, shared_band, window_of, write_phase
 from apertura.steps.stamping import stamped
 from apertura.store import create, finish, open_array, open_stage, writing
 
-_SUMS = ("coherent", "noncoherent", "magnitude")
+_PHASE = "coherence", "phase"
 
 
 def cube(campaign: Campaign) -> Path:
-    """Write results/cube.zarr: image (flight, pair, y, x) and the coherent and non-coherent sums of each flight.
+    """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
     Tile by tile; a tile that no pulse of a pair sees is not stored and reads as NaN, as in its image.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root, [__name__])
-    pairs = sorted({pair for flight in flights for pair in flight.pairs})
     images = {
-        f"{flight.name}/{pair}": open_stage(campaign.stage("image", flight.name, pair), "image")
+        (flight.name, pair): open_stage(campaign.stage("image", flight.name, pair), "image")
         for flight in flights
         for pair in flight.pairs
     }
     assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
-    fusion = {name: one["fusion"] for name, one in assessed.items()}
-    references = {name: images[f"{name}/{one['reference']}"] for name, one in assessed.items()}
-    side = campaign.settings.processing.tile_px
-    windows, folder = list(settled_scene(campaign).grid.tiles(side)), campaign.stage("cube")
+    grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
+    folder, windows = campaign.stage("cube"), list(grid.tiles(side))
+    with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
+        described = _empty(images, assessed, grid)
     with writing(folder) as wip:
         empty = stamped(
-            _empty(images, fusion, pairs), "cube", modules=[__name__], parents=images, settings={"fusion": fusion}
+            described,
+            "cube",
+            modules=[__name__],
+            parents={"/".join(name): image for name, image in images.items()},
+            settings={"fusion": {name: one["fusion"] for name, one in assessed.items()}},
         )
-        empty.attrs |= _between_flights(references, settled_scene(campaign).grid)
-        chunks = {"image": (1, 1, side, side), **dict.fromkeys(_SUMS, (1, side, side))}
-        create(wip, empty, chunks)
-        arrays = {name: open_array(wip, name) for name in chunks}
-        for place, flight in enumerate(flights):
-            present = [images[f"{flight.name}/{pair}"] for pair in flight.pairs]
-            peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present])
-            phases_rad = fusion[flight.name]["phases_rad"]
-            added = np.array([pair in phases_rad for pair in flight.pairs])
-            turned = np.array([phases_rad[pair] for pair in flight.pairs if pair in phases_rad])
-            for window in windows:
-                stack = np.stack([image.image[window].values for image in present])
-                there = ~np.isnan(stack).all(axis=(1, 2))
-                for pair, block in zip(compress(flight.pairs, there), stack[there], strict=True):
-                    arrays["image"][place, pairs.index(pair), *window] = block
-                stack[~there] = 0  # what a pair does not see it adds nothing to
-                if there[added].any():
-                    arrays["coherent"][place, *window] = coherent_sum(stack[added], peaks[added], turned)
-                if there.any():
-                    arrays["noncoherent"][place, *window] = noncoherent_sum(stack, peaks)
-                    arrays["magnitude"][place, *window] = magnitude_sum(stack, peaks)
+        tile = {"y": side, "x": side, "flight": 1, "pair": 1}
+        chunks = {name: tuple(tile[dim] for dim in STAGES["cube"].variables[name].dims) for name in RASTERS}
+        create(wip, empty, chunks | {name: empty[name].shape for name in MEASURED}, consolidated=True)
+        held = _Held({name: open_array(wip, name) for name in (*RASTERS, *MEASURED)}, [*assessed], empty.attrs["pairs"])
+        for flight, one in assessed.items():
+            _add_up(images, one["fusion"]["phases_rad"], held, flight, windows)
+            single_db = [
+                images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in one["fusion"]["phases_rad"]
+            ]
+            sum_db = survey(held.plane("coherent", flight), windows).noise_floor_db
+            held.plane("coherent_noise_floor", flight)[()] = sum_db
+            held.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
+        _compare(images, {flight: one["reference"] for flight, one in assessed.items()}, held, grid, side=side)
         finish(wip, folder, lineage=lineage)
     return folder
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """What an array holds of one flight, or of one pair of it."""
+
+    array: Any
+    place: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the plane."""
+        shape: tuple[int, ...] = self.array.shape[len(self.place) :]
+        return shape
+
+    def __getitem__(self, window: Window) -> Any:
+        return self.array[(*self.place, *window)]
+
+    def __setitem__(self, window: Window | tuple[()], values: Any) -> None:
+        self.array[(*self.place, *window)] = values
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The arrays of the cube, by name, flight and pair."""
+
+    arrays: Mapping[str, Any]
+    flights: Sequence[str]
+    pairs: Sequence[str]
+
+    def plane(self, name: str, flight: str, pair: str | None = None) -> _Plane:
+        """Return a plane of an array, to be read and written by windows."""
+        place = (self.flights.index(flight), *([] if pair is None else [self.pairs.index(pair)]))
+        return _Plane(self.arrays[name], place)
+
+
+def _add_up(images: Images, phases_rad: Mapping[str, float], held: _Held, flight: str, windows: list[Window]) -> None:
+    """Copy the images of a flight and write their sums, tile by tile; `phases_rad` of those added coherently."""
+    present = {pair: image for (name, pair), image in images.items() if name == flight}
+    peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
+    added = np.array([pair in phases_rad for pair in present])
+    turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
+    copies = [held.plane("image", flight, pair) for pair in present]
+    sums = {name: held.plane(name, flight) for name in ("coherent", "noncoherent", "magnitude")}
+    for window in windows:
+        stack = np.stack([image.image[window].values for image in present.values()])
+        there = ~np.isnan(stack).all(axis=(1, 2))
+        for copy, block in zip(compress(copies, there), stack[there], strict=True):
+            copy[window] = block
+        if there[added].any():
+            sums["coherent"][window] = coherent_sum(stack[added], peaks[added], turned)
+        if there.any():
+            sums["noncoherent"][window] = noncoherent_sum(stack, peaks)
+            sums["magnitude"][window] = magnitude_sum(stack, peaks)
+
+
+def _compare(images: Images, references: Mapping[str, str], held: _Held, grid: SceneGrid, *, side: int) -> None:
+    """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
+    window = window_of(images, grid.spacing_m)
+    for kind, rows in compared(images, references, reference_flights(images, held.pairs)).items():
+        for one, other in rows.items():
+            both, planes = (images[one], images[other]), [held.plane(f"{kind}_{name}", *one) for name in _PHASE]
+            told = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window)
+            for name, value in zip(("looks", "chance", "common_band"), (*told, shared_band(*both)), strict=True):
+                held.plane(f"{kind}_{name}", *one)[()] = value
 
 
 def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> dict[str, Any]:
@@ -84,18 +152,20 @@ def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> d
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 
-def _empty(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any], pairs: Sequence[str]) -> xr.Dataset:
-    first = next(iter(images.values()))
-    shape = first.image.shape
-    flights = list(fusion)
-    missing, nothing = np.complex64(np.nan + 1j * np.nan), np.float32(np.nan)
-    return xr.Dataset(
-        {
-            "image": (("flight", "pair", "y", "x"), np.broadcast_to(missing, (len(flights), len(pairs), *shape))),
-            "coherent": (("flight", "y", "x"), np.broadcast_to(missing, (len(flights), *shape))),
-            "noncoherent": (("flight", "y", "x"), np.broadcast_to(nothing, (len(flights), *shape))),
-            "magnitude": (("flight", "y", "x"), np.broadcast_to(nothing, (len(flights), *shape))),
-        },
-        coords={"y": first.y, "x": first.x, "spatial_ref": first.spatial_ref},
-        attrs={"flights": flights, "pairs": pairs, "fusion": fusion},
+def _empty(images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: SceneGrid) -> xr.Dataset:
+    """Return the cube without the values of its rasters, and of what is measured on them."""
+    pairs = sorted({pair for _, pair in images})
+    named = labels(images, assessed, pairs)
+    sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}
+    for name, (dims, dtype, _, _) in {**RASTERS, **MEASURED}.items():
+        nothing = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
+        named[name] = dims, np.broadcast_to(nothing, tuple(sizes[dim] for dim in dims))
+    references = {flight: images[flight, one["reference"]] for flight, one in assessed.items()}
+    return named.assign_coords(grid.coordinates).assign_attrs(
+        Conventions="CF-1.11",
+        flights=[*assessed],
+        pairs=pairs,
+        fusion={flight: one["fusion"] for flight, one in assessed.items()},
+        coherence_window=window_of(images, grid.spacing_m),
+        **_between_flights(references, grid),
     )

@@ -17,6 +17,7 @@ from apertura.imaging.certify import certified, measures
 from apertura.imaging.focus_check import focus_flags, focus_report
 from apertura.imaging.formation import Formation
 from apertura.imaging.stages import profiles_of
+from apertura.imaging.view import view_report
 from apertura.lineage import result_of
 from apertura.load.antennas import antennas_report, pattern_digests
 from apertura.load.budget import arithmetic_line, budget_of
@@ -66,6 +67,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             **work.scene.report,
             **antennas_report(campaign, pair, plan.illumination),
             **work.report,
+            "view": view_report(work.formation, work.pair.began, work.pair.time_s),
             "autofocus": work.track.report(pair),
         }
         lines = [*budget, arithmetic_line(quality["numerical_error_db"])]

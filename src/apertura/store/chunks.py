@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import warnings
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import zarr
 from zarr.abc.store import ByteRequest
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.errors import ZarrUserWarning
 from zarr.storage import LocalStore, MemoryStore
 
 from apertura.atomic import write_beside
@@ -122,7 +124,9 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
     return encoding
 
 
-def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True) -> dict[str, bytes]:
+def skeleton(
+    stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True, consolidated: bool = False
+) -> dict[str, bytes]:
     """Return the files of a stage before anything is computed: its metadata and coordinates, path → bytes.
 
     Parameters
@@ -134,6 +138,8 @@ def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, pack
         Array that is written chunk by chunk → shape of its chunks.
     packed
         Whether those are compressed; noise is not made smaller by it.
+    consolidated
+        Whether the stage's own metadata repeat those of its arrays, for readers that open many of them.
     """
     files: dict[str, Buffer] = {}
     rest, store = stage.drop_vars(list(chunks)), MemoryStore(files)
@@ -149,6 +155,10 @@ def skeleton(stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, pack
             compressors=CODECS if packed else CODECS[-1:],
             fill_value=array.values.flat[0],  # what a chunk that nobody writes holds
             dimension_names=[str(dim) for dim in array.dims],
-            attributes={**array.attrs, "grid_mapping": "spatial_ref"},
+            attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
         )
+    if consolidated:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ZarrUserWarning)  # of version 3 it is not in the standard yet
+            zarr.consolidate_metadata(store)
     return {path: content.to_bytes() for path, content in files.items()}

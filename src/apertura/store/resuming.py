@@ -156,7 +156,14 @@ def _chunk(windows: Sequence[Window]) -> tuple[int, ...]:
     return tuple(part.stop - part.start for part in windows[0])
 
 
-def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True) -> None:
+def create(
+    wip: Path,
+    stage: "xr.Dataset",
+    chunks: Mapping[str, tuple[int, ...]],
+    *,
+    packed: bool = True,
+    consolidated: bool = False,
+) -> None:
     """Create `wip`: metadata and coordinates of a stage, and arrays without values, to be written chunk by chunk.
 
     Parameters
@@ -170,10 +177,12 @@ def create(wip: Path, stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]]
         Array name → shape of its chunks. One process at a time may write a chunk.
     packed
         Whether chunks are compressed.
+    consolidated
+        As `apertura.store.chunks.skeleton` takes it.
     """
     from apertura.store.chunks import skeleton
 
-    _begin(wip, skeleton(stage, chunks, packed=packed))
+    _begin(wip, skeleton(stage, chunks, packed=packed, consolidated=consolidated))
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:

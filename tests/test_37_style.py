@@ -1,0 +1,80 @@
+"""What QGIS shows without being asked: decibels from noise floor to peak, classes by their names."""
+
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio import Affine
+
+from apertura.errors import ContractError
+from apertura.export.db import write_db
+from apertura.export.layers import CLASSES, OUTSIDE, write_incidence, write_mask
+from apertura.export.radiometry import ECHO, TAG, of_sums
+from apertura.export.style import write_db_style, write_layer_style, write_mask_style
+from apertura.provenance import canonical_json
+
+GRID = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
+IMAGE = np.full((30, 40), 1j, np.complex64)
+
+
+def ends_of(path):
+    return [float(ET.parse(path).find(f".//{name}").text) for name in ("minValue", "maxValue")]
+
+
+@pytest.mark.parametrize(("floor_db", "black"), [(-49.05, -17.05), (0.0, 31.0)])
+def test_decibels_are_black_at_the_noise_floor_and_white_at_the_peak(tmp_path, floor_db, black):
+    radiometry = ECHO.measured(10**1.6, floor_db)
+    write_db(tmp_path / "db.tif", IMAGE, **GRID, tags={TAG: canonical_json(radiometry.report)})
+    write_db_style(tmp_path / "db.qml")
+    assert ends_of(tmp_path / "db.qml") == [black, 32.0]
+
+
+def test_a_style_is_refused_where_nobody_measured_the_image(tmp_path):
+    write_db(tmp_path / "db.tif", IMAGE, **GRID, tags={})
+    with pytest.raises(ContractError, match="no peak and noise floor"):
+        write_db_style(tmp_path / "db.qml")
+    assert not (tmp_path / "db.qml").exists()
+
+
+def test_every_class_of_the_mask_has_its_name_and_colour_in_style_and_file(tmp_path):
+    write_mask(tmp_path / "mask.tif", np.zeros((30, 40), np.uint8), **GRID, tags={})
+    write_mask_style(tmp_path / "mask.qml")
+    entries = {int(one.get("value")): one for one in ET.parse(tmp_path / "mask.qml").iter("paletteEntry")}
+    assert {value: one.get("label") for value, one in entries.items()} == {
+        0: "valid",
+        1: "shadow",
+        2: "layover",
+        3: "shadow and layover",
+        255: "outside, no data",
+    }
+    assert [value for value, one in entries.items() if one.get("alpha") == "0"] == [0, OUTSIDE]
+    with rasterio.open(tmp_path / "mask.tif") as raster:
+        colours = raster.colormap(1)
+    for value, (_, colour) in CLASSES.items():
+        assert entries[value].get("color") == "#{:02x}{:02x}{:02x}".format(*colour)
+        if value != OUTSIDE:  # what is no data GDAL paints as it likes
+            assert colours[value][:3] == colour
+
+
+@pytest.mark.parametrize(
+    ("values", "ends"), [((18.2, 77.4), (18, 78)), ((30, 30), (30, 31)), ((np.nan, np.nan), (0, 1))]
+)
+def test_a_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, values, ends):
+    angle = np.full((30, 40), np.nan, np.float32)
+    angle[0, :2] = values
+    write_incidence(tmp_path / "incidence.tif", angle, **GRID, tags={})
+    write_layer_style(tmp_path / "incidence.qml")
+    items = list(ET.parse(tmp_path / "incidence.qml").iter("item"))
+    assert (float(items[0].get("value")), float(items[-1].get("value"))) == ends
+    assert items[-1].get("label") == f"{ends[1]} deg"
+
+
+def test_sums_say_what_they_were_divided_by_and_which_pairs_they_hold():
+    told = of_sums({"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}, {"a-a": 0.0, "a-b": 0.7})
+    assert told["coherent"].amplitude == "mean of 2 peak-normalised images, added with phase"
+    assert told["coherent"].divided_by == {"a-a": 4.0, "a-b": 2.0}
+    assert told["coherent"].phases_taken_off_rad == {"a-a": 0.0, "a-b": 0.7}
+    assert told["noncoherent"].power == "mean power of 3 peak-normalised images"
+    assert told["noncoherent"].divided_by == {"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}
+    assert not told["noncoherent"].phases_taken_off_rad

@@ -1,0 +1,215 @@
+"""Programs that open our rasters agree on where they lie, on what is no data, and on each pixel to the millimetre."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from folders import copy_writable
+from pyproj import CRS
+from rasterio import Affine
+from readers import (
+    ask_qgis,
+    by_gdal,
+    by_rasterio,
+    by_rioxarray,
+    have_gdal,
+    have_qgis,
+    sampled_by_gdal,
+    sampled_by_qgis,
+    sampled_by_rasterio,
+    sampled_by_rioxarray,
+)
+
+from apertura.campaign import Campaign
+from apertura.errors import CampaignError
+from apertura.export import exports_in, mosaics, product_files, write_exports
+from apertura.export.mosaic import write_mosaic
+from apertura.export.radiometry import ECHO
+from apertura.geometry.geodesy import LOCAL
+from apertura.scene.grid import SceneGrid
+from apertura.steps import mosaic
+
+FLOWN = {"f01": ("uav1-uav1", "uav1-uav2")}
+RASTERS = [name for name in product_files(FLOWN) if name.endswith((".tif", ".vrt"))]
+STYLED = [name for name in product_files(FLOWN) if name.endswith(".qml")]
+needs_gdal = pytest.mark.skipif(not have_gdal(), reason="no programs of GDAL here: gdalinfo, gdallocationinfo")
+needs_qgis = pytest.mark.skipif(not have_qgis(), reason="no QGIS here")
+
+MILLIMETRE, SPACING_M, SHAPE = 0.001, 0.05, (40, 60)
+ROW, COLUMN = 11, 37
+
+
+def agree(told, expected):
+    assert told["transform"] == pytest.approx(expected["transform"], rel=0, abs=1e-8)
+    assert tuple(told["shape"]) == tuple(expected["shape"])
+    assert told["nodata"] == pytest.approx(expected["nodata"], nan_ok=True)
+    one, other = (CRS.from_wkt(place["wkt"]) for place in (told, expected))
+    assert one.is_engineering == other.is_engineering
+    assert one.name == other.name if one.is_engineering else one.to_epsg() == other.to_epsg() is not None
+
+
+def test_rioxarray_agrees_with_rasterio_on_every_raster(finished_tiny):
+    for name in RASTERS:
+        agree(by_rioxarray(finished_tiny.results / name), by_rasterio(finished_tiny.results / name))
+
+
+@needs_gdal
+def test_another_gdal_agrees_with_rasterio_on_every_raster(finished_tiny):
+    for name in RASTERS:
+        agree(by_gdal(finished_tiny.results / name), by_rasterio(finished_tiny.results / name))
+
+
+@needs_qgis
+def test_qgis_agrees_with_rasterio_on_every_raster_and_finds_every_style(finished_tiny):
+    paths = {name: finished_tiny.results / name for name in RASTERS}
+    told = ask_qgis(tell=[str(path) for path in paths.values()])["told"]
+    for name, path in paths.items():
+        found = told[str(path)]
+        assert found["valid"], name
+        assert found["crs"] == "EPSG:32632"
+        agree(found, by_rasterio(path))
+        if name.endswith("db.tif"):
+            radiometry = json.loads(rasterio.open(path).tags()["APERTURA_RADIOMETRY"])
+            top = radiometry["peak_db"]
+            assert found["stretch"] == pytest.approx([top + radiometry["noise_floor_db"], top], abs=0.01)
+        if name.endswith("mask.tif"):
+            assert found["classes"]["2"] == ["layover", 255]
+            assert found["classes"]["0"] == ["valid", 0]
+        if path.with_suffix(".qml").name in {"incidence.qml", "looks.qml"}:
+            assert found["renderer"] == "singlebandpseudocolor"
+    assert (
+        len(STYLED) == 2 * 6 * 2 + 2 * 2
+    )  # of each pair db and five layers, of sums two; in the flight, in the mosaic
+
+
+def known_rasters():
+    """Return rasters that differ from their ground at one pixel alone."""
+    rasters = {source: np.ones(SHAPE, np.complex64) for source in ("image", "coherent", "noncoherent")}
+    rasters |= {source: np.ones(SHAPE, np.float32) for source in ("magnitude", "incidence", "bistatic_angle")}
+    rasters |= {
+        "looks": np.ones(SHAPE, np.float32),
+        "nesz": np.ones(SHAPE, np.float32),
+        "mask": np.ones(SHAPE, np.uint8),
+    }
+    for raster in rasters.values():
+        raster[ROW, COLUMN] = 2
+    return rasters
+
+
+@pytest.fixture(scope="module", params=["EPSG:32632", LOCAL])
+def control(request, tmp_path_factory):
+    """Every kind of raster with a control point in it, and where that is."""
+    north_m = 5363701.65 if request.param != LOCAL else 40.0
+    west_m = 570656.9 if request.param != LOCAL else -30.0
+    grid = SceneGrid(request.param, west_m, north_m, SPACING_M, SHAPE)
+    folder, rasters = tmp_path_factory.mktemp("control") / "f01", known_rasters()
+    for kind in ("pair", "layers", "fused"):
+        into = folder / ("fused" if kind == "fused" else "a-b")
+        into.mkdir(parents=True, exist_ok=True)
+        write_exports(
+            kind,
+            into,
+            rasters,
+            titles=dict.fromkeys(rasters, "control"),
+            tags={},
+            radiometry=dict.fromkeys(("image", "coherent", "noncoherent"), ECHO.measured(2.0, -6.02).report),
+            transform=Affine(*grid.transform),
+            crs=grid.crs_wkt,
+        )
+    for name, files in mosaics({"f01": ["a-b"]}).items():
+        write_mosaic(folder.parent / "mosaic" / name, [folder.parent / file for file in files])
+    x, y = map(float, grid.map_at(ROW, COLUMN))
+    return sorted([*folder.parent.rglob("*.tif"), *folder.parent.rglob("*.vrt")]), (x, y)
+
+
+def test_control_points_lie_where_the_pixel_is_centred(control):
+    paths, (x, y) = control
+    assert len(paths) == (3 + 5 + 6) + (2 + 5 + 5)  # of pair, layers and sums; in the mosaic none that is complex
+    for path in paths:
+        with rasterio.open(path) as raster:
+            values = np.abs(raster.read(1))
+            there = raster.xy(*np.unravel_index(values.argmax(), values.shape))
+        assert there == pytest.approx((x, y), rel=0, abs=MILLIMETRE / 10)
+
+
+@pytest.mark.parametrize(
+    "sampled",
+    [
+        sampled_by_rasterio,
+        sampled_by_rioxarray,
+        pytest.param(sampled_by_gdal, marks=needs_gdal),
+        pytest.param(sampled_by_qgis, marks=needs_qgis),
+    ],
+)
+def test_a_control_point_reads_back_within_a_millimetre(control, sampled):
+    """A place a millimetre inside each edge of its pixel has its value, one a millimetre outside has not."""
+    paths, (x, y) = control
+    ways = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+    reach = [SPACING_M / 2 - MILLIMETRE, SPACING_M / 2 + MILLIMETRE]
+    places = [(x + east * far, y + north * far) for far in reach for east, north in ways]
+    found = sampled(dict.fromkeys(paths, places))
+    assert len(found) >= len(paths) - 2
+    for path, values in found.items():
+        inside, outside = np.split(np.array(values), 2)
+        with rasterio.open(path) as raster:
+            point, ground = (raster.read(1)[at] for at in ((ROW, COLUMN), (0, 0)))
+        np.testing.assert_allclose(inside, point, rtol=1e-6, err_msg=str(path))
+        np.testing.assert_allclose(outside, ground, rtol=1e-6, atol=1e-6, err_msg=str(path))
+
+
+@needs_qgis
+def test_qgis_paints_the_brightest_place_white_and_the_noise_floor_black(finished_tiny, tmp_path):
+    db, picture = finished_tiny.results / "f01/uav1-uav1/db.tif", tmp_path / "db.png"
+    assert ask_qgis(draw={str(db): [str(picture), 240]})["errors"][str(db)] == []
+    with rasterio.open(db) as raster:
+        decibel, radiometry = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(picture) as png:
+        grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels, four dots each
+    floor_db = radiometry["peak_db"] + radiometry["noise_floor_db"]
+    expected = np.clip((decibel - floor_db) / -radiometry["noise_floor_db"], 0, 1) * 255
+    assert np.abs(grey - expected).max() < 3
+
+
+def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
+    said = {}
+    for name in (name for name in RASTERS if name.endswith(".tif")):
+        with rasterio.open(finished_tiny.results / name) as raster:
+            radiometry = json.loads(raster.tags()["APERTURA_RADIOMETRY"])
+            assert (raster.descriptions[0], raster.units[0]) == (radiometry["quantity"], radiometry["unit"])
+        said[name.removeprefix("f01/")] = radiometry
+    assert said["uav1-uav1/power.tif"]["quantity"] == "echo power, linear"
+    assert not said["uav1-uav1/power.tif"]["divided_by"]
+    sums = [f"fused/{row.file}" for row in exports_in("fused") if row.file.endswith(".tif")]
+    assert (
+        len({said[name]["quantity"] for name in [*sums, "uav1-uav1/slc.tif", "uav1-uav1/power.tif"]}) == len(sums) + 2
+    )
+    reports = {
+        pair: json.loads((finished_tiny.results / f"f01/{pair}/image.json").read_text()) for pair in FLOWN["f01"]
+    }
+    peaks = {pair: report["brightest"]["amplitude"] for pair, report in reports.items()}
+    fused = json.loads((finished_tiny.results / "f01/fused/image.json").read_text())
+    for source in ("coherent", "noncoherent", "magnitude"):
+        assert fused["radiometry"][source]["divided_by"] == peaks
+    for name in sums:
+        assert said[name]["divided_by"] == peaks
+    assert said["fused/coherent_db.tif"]["phases_taken_off_rad"] == fused["fusion"]["phases_rad"]
+
+
+def test_a_sum_times_its_factor_is_the_echo_again(finished_tiny):
+    folder = finished_tiny.results / "f01"
+    with rasterio.open(folder / "fused" / "noncoherent_power.tif") as raster:
+        mean, peaks = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])["divided_by"]
+    powers = [rasterio.open(folder / pair / "power.tif").read(1) / peak**2 for pair, peak in peaks.items()]
+    np.testing.assert_allclose(mean, np.mean(powers, axis=0), rtol=1e-5)
+
+
+def test_a_mosaic_of_a_product_that_was_edited_or_is_gone_is_refused(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    path = root / "results" / "f01" / "fused" / "coherent_db.tif"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(CampaignError, match=r"coherent_db\.tif: not as it was written.*Delete .*export\.manifest"):
+        mosaic.mosaic(Campaign.load(root))
+    path.unlink()
+    with pytest.raises(CampaignError, match=r"coherent_db\.tif: no such file"):
+        mosaic.mosaic(Campaign.load(root))

@@ -1,0 +1,173 @@
+"""The cube as people open it: by names, with its CRS, and with phases between pairs and between flights."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rioxarray  # noqa: F401
+import xarray as xr
+import zarr
+from folders import complaint, copy_writable, edit_config, run_steps
+
+from apertura.campaign import Campaign
+from apertura.interferometry.coherence import chance, coherence
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.steps import cube
+from apertura.store import create, damaged_files, finish, manifest_of, open_stage, writing
+
+LIFTED_M = 0.1
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """Two flights, the second of one node, a little higher and a day later; tiles of 16 of 60 pixels."""
+    plan = preset("demo", pulses=120)
+    first, grid = plan.flights[0], ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
+    track = first.tracks["uav1"]
+    east, north, up = track.start_m
+    lifted = {"uav1": replace(track, start_m=(east, north, up + LIFTED_M))}
+    second = replace(first, name="f02", tracks=lifted, start_utc="2025-05-15T09:30:00")
+    root = simulate(
+        tmp_path_factory.mktemp("cube") / "campaign", replace(plan, scene=grid, flights=(first, second)), seed=7
+    )
+    edit_config(root, lambda document: document.setdefault("processing", {}).update(tile_px=16))
+    return run_steps(root, exports=False)
+
+
+@pytest.fixture(scope="module")
+def opened(campaign):
+    """The cube as a stranger opens it; a warning is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return xr.open_zarr(campaign.stage("cube"))
+
+
+def test_images_are_selected_by_name(campaign, opened):
+    assert opened.flight.values.tolist() == ["f01", "f02"]
+    assert opened.pair.values.tolist() == ["uav1-uav1", "uav1-uav2"]
+    for flight, pair in (("f01", "uav1-uav1"), ("f01", "uav1-uav2"), ("f02", "uav1-uav1")):
+        image = open_stage(campaign.stage("image", flight, pair), "image")
+        np.testing.assert_array_equal(opened.image.sel(flight=flight, pair=pair), image.image)
+    missing = opened.sel(flight="f02", pair="uav1-uav2")
+    assert np.isnan(missing.image).all()
+    assert np.isnan(missing.incidence)
+    assert missing.verdict.values.item() == ""
+    assert opened.sel(flight="f01", pair="uav1-uav2").verdict.values.item() in {"focused", "cannot tell", "defocused"}
+
+
+def test_the_crs_is_one_line_away_and_every_raster_names_it(campaign, opened):
+    assert opened.rio.crs.to_epsg() == 32632
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
+        xmin, ymin, xmax, ymax = campaign.settings.scene.bounds_m
+        assert opened.rio.bounds() == pytest.approx((xmin, ymin, xmax, ymax), abs=1e-6)
+        assert tuple(opened.image.rio.transform())[:6] == pytest.approx((0.1, 0, xmin, 0, -0.1, ymax), abs=1e-6)
+    rasters = [name for name, array in opened.items() if {"y", "x"} <= set(array.dims)]
+    assert len(rasters) == 8
+    for name, array in opened.items():
+        assert (array.attrs.get("grid_mapping") == "spatial_ref") == (name in rasters)
+
+
+def test_names_and_units_are_those_of_cf(opened):
+    assert opened.attrs["Conventions"].startswith("CF-")
+    for name, array in opened.variables.items():
+        assert name == "spatial_ref" or array.attrs.keys() & {"long_name", "standard_name"}, name
+        assert "units" in array.attrs or array.dtype.kind in "TMO" or name == "spatial_ref", name
+    assert opened.x.attrs["standard_name"] == "projection_x_coordinate"
+    assert opened.y.attrs["axis"] == "Y"
+    assert opened.time.attrs["standard_name"] == "time"
+    assert opened.spatial_ref.attrs["grid_mapping_name"] == "transverse_mercator"
+
+
+def test_a_flight_has_the_time_of_its_middle(opened):
+    middle = np.array(
+        ["2025-05-14T09:30:02.975", "2025-05-15T09:30:02.975"], "datetime64[ns]"
+    )  # of 120 pulses at 20 Hz
+    assert (np.abs(opened.time.values - middle) < np.timedelta64(100, "ms")).all()
+
+
+def test_each_image_says_how_it_saw_the_scene(opened):
+    f01, f02 = (opened.sel(flight=flight, pair="uav1-uav1") for flight in ("f01", "f02"))
+    assert float(f02.height - f01.height) == pytest.approx(LIFTED_M, abs=0.15)  # both wobble
+    assert float(f01.heading) == pytest.approx(40, abs=5)  # of the demo's tracks
+    assert (float(f01.look_direction) - float(f01.heading)) % 360 == pytest.approx(90, abs=30)
+    assert np.degrees(np.arccos(float(f01.height / f01.range))) == pytest.approx(float(f01.incidence), abs=1)
+    assert float(f01.bandwidth) == pytest.approx(409.6e6, rel=1e-3)
+    assert float(f01.bistatic_angle) < 1 < float(opened.bistatic_angle.sel(flight="f01", pair="uav1-uav2"))
+
+
+def test_coherence_and_phase_are_those_of_whole_images_whatever_the_tiles(opened):
+    window = opened.attrs["coherence_window"]
+    images = opened.image.load()
+    reference = opened.reference_pair.sel(flight="f01").values.item()
+    (other,) = set(opened.pair.values.tolist()) - {reference}
+    for kind, one, against in (
+        ("pair", ("f01", other), ("f01", reference)),
+        ("flight", ("f02", "uav1-uav1"), ("f01", "uav1-uav1")),
+    ):
+        whole = coherence(
+            images.sel(flight=one[0], pair=one[1]).values,
+            images.sel(flight=against[0], pair=against[1]).values,
+            window=window,
+        )
+        held = opened.sel(flight=one[0], pair=one[1])
+        np.testing.assert_array_equal(held[f"{kind}_coherence"], whole[0])
+        np.testing.assert_array_equal(held[f"{kind}_phase"], whole[1])
+        assert float(held[f"{kind}_chance"]) == pytest.approx(chance(whole[2]), abs=0.03)  # looks are told tile by tile
+        assert np.isnan(opened.sel(flight=against[0], pair=against[1])[f"{kind}_coherence"]).all()
+
+
+def test_a_target_is_as_coherent_as_the_common_band_lets_it(opened):
+    brightest = np.abs(opened.image.sel(flight="f01", pair="uav1-uav2")).argmax(...)
+    assert opened.reference_pair.sel(flight="f01") == "uav1-uav2"
+    for name, flight in (("pair", "f01"), ("flight", "f02")):
+        here = opened.sel(flight=flight, pair="uav1-uav1").isel(brightest)
+        assert float(here[f"{name}_coherence"]) == pytest.approx(float(here[f"{name}_common_band"]), abs=0.12)
+        assert abs(float(here[f"{name}_phase"])) < 0.3
+
+
+def test_the_sum_says_how_far_it_lowers_clutter(opened):
+    floors = opened.noise_floor.sel(flight="f01")
+    mean_db = 10 * np.log10((10 ** (floors / 10)).mean())
+    assert np.isfinite(opened.phase_removed.sel(flight="f01")).all()  # both pairs are in the sum
+    assert float(opened.clutter_reduction[0]) == pytest.approx(
+        float(mean_db - opened.coherent_noise_floor[0]), abs=1e-9
+    )
+    assert float(opened.clutter_reduction.sel(flight="f02")) == pytest.approx(
+        0, abs=0.011
+    )  # of one image, to its 0.01 dB
+
+
+def test_metadata_are_consolidated_and_hashed_with_the_rest(campaign):
+    folder = campaign.stage("cube")
+    held = zarr.open_group(folder, mode="r", use_consolidated=True)
+    assert {"image", "flight", "time"} <= set(held.metadata.consolidated_metadata.metadata)
+    assert damaged_files(manifest_of(folder)) == []
+
+
+def test_chunks_are_tiles_and_files(campaign, opened):
+    assert opened.image.encoding["chunks"] == (1, 1, 16, 16)
+    assert opened.image.encoding["shards"] is None
+    assert len([*(campaign.stage("cube") / "pair_phase" / "c").rglob("*")]) == 1 + 1 + 4 + 16  # of one pair alone
+    assert not (campaign.stage("cube") / "flight_phase" / "c" / "0").exists()
+
+
+def test_a_cube_made_again_is_the_same_to_the_byte(campaign, tmp_path):
+    root = copy_writable(campaign.root, tmp_path / "campaign")
+    before = manifest_of(campaign.stage("cube")).read_bytes()
+    cube.cube(Campaign.load(root))
+    assert manifest_of(Campaign.load(root).stage("cube")).read_bytes() == before
+
+
+def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
+    root = copy_writable(campaign.root, tmp_path / "campaign")
+    folder = Campaign.load(root).stage("image", "f01", "uav1-uav1")
+    image = open_stage(folder, "image").load()
+    del image.attrs["quality"]["view"]
+    with writing(folder) as wip:
+        create(wip, image, {"image": (16, 16)})
+        finish(wip, folder)
+    said = complaint(lambda: cube.cube(Campaign.load(root)))
+    assert "'view' missing" in said
+    assert "Run the workflow again" in said

@@ -1,0 +1,28 @@
+// Bundles the map's page into the package: index.html, app.js and app.css, which name no other host.
+// `node build.mjs [folder]`; without a folder, into src/apertura/webmap/page.
+import { build } from 'esbuild';
+import { copyFile, mkdir, rename, rm } from 'node:fs/promises';
+import { dirname, join, resolve } from 'node:path';
+import { fileURLToPath } from 'node:url';
+
+const here = dirname(fileURLToPath(import.meta.url));
+const folder = resolve(process.argv[2] ?? join(here, '../src/apertura/webmap/page'));
+const beside = `${folder}.wip`;
+
+await rm(beside, { recursive: true, force: true });
+await mkdir(beside, { recursive: true });
+await build({
+  entryPoints: [join(here, 'src/app.js')],
+  outfile: join(beside, 'app.js'),
+  absWorkingDir: here,
+  bundle: true,
+  minify: true,
+  format: 'iife', // a module would not even load from file://, where the page has to say what to do
+  target: 'es2022',
+  charset: 'utf8',
+  legalComments: 'inline', // the licences of what is bundled go with it
+  logLevel: 'warning',
+});
+await copyFile(join(here, 'src/index.html'), join(beside, 'index.html'));
+await rm(folder, { recursive: true, force: true });
+await rename(beside, folder);

@@ -1,0 +1,217 @@
+// The page: what is chosen in the panel goes to the map, the readout, the cross-section, the target list and the address.
+import 'ol/ol.css';
+import './app.css';
+import { Chart, canDraw } from './chart.js';
+import { MASK, RAMPS, drawRamp } from './colours.js';
+import { byId, element, notice, number } from './dom.js';
+import * as permalink from './permalink.js';
+import { Places } from './places.js';
+import { Raster } from './raster.js';
+import { Readout } from './readout.js';
+import { Section } from './section.js';
+import { Targets } from './targets.js';
+
+const FORMAT = 1;
+const OVER = { mask: 'mask: shadow and layover', tracks: 'tracks', footprints: 'footprints', targets: 'targets' };
+const BEYOND = 0.5; // of the range between floor and peak, that the sliders reach beyond it
+
+class Page {
+  constructor(data) {
+    this.data = data;
+    this.rasters = new Map();
+    this.places = new Places(data);
+    this.chart = new Chart('map', this.places);
+    this.readout = new Readout(this.chart, this.places, () => this.raster, () => this.maskRaster, data.classes);
+    this.section = new Section(this.chart, this.places, () => this.raster, () => this.remember());
+    this.targets = new Targets(data.places, this.chart, this.places, () => (this.layer.unit === 'dB' ? this.raster : null));
+    data.notes.forEach(notice);
+    this.describe();
+    this.fill();
+    this.restore(permalink.read(location.hash));
+    this.listen();
+    if (data.coverage_url) this.chart.cover(data.coverage_url).catch((error) => notice(error.message));
+    else for (const name of ['tracks', 'footprints']) this.boxes[name].disabled = true;
+  }
+
+  /** Words about the campaign that stay. */
+  describe() {
+    const { campaign, crs } = this.data;
+    document.title = `${campaign} · apertura map`;
+    byId('campaign').textContent = campaign;
+    byId('crs').textContent = [crs.name, crs.code].filter(Boolean).join(' · ');
+    const right = this.places.convergence();
+    const north =
+      right === null ? 'up is the local y axis' : `up is grid north; true north is ${number(Math.abs(right), 2)}° to the ${right < 0 ? 'left' : 'right'}`;
+    byId('north').lastElementChild.textContent = right === null ? 'y' : 'grid N';
+    byId('north').title = north;
+    byId('north').setAttribute('aria-label', north);
+    const shown = Object.entries(MASK).map(([value, colour]) => {
+      const swatch = element('span', { className: 'swatch' });
+      swatch.style.background = colour;
+      return element('li', {}, swatch, this.data.classes[value]);
+    });
+    byId('mask-legend').append(...shown);
+  }
+
+  /** Choices of the panel. */
+  fill() {
+    const flights = new Map();
+    for (const { flight, image } of this.data.images) {
+      if (!flights.has(flight)) flights.set(flight, element('optgroup', { label: flight }));
+      flights.get(flight).append(element('option', { value: `${flight}/${image}`, textContent: `${flight} · ${image}` }));
+    }
+    byId('image').append(...flights.values());
+    byId('colours').append(...Object.keys(RAMPS).map((name) => element('option', { value: name, textContent: name })));
+    this.boxes = {};
+    for (const [name, words] of Object.entries(OVER)) {
+      const box = element('input', { type: 'checkbox', checked: name !== 'mask' });
+      this.boxes[name] = box;
+      byId('overlays').append(element('label', {}, box, ` ${words}`));
+      box.addEventListener('change', () => this.over());
+    }
+  }
+
+  listen() {
+    byId('image').addEventListener('change', () => this.choose(byId('image').value, this.layer.file));
+    byId('layer').addEventListener('change', () => this.choose(byId('image').value, byId('layer').value));
+    byId('colours').addEventListener('change', () => this.show());
+    byId('reset').addEventListener('click', () => this.stretch(this.layer.low, this.layer.high));
+    for (const name of ['low', 'high'])
+      byId(name).addEventListener('input', () => this.stretch(byId('low').valueAsNumber, byId('high').valueAsNumber, name));
+    byId('skip').addEventListener('click', () => byId('map').focus());
+    byId('fit-scene').addEventListener('click', () => this.chart.fit());
+    byId('fit-tracks').addEventListener('click', () => this.chart.fit(true));
+    byId('toggle').addEventListener('click', () => {
+      const open = document.body.classList.toggle('closed');
+      byId('toggle').setAttribute('aria-expanded', String(!open));
+      this.chart.map.updateSize();
+    });
+    this.chart.map.on('moveend', () => this.remember());
+    addEventListener('hashchange', () => this.restore(permalink.read(location.hash)));
+  }
+
+  /** Show what an address asks for, as far as the campaign has it. */
+  restore(asked) {
+    if (asked.over) for (const [name, box] of Object.entries(this.boxes)) box.checked = asked.over.includes(name);
+    if (asked.view) {
+      this.chart.view.setCenter(asked.view.slice(0, 2));
+      this.chart.view.setResolution(asked.view[2]);
+    }
+    this.choose(asked.image, asked.layer, asked);
+    this.section.set(asked.line);
+  }
+
+  /** Choose an image and a layer of it by their names; others than there are choose the first. */
+  choose(image, file, { stretch = null, colours = null } = {}) {
+    this.image = this.data.images.find((one) => `${one.flight}/${one.image}` === image) ?? this.data.images[0];
+    const layers = this.image.layers.filter((one) => one.kind !== 'classes');
+    const before = this.layer;
+    this.layer = layers.find((one) => one.file === file) ?? layers[0];
+    byId('image').value = `${this.image.flight}/${this.image.image}`;
+    byId('layer').replaceChildren(...layers.map((one) => element('option', { value: one.file, textContent: one.file.replace(/\.tif$/, '').replaceAll('_', ' ') })));
+    byId('layer').value = this.layer.file;
+    byId('title').textContent = `${this.layer.title}${this.layer.unit ? `, ${this.layer.unit}` : ''}`;
+    if (Object.hasOwn(RAMPS, colours ?? '')) byId('colours').value = colours;
+    else if (before?.kind !== this.layer.kind) byId('colours').value = this.layer.kind === 'image' ? 'grey' : 'viridis';
+    this.maskLayer = this.image.layers.find((one) => one.kind === 'classes') ?? null;
+    this.boxes.mask.disabled = !this.maskLayer;
+    this.limits(...(stretch ?? [this.layer.low, this.layer.high]));
+    this.say();
+    this.show();
+    this.over();
+    this.targets.list(byId('image').value);
+    this.section.refresh();
+  }
+
+  /** What the image says of itself. */
+  say() {
+    const { verdict, why, error_db: error, flags } = this.image;
+    byId('verdict').textContent = `${verdict}: ${why}; numerical error below ${number(error, 1)} dB`;
+    const raised = Object.entries(flags).flatMap(([name, words]) => [
+      element('dt', { textContent: name }),
+      element('dd', { textContent: words }),
+    ]);
+    byId('flags').replaceChildren(...(raised.length ? raised : [element('dt', { className: 'none', textContent: 'no flag' })]));
+  }
+
+  limits(low, high) {
+    const range = this.layer.high - this.layer.low || 1;
+    const step = Number((range / 200).toPrecision(1));
+    for (const name of ['low', 'high'])
+      Object.assign(byId(name), { step, min: this.layer.low - BEYOND * range, max: this.layer.high + BEYOND * range });
+    this.stretch(low, high);
+  }
+
+  /** Set both ends of the colours; the one that was moved pushes the other. */
+  stretch(low, high, moved = 'low') {
+    const gap = Number(byId('low').step) || 1e-6;
+    this.low = moved === 'high' ? Math.min(low, high - gap) : low;
+    this.high = moved === 'high' ? high : Math.max(high, low + gap);
+    const decimals = Math.max(0, 1 - Math.floor(Math.log10(this.high - this.low)));
+    for (const name of ['low', 'high']) {
+      byId(name).value = this[name];
+      const words = `${number(this[name], Math.min(4, decimals))} ${this.layer.unit}`;
+      for (const place of [`${name}-value`, `ramp-${name}`]) byId(place).textContent = words;
+      byId(name).setAttribute('aria-valuetext', words);
+    }
+    this.chart.stretch(this.low, this.high);
+    this.remember();
+  }
+
+  show() {
+    this.raster = this.opened(this.layer);
+    const colours = byId('colours').value;
+    drawRamp(byId('ramp'), colours);
+    this.chart.show(this.layer, colours, this.low, this.high);
+    this.readout.refresh();
+    this.remember();
+  }
+
+  over() {
+    const masked = this.boxes.mask.checked && this.maskLayer;
+    this.maskRaster = masked ? this.opened(this.maskLayer) : null;
+    this.chart.mask(masked ? this.maskLayer : null);
+    byId('mask-legend').hidden = !masked;
+    for (const name of ['tracks', 'footprints', 'targets']) this.chart[name].setVisible(this.boxes[name].checked);
+    this.readout.refresh();
+    this.remember();
+  }
+
+  opened(layer) {
+    if (!this.rasters.has(layer.url)) this.rasters.set(layer.url, new Raster(layer, this.places));
+    return this.rasters.get(layer.url);
+  }
+
+  remember() {
+    if (!this.image || !this.section) return;
+    const { view } = this.chart;
+    permalink.write(
+      {
+        image: `${this.image.flight}/${this.image.image}`,
+        layer: this.layer.file,
+        colours: byId('colours').value,
+        stretch: [this.low, this.high].map((value) => Number(value.toPrecision(5))),
+        over: Object.keys(OVER).filter((name) => this.boxes[name].checked),
+        view: [...view.getCenter(), view.getResolution()],
+        line: this.section.ends,
+      },
+      this.places.decimals,
+    );
+  }
+}
+
+async function start() {
+  if (location.protocol === 'file:') {
+    notice('A browser reads no image from a folder opened like this: type `apertura map CAMPAIGN`, and open the address that it prints.');
+    return;
+  }
+  if (!canDraw()) notice('This browser has no WebGL, with which images are drawn; values, places and tracks are still told.');
+  const answer = await fetch('map.json');
+  if (!answer.ok) throw new Error(`map.json: ${(await answer.text()).trim()}`);
+  const data = await answer.json();
+  if (data.format !== FORMAT) throw new Error('map.json is of another version than this page: run the workflow again');
+  const page = new Page(data);
+  page.chart.map.on('rendercomplete', () => document.documentElement.setAttribute('data-drawn', ''));
+}
+
+start().catch((error) => notice(`No map: ${error.message}`));

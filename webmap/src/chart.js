@@ -1,0 +1,175 @@
+// The map itself: one raster, the mask over it, tracks, footprints, targets, and the line of the cross-section.
+import Map from 'ol/Map.js';
+import View from 'ol/View.js';
+import { extend } from 'ol/extent.js';
+import { getPointResolution } from 'ol/proj.js';
+import Feature from 'ol/Feature.js';
+import GeoJSON from 'ol/format/GeoJSON.js';
+import LineString from 'ol/geom/LineString.js';
+import Point from 'ol/geom/Point.js';
+import TileLayer from 'ol/layer/WebGLTile.js';
+import VectorLayer from 'ol/layer/Vector.js';
+import GeoTIFF from 'ol/source/GeoTIFF.js';
+import VectorSource from 'ol/source/Vector.js';
+import Zoom from 'ol/control/Zoom.js';
+import { Circle, Fill, Stroke, Style, Text } from 'ol/style.js';
+import { maskStyle, rampStyle } from './colours.js';
+import { byId, notice } from './dom.js';
+
+const FLIGHTS = ['#22d3ee', '#f472b6', '#a3e635', '#facc15', '#c084fc', '#fb7185'];
+const HALO = new Stroke({ color: '#0b1220cc', width: 4 });
+
+/** Whether the browser can draw rasters at all. */
+export function canDraw() {
+  const canvas = document.createElement('canvas');
+  return Boolean(canvas.getContext('webgl') || canvas.getContext('experimental-webgl'));
+}
+
+export class Chart {
+  constructor(target, places) {
+    this.places = places;
+    const { bounds_m: bounds, spacing_m: spacing } = places.grid;
+    this.tracks = vector(3, (feature) => trackStyle(feature));
+    this.footprints = vector(2, (feature) => footprintStyle(feature));
+    this.targets = vector(5, (feature) => targetStyle(feature), true);
+    this.line = vector(6, () => LINE);
+    this.map = new Map({
+      target,
+      controls: [new Zoom()],
+      layers: [this.footprints, this.tracks, this.targets, this.line],
+      view: new View({
+        projection: places.projection,
+        enableRotation: false,
+        minResolution: spacing / 64,
+        maxResolution: Math.max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 50,
+        center: [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2],
+        resolution: 1,
+      }),
+    });
+    this.fit();
+    this.map.on('postrender', () => this.scale());
+  }
+
+  /** Show the whole scene, with the tracks where they are asked for. */
+  fit(tracks = false) {
+    const extent = [...this.places.grid.bounds_m];
+    if (tracks) extend(extent, this.tracks.getSource().getExtent());
+    this.view.fit(extent, { padding: [30, 30, 60, 30] });
+  }
+
+  get view() {
+    return this.map.getView();
+  }
+
+  /** Draw a scale bar of a round length on the ground. */
+  scale() {
+    const metres = getPointResolution(this.places.projection, this.view.getResolution(), this.view.getCenter(), 'm');
+    const most = 140 * metres;
+    const power = 10 ** Math.floor(Math.log10(most));
+    const length = power * [5, 2, 1].find((each) => each * power <= most);
+    const [unit, metre] = length >= 1000 ? ['km', 1000] : length >= 1 ? ['m', 1] : ['cm', 0.01];
+    byId('scale').style.width = `${length / metres}px`;
+    byId('scale').textContent = `${Number((length / metre).toPrecision(2))} ${unit}`;
+  }
+
+  /** Show a raster with a style instead of the one before. */
+  show(layer, colours, low, high) {
+    this.raster = this.replaced(this.raster, layer, () => rampStyle(colours, low, high), 0);
+  }
+
+  /** Show a mask over the raster; null: none. */
+  mask(layer) {
+    this.overlay = this.replaced(this.overlay, layer, maskStyle, 1);
+    this.overlay?.setOpacity(0.55);
+  }
+
+  replaced(before, layer, style, zIndex) {
+    if (before) this.map.removeLayer(before);
+    before?.dispose();
+    if (!layer || !canDraw()) return null;
+    const source = new GeoTIFF({
+      sources: [{ url: layer.url }],
+      normalize: false,
+      interpolate: false, // pixels as they are: dB between them would be an invention
+      projection: this.places.projection,
+      transition: 0,
+    });
+    source.on('change', () => source.getState() === 'error' && explain(layer));
+    const made = new TileLayer({ source, style: style(), zIndex });
+    this.map.addLayer(made);
+    return made;
+  }
+
+  stretch(low, high) {
+    this.raster?.updateStyleVariables({ low, high });
+  }
+
+  async cover(url) {
+    const response = await fetch(url);
+    if (!response.ok) throw new Error(`tracks and footprints: ${(await response.text()).trim()}`);
+    const read = new GeoJSON().readFeatures(await response.json(), {
+      dataProjection: 'EPSG:4326',
+      featureProjection: this.places.projection,
+    });
+    const flights = [...new Set(read.map((one) => one.get('flight')))];
+    for (const feature of read) {
+      feature.set('colour', FLIGHTS[flights.indexOf(feature.get('flight')) % FLIGHTS.length]);
+      (feature.get('kind') === 'track' ? this.tracks : this.footprints).getSource().addFeature(feature);
+    }
+  }
+
+  mark(places) {
+    const source = this.targets.getSource();
+    source.clear();
+    source.addFeatures(places.map((one) => new Feature({ geometry: new Point([one.x_m, one.y_m]), name: one.name })));
+  }
+
+  drawLine(ends) {
+    const source = this.line.getSource();
+    source.clear();
+    if (ends) source.addFeature(new Feature(new LineString(ends)));
+  }
+
+  zoomTo(place) {
+    const resolution = Math.min(this.view.getResolution(), this.places.grid.spacing_m / 4);
+    this.view.animate({ center: place, resolution, duration: 250 });
+  }
+}
+
+async function explain(layer) {
+  const answer = await fetch(layer.url, { headers: { Range: 'bytes=0-0' } }).catch(() => null);
+  const why = answer === null ? 'the server does not answer' : answer.ok ? 'it is no GeoTIFF' : await answer.text();
+  notice(`${layer.file} cannot be shown: ${why.trim()}.`);
+}
+
+function vector(zIndex, style, declutter = false) {
+  return new VectorLayer({ source: new VectorSource(), zIndex, style, declutter });
+}
+
+const LINE = [
+  new Style({ stroke: new Stroke({ color: '#0b1220', width: 5 }) }),
+  new Style({ stroke: new Stroke({ color: '#fde047', width: 2.5 }) }),
+];
+
+const trackStyle = (feature) =>
+  new Style({
+    stroke: new Stroke({
+      color: feature.get('colour'),
+      width: 2,
+      lineDash: feature.get('antenna') === 'receiver' ? [6, 5] : undefined,
+    }),
+  });
+
+const footprintStyle = (feature) => new Style({ stroke: new Stroke({ color: `${feature.get('colour')}99`, width: 1 }) });
+
+const targetStyle = (feature) =>
+  new Style({
+    image: new Circle({ declutterMode: 'none', radius: 8, stroke: new Stroke({ color: '#34d399', width: 1.5 }), fill: new Fill({ color: '#0000' }) }),
+    text: new Text({
+      text: feature.get('name'),
+      font: '12px system-ui, sans-serif',
+      offsetY: -16,
+      fill: new Fill({ color: '#d1fae5' }),
+      stroke: HALO,
+    }),
+  });

@@ -1,0 +1,115 @@
+// Values of one GeoTIFF at full resolution, read by ranges of bytes: what the readout, peaks and cuts tell.
+import { fromUrl } from 'geotiff';
+
+const SAMPLES_AT_ONCE = 256;
+const MOST_SAMPLES = 4000;
+
+export class Raster {
+  constructor(layer, places) {
+    this.layer = layer;
+    this.places = places;
+    this.opened = this.open();
+    this.opened.catch(() => {}); // told where it is used
+  }
+
+  async open() {
+    const image = await (await fromUrl(this.layer.url)).getImage();
+    const { bounds_m: bounds, spacing_m: spacing, shape } = this.places.grid;
+    const off = image.getBoundingBox().map((edge, side) => Math.abs(edge - bounds[side]));
+    if (image.getHeight() !== shape[0] || image.getWidth() !== shape[1] || Math.max(...off) > spacing / 1000)
+      throw new Error(`${this.layer.file} is not on the campaign's grid`);
+    this.nodata = image.getGDALNoData();
+    return image;
+  }
+
+  /** Values of rows and columns, the last ones not included, NaN where there is none; null beyond the grid. */
+  async window(top, left, bottom, right) {
+    const [rows, columns] = this.places.grid.shape;
+    const [row, column] = [Math.max(0, top), Math.max(0, left)];
+    const [end, last] = [Math.min(rows, bottom), Math.min(columns, right)];
+    if (end <= row || last <= column) return null;
+    const image = await this.opened;
+    const [data] = await image.readRasters({ window: [column, row, last, end] });
+    const width = last - column;
+    const at = (y, x) => {
+      if (y < row || y >= end || x < column || x >= last) return NaN;
+      const value = data[(y - row) * width + x - column];
+      return value === this.nodata ? NaN : value;
+    };
+    return { row, column, end, last, at };
+  }
+
+  /** The value of the pixel under a place, NaN where there is none. */
+  async value(place) {
+    const [row, column] = this.places.pixelOf(place).map(Math.round);
+    const window = await this.window(row, column, row + 1, column + 1);
+    return window ? window.at(row, column) : NaN;
+  }
+
+  /** The highest pixel around a place, and its top between the pixels by a paraboloid through its neighbours. */
+  async peak(place, reach) {
+    const [row, column] = this.places.pixelOf(place).map(Math.round);
+    const window = await this.window(row - reach - 1, column - reach - 1, row + reach + 2, column + reach + 2);
+    if (!window) return null;
+    let best = null;
+    for (let y = row - reach; y <= row + reach; y++)
+      for (let x = column - reach; x <= column + reach; x++) {
+        const value = window.at(y, x);
+        if (value > (best?.value ?? -Infinity)) best = { y, x, value };
+      }
+    if (!best) return null;
+    const { y, x, value } = best;
+    const [down, right] = top((dy, dx) => window.at(y + dy, x + dx));
+    return { place: this.places.placeOf([y + down, x + right]), value };
+  }
+
+  /** Values along a line: distance (m), place and value of each sample; half a pixel apart, or as many as are told. */
+  async along(from, to) {
+    const length = Math.hypot(to[0] - from[0], to[1] - from[1]);
+    const count = Math.min(MOST_SAMPLES, Math.max(2, Math.ceil((2 * length) / this.places.grid.spacing_m) + 1));
+    const samples = Array.from({ length: count }, (_, index) => {
+      const share = index / (count - 1);
+      return { distance: share * length, place: from.map((start, axis) => start + share * (to[axis] - start)) };
+    });
+    for (let first = 0; first < count; first += SAMPLES_AT_ONCE)
+      await this.fill(samples.slice(first, first + SAMPLES_AT_ONCE));
+    return samples;
+  }
+
+  async fill(samples) {
+    const pixels = samples.map(({ place }) => this.places.pixelOf(place));
+    const [rows, columns] = [0, 1].map((axis) => pixels.map((pixel) => pixel[axis]));
+    const [top, left] = [rows, columns].map((all) => Math.floor(Math.min(...all)));
+    const [bottom, right] = [rows, columns].map((all) => Math.floor(Math.max(...all)) + 2);
+    const window = await this.window(top, left, bottom, right);
+    const between = this.layer.unit === 'dB' ? bilinearPower : nearest;
+    samples.forEach((sample, index) => {
+      sample.value = window ? between(window.at, pixels[index]) : NaN;
+    });
+  }
+}
+
+/** Where a paraboloid through 3 × 3 dB is highest, down and right of the middle, pixels; cells lie askew: it is turned. */
+function top(at) {
+  const slope = [(at(1, 0) - at(-1, 0)) / 2, (at(0, 1) - at(0, -1)) / 2];
+  const bend = [at(1, 0) - 2 * at(0, 0) + at(-1, 0), at(0, 1) - 2 * at(0, 0) + at(0, -1)];
+  const twist = (at(1, 1) - at(1, -1) - at(-1, 1) + at(-1, -1)) / 4;
+  const determinant = bend[0] * bend[1] - twist * twist;
+  if (!(bend[0] < 0 && determinant > 0)) return [0, 0];
+  const down = (twist * slope[1] - bend[1] * slope[0]) / determinant;
+  const right = (twist * slope[0] - bend[0] * slope[1]) / determinant;
+  return Math.max(Math.abs(down), Math.abs(right)) <= 1 ? [down, right] : [0, 0];
+}
+
+const nearest = (at, [row, column]) => at(Math.round(row), Math.round(column));
+
+/** dB of the power between four pixels: decibels are not what adds up. */
+function bilinearPower(at, [row, column]) {
+  const [y, x] = [Math.floor(row), Math.floor(column)];
+  const [down, right] = [row - y, column - x];
+  let power = 0;
+  for (const [dy, weightY] of [[0, 1 - down], [1, down]])
+    for (const [dx, weightX] of [[0, 1 - right], [1, right]])
+      if (weightY * weightX > 0) power += weightY * weightX * 10 ** (at(y + dy, x + dx) / 10);
+  return power > 0 ? 10 * Math.log10(power) : NaN;
+}

@@ -1,0 +1,116 @@
+// The cross-section tool: a line on the map, its values below, and as CSV.
+import Draw from 'ol/interaction/Draw.js';
+import { byId, element, number } from './dom.js';
+import { plot, width3dB } from './plot.js';
+
+const NAMES = ['from E', 'from N', 'to E', 'to N'];
+const HEIGHT = 190;
+
+export class Section {
+  /** `raster` gives what is cut now; `changed` hears of a new line. */
+  constructor(chart, places, raster, changed) {
+    Object.assign(this, { chart, places, raster, changed, ends: null, asked: 0 });
+    this.inputs = NAMES.map((name) => {
+      const input = element('input', { type: 'number', step: 'any' });
+      input.addEventListener('change', () => this.typed());
+      byId('ends').append(element('label', {}, `${name} `, input));
+      return input;
+    });
+    byId('draw').addEventListener('click', () => this.draw());
+    byId('clear').addEventListener('click', () => this.set(null));
+    byId('csv').addEventListener('click', () => this.save());
+    document.addEventListener('keydown', (event) => event.key === 'Escape' && this.stop());
+    new ResizeObserver(() => this.plot()).observe(byId('stage'));
+  }
+
+  draw() {
+    this.stop();
+    this.tool = new Draw({ type: 'LineString', maxPoints: 2, source: undefined });
+    this.tool.on('drawend', ({ feature }) => {
+      const ends = feature.getGeometry().getCoordinates();
+      setTimeout(() => this.stop()); // the tool is still at work while it tells
+      this.set(ends);
+    });
+    this.chart.map.addInteraction(this.tool);
+    byId('draw').classList.add('active');
+  }
+
+  stop() {
+    if (this.tool) this.chart.map.removeInteraction(this.tool);
+    this.tool = null;
+    byId('draw').classList.remove('active');
+  }
+
+  typed() {
+    const values = this.inputs.map((input) => input.valueAsNumber);
+    if (values.every(Number.isFinite)) this.set([values.slice(0, 2), values.slice(2)]);
+  }
+
+  /** Cut along a line, ends as [x, y]; null: no line. */
+  set(ends) {
+    const real = ends && Math.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]) > 0 ? ends : null;
+    this.ends = real;
+    this.inputs.forEach((input, index) => {
+      input.value = real ? real.flat()[index].toFixed(this.places.decimals) : '';
+    });
+    this.chart.drawLine(real);
+    this.changed();
+    return this.refresh();
+  }
+
+  /** Read the values again: another line, or another raster under it. */
+  async refresh() {
+    const asked = ++this.asked;
+    this.samples = null;
+    const raster = this.raster();
+    let problem = '';
+    if (this.ends && raster)
+      try {
+        const samples = await raster.along(...this.ends);
+        if (asked !== this.asked) return;
+        this.samples = samples;
+        this.of = raster.layer;
+      } catch (error) {
+        problem = error.message;
+      }
+    if (asked !== this.asked) return;
+    byId('section').hidden = !this.ends;
+    byId('clear').disabled = !this.ends;
+    byId('csv').disabled = !this.samples;
+    byId('section-words').textContent = this.samples ? this.words() : problem;
+    this.plot();
+  }
+
+  plot() {
+    const box = byId('plot');
+    box.replaceChildren();
+    if (this.samples && box.clientWidth > 0) box.append(plot(this.samples, this.of.unit, box.clientWidth, HEIGHT));
+  }
+
+  words() {
+    const best = this.samples.reduce((most, one) => (one.value > most.value ? one : most), { value: -Infinity });
+    if (!Number.isFinite(best.value)) return 'no value along this line';
+    const apart = this.samples[1].distance;
+    const told = [`highest ${number(best.value, 2)} ${this.of.unit} at ${number(best.distance, 3)} m`];
+    const width = this.of.unit === 'dB' ? width3dB(this.samples) : null;
+    if (width !== null) told.push(`−3 dB width ${number(width, 3)} m`);
+    const how = this.of.unit === 'dB' ? 'bilinear in power' : 'nearest pixels';
+    return `${told.join(' · ')} · samples ${number(apart, 3)} m apart, ${how}`;
+  }
+
+  save() {
+    const geographic = this.places.toGeographic;
+    const names = ['distance_m', 'easting_m', 'northing_m', ...(geographic ? ['longitude_deg', 'latitude_deg'] : [])];
+    const rows = this.samples.map(({ distance, place, value }) => {
+      const degrees = geographic ? geographic([...place]).map((one) => one.toFixed(9)) : [];
+      const metres = [distance, ...place].map((one) => one.toFixed(4));
+      return [...metres, ...degrees, Number.isFinite(value) ? value.toFixed(4) : ''].join(',');
+    });
+    const unit = this.of.unit.toLowerCase().replace(/[^a-z0-9]/g, '') || 'value';
+    const text = [`${[...names, `value_${unit}`].join(',')}`, ...rows].join('\n');
+    const link = element('a', { download: 'cross-section.csv' });
+    link.href = URL.createObjectURL(new Blob([`${text}\n`], { type: 'text/csv' }));
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  }
+}
