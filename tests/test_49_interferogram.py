@@ -25,6 +25,7 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.steps.interferogram import interferogram
+from apertura.steps.summary import print_summary
 
 SLOPE = (0.03, 0.06)
 MARKS = ((-3.0, -2.5), (3.0, 3.0))
@@ -45,7 +46,7 @@ def two_flights(*, half_width_m, density_per_m2, pulses=60, rise_m=1.0):
     return CampaignSpecification(
         "ramp",
         Origin(48.0, 9.0, 500.0),
-        WaveformSpecification(256, 1.2e9, 1.6e6, 0.625e-6, 0.375e-6, 512e6, 10.0),
+        WaveformSpecification(256, 1.2e9, 1.6e6, 0.625e-6, 0.5e-6, 512e6, 10.0),
         (Clutter((-edge, -edge, edge, edge), 1.0, density_per_m2, slope=SLOPE), *marks),
         {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=30.0))},
         (flight("f01", 25.0, "2025-05-14T09:30:00"), flight("f02", 25.0 + rise_m, "2025-05-14T10:30:00")),
@@ -132,6 +133,20 @@ def test_heights_of_sparse_ground_lie_about_the_ramp(small):
     assert there.mean() > 0.5
     assert abs(np.median(wrong[there])) < 0.03
     assert np.mean(abs(wrong[there]) < 3 * std[there]) > 0.97
+
+
+def test_the_summary_tells_heights_and_the_flags_of_an_interferogram(small, tmp_path, capsys):
+    root = copy_writable(small, tmp_path / "unlevelled")
+    print_summary(Campaign.load(root))
+    told = capsys.readouterr().out
+    assert "interferogram two_tracks: coherence 0.9" in told
+    assert "height.tif" in told
+    edit_config(root, lambda config: config["scene"].update(reference_points=[]))
+    interferogram(Campaign.load(root), NAME)
+    print_summary(Campaign.load(root))
+    told = capsys.readouterr().out
+    assert "height_relative" in told
+    assert "interferometry two_tracks: no point of known height shows" in told
 
 
 def test_the_same_images_give_the_same_bytes(small, tmp_path):
