@@ -1,5 +1,6 @@
 """`apertura summary`: what every image of a finished campaign says of itself, its flags explained, and what to open."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +75,8 @@ def print_products(campaign: Campaign) -> None:
             print(f"  {campaign.relative(path)}  in a GIS, with its deviation beside it")
     if len(flights) > _MOST_FLIGHTS:
         print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
+    if campaign.result("map", "index.html").is_file():
+        print(f"  all of them on a map: apertura map {shlex.quote(str(campaign.root))}")
 
 
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
