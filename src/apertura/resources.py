@@ -111,7 +111,7 @@ DEMANDS: Mapping[str, Demand] = {
     "image": _IMAGE,
     "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
     "cube": Demand(500, pixel_bytes=50, pixel_s=10),
-    "interferogram": Demand(800, pulse_bytes=1000, pixel_bytes=350, pixel_s=60),
+    "interferogram": Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
     "cphd": Demand(500, pulse_bytes=500, recorded_s=120),
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),

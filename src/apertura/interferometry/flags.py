@@ -62,7 +62,7 @@ def raised(measured: Measured) -> dict[str, str]:
     Examples
     --------
     >>> sorted(raised(Measured(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
-    ['height_relative', 'interferogram_decorrelated']
+    ['interferogram_decorrelated']
     """
     one, flags = measured, {}
     if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
@@ -93,7 +93,7 @@ def raised(measured: Measured) -> dict[str, str]:
             f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back to itself, "
             f"heights may err by multiples of {one.ambiguity_m:.3g} m{folded}"
         )
-    if not one.points:
+    if one.told and not one.points:
         flags["height_relative"] = (
             "no point of known height shows: the median of the phase is taken for the height that the terrain has, and "
             "an error of it is another height wherever one turn is another height"

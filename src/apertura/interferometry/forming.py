@@ -53,7 +53,7 @@ def formed(
     """
     shape, margin = first.shape, window // 2
     planes = [np.full(shape, np.nan, np.float32) for _ in range(3)]
-    looks = []
+    looks: list[float] = []
     for tile in tiles:
         wider = tuple(
             slice(max(0, part.start - margin), min(size, part.stop + margin))
@@ -63,12 +63,12 @@ def formed(
             slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(tile, wider, strict=True)
         )
         one, other = np.asarray(first[wider]), np.asarray(second[wider])
-        *told, own = coherence(one, other, window=window)
+        magnitude, phase, own = coherence(one, other, window=window)
         looks.append(own)
-        for plane, values in zip(planes, (*told, _shared(one, other, window)), strict=True):
-            plane[tile] = values[inner]
+        planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
+        planes[2][tile] = _shared(one, other, window)[inner]
     there = [one for one in looks if np.isfinite(one)]
-    return Formed(*planes, float(np.median(there)) if there else float("nan"))
+    return Formed(planes[0], planes[1], planes[2], float(np.median(there)) if there else float("nan"))
 
 
 def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:

@@ -129,7 +129,7 @@ def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: lis
         design, missed = np.concatenate(slopes, axis=1), np.concatenate(rows, axis=1)
         step = np.einsum("pij,pj->pi", np.linalg.pinv(design), -missed)
         moved = moved + step @ east_north
-    return moved
+    return np.asarray(moved)
 
 
 def _path(places_m: Floats, legs: Legs) -> Floats:
@@ -162,7 +162,7 @@ def _overlap(places_m: Floats, axes: Floats, first: Legs, second: Legs, band_hz:
     in_range = [np.sort(np.multiply.outer((one * along).sum(-1), np.array(band_hz)), axis=-1) for one in middle]
     turned = [np.einsum("pmi,pi->pm", one, across) for one in ground]
     in_angle = [np.stack([one.min(axis=1), one.max(axis=1)], axis=-1) for one in turned]
-    return _shared(*in_range) * _shared(*in_angle)
+    return np.asarray(_shared(*in_range) * _shared(*in_angle))
 
 
 def _shared(one: Floats, other: Floats) -> Floats:

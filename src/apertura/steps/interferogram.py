@@ -108,10 +108,11 @@ def _says(level: Level) -> str:
 
 def _tags(report: dict[str, Any]) -> dict[str, str]:
     measured = report["measured"]
+    needed = measured["by"] or "no: snaphu is not installed"
     return {
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_LEVEL": report["level"]["says"] if report["level"] else "no heights",
         "APERTURA_LOOKS": "none" if report["looks"] is None else f"{report['looks']:.2f}",
         "APERTURA_CHANCE": f"{measured['chance']:.3f}",
-        "APERTURA_UNWRAPPED": measured["by"] or "no: snaphu is not installed",
+        "APERTURA_UNWRAPPED": needed if measured["jumps"] else "not needed: no jumps",
     }
