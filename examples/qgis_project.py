@@ -1,7 +1,7 @@
 """A QGIS project of all images in dB of a campaign: python3 qgis_project.py CAMPAIGN, with the Python that QGIS brings.
 
-Coherent sums are on top; QGIS draws each as the .qml beside it says. Writes CAMPAIGN/campaign.qgz, and never over one that
-is there.
+Coherent sums are on top; QGIS draws each as the .qml beside it says. Writes CAMPAIGN/campaign.qgz,
+and never over one that is there.
 """
 
 import os

@@ -1,0 +1,22 @@
+"""`.test/` runs as the Snakemake workflow catalogue runs it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from test_50_workflow import finished, snakemake
+
+CAMPAIGN = Path(__file__).parents[1] / ".test"
+
+
+@pytest.mark.slow
+def test_the_campaign_of_the_catalogue_gives_a_focused_image_without_a_flag(tmp_path):
+    ignored = shutil.ignore_patterns("results", ".snakemake")
+    root = Path(shutil.copytree(CAMPAIGN, tmp_path / "campaign", ignore=ignored))
+    code, output = finished(snakemake(root))
+    assert code == 0, output
+    report = json.loads((root / "results/f01/fused/image.json").read_text())
+    assert report["flags"] == {}
+    assert report["focus"]["verdict"] == "focused"
+    assert report["coherence"]["mean"] > 0.99
