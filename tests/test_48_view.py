@@ -31,7 +31,7 @@ def test_the_carrier_of_the_view_is_that_of_the_images_band(finished_tiny, pair)
     for axis, cycles in ((1, east), (0, -north)):
         ahead = np.take(values, range(1, 60), axis) * np.take(values, range(59), axis).conj()
         turn = np.angle(ahead.sum()) / (2 * np.pi)
-        assert abs((turn - cycles * spacing_m + 0.5) % 1 - 0.5) < 0.06
+        assert abs((turn - cycles * spacing_m + 0.5) % 1 - 0.5) < 0.02
 
 
 def test_a_flight_is_timed_by_its_pulses(finished_tiny):
