@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages docs test test-slow attack cluster-test crate-check lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages docs wheel test test-slow attack cluster-test crate-check lint format lock clean
 
 setup: $(SETUP)
 
@@ -59,6 +59,12 @@ pages: $(SETUP)
 docs: pages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/python -m website.check build/site
+
+# A wheel into dist/, tagged by the oldest glibc that its kernel runs on; on this machine's compiler.
+wheel: $(SETUP)
+	rm -rf build/wheel dist
+	$(BIN)/uv build --wheel --no-build-isolation --out-dir build/wheel .
+	$(BIN)/auditwheel repair --wheel-dir dist build/wheel/*.whl
 
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)

@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 22 + 4 + 5
+    assert len(results) == 33
     for name, result in results:
         if name in ON_DEMAND:
             continue
@@ -169,6 +169,7 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
         ("f01/fused/image.json", "f01/fused/export"),
         ("f01/uav1-uav1/mask.tif", "f01/uav1-uav1/layers"),
         ("coverage.geojson", "coverage"),
+        ("map/map.json", "map/map"),
         ("scene.json", "scene"),
         ("f01/assessment.json", "f01/assessment"),
         ("cube.zarr/zarr.json", "cube"),

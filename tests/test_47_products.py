@@ -2,11 +2,13 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
 import xarray as xr
+from folders import run_steps
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
@@ -15,6 +17,7 @@ from apertura.export import exports_in, product_files
 from apertura.focus.engines import instruction_set
 from apertura.paths import shipped
 from apertura.provenance import Provenance, sha256_file
+from apertura.simulation import ImageGrid, preset, simulate
 from apertura.store import open_stage, read_manifest
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -36,7 +39,7 @@ def tags_of(campaign, name):
 
 def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
     results = finished_tiny.results
-    opened = {".tif", ".png", ".geojson", ".qml"}
+    opened = {".tif", ".png", ".geojson", ".qml", ".vrt", ".html"}
     files = {path.relative_to(results).as_posix() for path in results.rglob("*") if path.suffix in opened}
     reports = {path.relative_to(results).as_posix() for path in results.rglob("image.json")}
     assert (len(RASTERS), len(LAYERS)) == (12, 10)
@@ -84,6 +87,19 @@ def test_a_raster_names_what_it_was_made_from_and_with(finished_tiny, name):
     assert tags["APERTURA_LOCK_SHA256"] == sha256_file(shipped() / "requirements" / "all.txt")
     if name in RASTERS:
         assert tags["APERTURA_INSTRUCTION_SET"] == instruction_set("native")
+
+
+@pytest.mark.slow
+def test_a_raster_of_one_flight_names_no_recording_of_another(tmp_path):
+    plan = replace(preset("demo", pulses=20), scene=ImageGrid("EPSG:32632", half_width_m=1.5, spacing_m=0.1))
+    (flight,) = plan.flights
+    campaign = run_steps(
+        simulate(tmp_path / "two", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3)
+    )
+    for name in product_files({one.name: one.pairs for one in campaign.image_flights}):
+        if name.endswith(".tif"):
+            inputs = json.loads(tags_of(campaign, name)["APERTURA_INPUTS"])
+            assert {role.split("/")[1] for role in inputs} == {"codes.npy", name.split("/")[0]}
 
 
 def test_a_product_that_stands_on_a_stage_of_other_versions_names_both(finished_tiny):

@@ -8,6 +8,8 @@ import typer
 
 from apertura.paths import leave_working_folder
 
+ALL_CORES = os.cpu_count() or 1
+
 
 def score(
     campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
@@ -33,6 +35,22 @@ def verify(
     from apertura.audit.verify import print_verified
 
     raise typer.Exit(print_verified(path, there, quiet=quiet))
+
+
+def reproduce(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    cores: Annotated[int, typer.Option(min=1, help="cores to use")] = ALL_CORES,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="a new folder to make it in, which stays; else in TMPDIR")
+    ] = None,
+) -> None:
+    """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
+    kept = None if keep is None else keep.absolute()
+    path = leave_working_folder(product)
+    from apertura.audit.reproduce import print_reproduced
+
+    raise typer.Exit(print_reproduced(path, cores=cores, keep=kept))
 
 
 def diff(
@@ -62,24 +80,22 @@ def report(
     cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,
 ) -> None:
     """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
-    from apertura.atomic import replacement
     from apertura.campaign import Campaign
-    from apertura.paths import shipped
-    from apertura.steps.page import PAGE
+    from apertura.steps.page import PAGE, open_report
     from apertura.workflow import run_workflow
 
     campaign = campaign.absolute()
     status = run_workflow(campaign, cores, "all", "pages")
-    if status == 0:
-        opened = Campaign.load(leave_working_folder(campaign))
-        style = ["--report-stylesheet", str(shipped() / "workflow" / "report" / "report.css")]
-        with replacement(opened.result(PAGE)) as temporary:
-            status = run_workflow(campaign, 1, "all", "pages", "--report", str(temporary), *style, show="errors")
-            if status:
-                raise SystemExit(status)
-        for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
-            typer.echo(path)
-    raise SystemExit(status)
+    if status:
+        raise SystemExit(status)
+    opened = Campaign.load(leave_working_folder(campaign))
+    with open_report(opened) as (temporary, style):
+        asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
+        status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
+        if status:
+            raise SystemExit(status)
+    for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
+        typer.echo(path)
 
 
 def map_page(

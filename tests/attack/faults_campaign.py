@@ -39,6 +39,7 @@ STEPS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "map",
     "stac",
     "ro-crate",
 )
@@ -61,6 +62,7 @@ TARGETS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "map",
     "stac",
     "ro-crate",
 )

@@ -41,7 +41,7 @@ from apertura.simulation.specification import read_specification
 from apertura.steps.calibration import calibrated
 from apertura.store import manifest_of, read_manifest, record_files
 
-from . import beats, mutators, seeds
+from . import beats, mutators, products, seeds
 
 GRID = SceneGrid("EPSG:32632", 500030.0, 5400060.0, 2.0, (20, 20))
 FLIGHT = Flight("f01", "image", "uav1", seeds.NODES)
@@ -361,6 +361,13 @@ PARSERS: dict[str, Parser] = {
         lambda path: assessment_of(Campaign(_recorded(path).parents[2], None, (FLIGHT,)), "f01"),  # type: ignore[arg-type]
         _JSON_TREE,
         _JSON,
+    ),
+    "tag.json": Parser("tag.json", products.told, products.read_told, _JSON_TREE, _JSON),
+    "product.tif": Parser(
+        "slc.tif", products.rasters, products.read_product, (), f"{_TIFF} <GDALMetadata> <Item name="
+    ),
+    "product.png": Parser(
+        "quicklook.png", products.pictures, products.read_product, (), "\x89PNG IHDR IDAT tEXt zTXt iTXt iCCP IEND eXIf"
     ),
     "image.json": Parser(
         "results/f01/fused/image.json",

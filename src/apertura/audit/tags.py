@@ -1,12 +1,13 @@
 """What a file says of itself: the tags of a GeoTIFF or a PNG, which may be a stranger's."""
 
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from apertura.documents import undamaged
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, shown
 from apertura.scene.raster import opened_raster
 
 TAGGED = (".tif", ".png")
@@ -55,14 +56,19 @@ def _texts(path: Path) -> dict[Any, Any]:
 
 def picture(path: Path) -> Any:
     """Return a PNG with its pixels, a `PIL.Image.Image`; raises as `read_tags`."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path, formats=["PNG"]) as opened:
-            opened.load()  # texts may follow the pixels
-            return opened
-    except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise CampaignError(f"not readable as PNG ({error})", path, EXPECTED, COPY_AGAIN) from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a picture of more pixels than any of ours, before it is unpacked
+            with Image.open(path, formats=["PNG"]) as opened:
+                opened.load()  # texts may follow the pixels
+                return opened
+    except MemoryError:
+        raise
+    except Exception as error:  # a codec may raise anything
+        found = shown(str(error).replace(str(path), path.name), 200)
+        raise CampaignError(f"not readable as PNG ({found})", path, EXPECTED, COPY_AGAIN) from error
 
 
 def document(tags: Mapping[str, str], name: str, where: Path) -> dict[str, Any]:

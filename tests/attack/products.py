@@ -1,0 +1,60 @@
+"""Finished products as strangers may hand them out: tags and pictures that `apertura verify` and `diff` read."""
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from PIL import Image, PngImagePlugin
+from rasterio import Affine
+
+from apertura.audit.contents import sections_of
+from apertura.audit.tags import document, hashes, read_tags
+from apertura.export.cog import write_slc
+
+_TOLD = {"raw/f01/uav1.sigmf-data": "0f" * 32, "results/scene.manifest.json": "1e" * 32}
+_TAGS = {
+    "APERTURA_SOURCES": json.dumps(_TOLD),
+    "APERTURA_RUNSPEC": '{"window":"hann","nodes":{"uav1":{"lever":[0,1]}}}',
+    "APERTURA_VERSION": "0.1.0",
+}
+
+
+def told() -> list[bytes]:
+    """Return the text of a tag."""
+    return [_TAGS["APERTURA_SOURCES"].encode(), b"{}"]
+
+
+def rasters() -> list[bytes]:
+    """Return a small product."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "slc.tif"
+        place = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632"}
+        write_slc(path, np.full((4, 6), 1j, "c8"), tags=_TAGS, **place)
+        return [path.read_bytes()]
+
+
+def pictures() -> list[bytes]:
+    """Return a small picture with tags before its pixels, plain and compressed."""
+    found = []
+    for packed in (False, True):
+        texts = PngImagePlugin.PngInfo()
+        for name, text in _TAGS.items():
+            texts.add_text(name, text, zip=packed)
+        texts.add_itxt("Title", "flight f01", zip=packed)
+        with TemporaryDirectory() as folder:
+            Image.fromarray(np.arange(48, dtype="u1").reshape(4, 4, 3)).save(Path(folder) / "a.png", pnginfo=texts)
+            found.append((Path(folder) / "a.png").read_bytes())
+    return found
+
+
+def read_told(path: Path) -> Any:
+    """Return what a tag with the text of a file says."""
+    tags = {"APERTURA_SOURCES": path.read_bytes().decode("utf-8", "replace")}
+    return document(tags, "SOURCES", path), hashes(tags, "SOURCES", path)
+
+
+def read_product(path: Path) -> Any:
+    """Return what a product says of itself."""
+    return read_tags(path), sections_of(path)
