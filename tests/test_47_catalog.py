@@ -3,14 +3,12 @@
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from urllib.parse import unquote
 
 import pystac
 import pytest
 import rasterio
-from crate import validator
 from folders import contents, copy_writable
 from rasterio.warp import transform_bounds
 from rocrate.rocrate import ROCrate
@@ -240,23 +238,6 @@ def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
             job = job_of(name, kinds.get(name, ("flight", "pair")[: len(where)]))
             assert job.command == f"apertura {rules[job.rule]}"
     assert set(kinds) <= set(RESULTS)
-
-
-@pytest.mark.slow
-def test_roc_validator_passes_and_fails_with_one_file_changed(finished):
-    try:
-        validator.make_environment()
-    except (OSError, subprocess.CalledProcessError) as error:
-        pytest.skip(f"roc-validator cannot be installed here: {str(getattr(error, 'stderr', error))[-300:]}")
-    assert validator.issues(finished / "results") == []
-    edit(finished / "results/f01/uav1-uav1/db.tif")
-    (problem,) = validator.issues(finished / "results")
-    assert problem.endswith("f01/uav1-uav1/db.tif: is not the file that was made")
-    path = finished / "results" / CRATE
-    document = json.loads(path.read_text())
-    document["@graph"] = [one for one in document["@graph"] if one["@id"] != "workflow/Snakefile"]
-    path.write_text(json.dumps(document))
-    assert len(validator.issues(finished / "results")) > 1
 
 
 def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):

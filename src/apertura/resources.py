@@ -60,8 +60,8 @@ class Demand:
     ----------
     base_mb
         Resident memory whatever the work; what was measured on small work, and half as much again.
-    pulse_bytes, pixel_bytes, tile_bytes
-        Memory per pulse, per pixel in memory at once, and per tile to be formed.
+    pulse_bytes, pixel_bytes, tile_bytes, image_bytes
+        Memory per pulse, per pixel in memory at once, per tile to be formed, and per image that is described.
     profile_share
         Memory per byte of range profiles in memory at once.
     threads
@@ -78,6 +78,7 @@ class Demand:
     pulse_bytes: float = 0.0
     pixel_bytes: float = 0.0
     tile_bytes: float = 0.0
+    image_bytes: float = 0.0
     profile_share: float = 0.0
     threads: int = 1
     recorded_s: float = 0.0
@@ -116,8 +117,8 @@ DEMANDS: Mapping[str, Demand] = {
     "export": Demand(500, pixel_bytes=50, pixel_s=30),
     "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
     "mosaic": Demand(500),
-    "stac": Demand(500, pixel_s=0.5),
-    "ro_crate": Demand(2500),
+    "stac": Demand(400, image_bytes=200_000),
+    "ro_crate": Demand(350, image_bytes=1_000_000),
     "pictures": Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
     "page": Demand(500, pixel_s=5),
     "map": Demand(500, pixel_s=1),
@@ -241,7 +242,11 @@ class RuleResources:
         work, demand = self._work(wildcards), self.demand
         grows = demand.pulse_bytes * work.pulses
         grows += demand.pixel_bytes * min(work.pixels, _AT_ONCE_PIXELS)
-        grows += demand.tile_bytes * work.tiles + demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
+        grows += (
+            demand.image_bytes * work.images
+            + demand.tile_bytes * work.tiles
+            + demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
+        )
         return math.ceil(_BESIDE_MB + demand.base_mb + grows / 1e6) << attempt - 1
 
     def runtime(self, wildcards: Any, attempt: int) -> int:

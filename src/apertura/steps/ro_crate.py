@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from apertura.atomic import write_json, write_text
 from apertura.campaign import Campaign
 from apertura.catalog import CATALOG, CRATE
-from apertura.catalog.crate import Job, Listed, Run, crate_document
+from apertura.catalog.crate import crate_document
+from apertura.catalog.run import Job, Listed, Run
 from apertura.catalog.stac import RECORDED
 from apertura.digests import Result
 from apertura.documents import read_json, undamaged

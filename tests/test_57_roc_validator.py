@@ -1,0 +1,39 @@
+"""The crate of a finished campaign, as the community's validator judges it."""
+
+import json
+import subprocess
+
+import pytest
+from crate import validator
+from folders import copy_writable
+
+from apertura.catalog import CRATE
+
+
+@pytest.fixture
+def finished(finished_tiny, tmp_path):
+    """The tiny campaign with all its results, to be spoilt at will."""
+    return copy_writable(finished_tiny.root, tmp_path / "campaign")
+
+
+def edit(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.slow
+def test_roc_validator_passes_and_fails_with_one_file_changed(finished):
+    try:
+        validator.make_environment()
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"roc-validator cannot be installed here: {str(getattr(error, 'stderr', error))[-300:]}")
+    assert validator.issues(finished / "results") == []
+    edit(finished / "results/f01/uav1-uav1/db.tif")
+    (problem,) = validator.issues(finished / "results")
+    assert problem.endswith("f01/uav1-uav1/db.tif: is not the file that was made")
+    path = finished / "results" / CRATE
+    document = json.loads(path.read_text())
+    document["@graph"] = [one for one in document["@graph"] if one["@id"] != "workflow/Snakefile"]
+    path.write_text(json.dumps(document))
+    assert len(validator.issues(finished / "results")) > 1
