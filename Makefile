@@ -7,7 +7,7 @@ TESTS ?= tests src
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages docs test test-slow attack cluster-test lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages docs wheel test test-slow attack cluster-test crate-check lint format lock clean
 
 setup: $(SETUP)
 
@@ -60,6 +60,12 @@ docs: pages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/python -m website.check build/site
 
+# A wheel into dist/, tagged by the oldest glibc that its kernel runs on; on this machine's compiler.
+wheel: $(SETUP)
+	rm -rf build/wheel dist
+	$(BIN)/uv build --wheel --no-build-isolation --out-dir build/wheel .
+	$(BIN)/auditwheel repair --wheel-dir dist build/wheel/*.whl
+
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
 
@@ -78,6 +84,10 @@ attack: $(SETUP)
 cluster-test: $(SETUP)
 	$(BIN)/uv pip install --quiet --python $(BIN)/python snakemake-executor-plugin-slurm
 	$(BIN)/python -m tests.cluster
+
+# The crate of a finished campaign by roc-validator, in an environment of its own, and every file by its hash.
+crate-check: $(SETUP)
+	$(BIN)/python -m tests.crate $(or $(CAMPAIGN),$(error which campaign? make crate-check CAMPAIGN=folder))
 
 lint: $(SETUP)
 	$(BIN)/ruff check src tests benchmarks website
@@ -99,6 +109,8 @@ format: $(SETUP)
 lock: $(SETUP)
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
 	    pyproject.toml --group dev --output-file requirements/all.txt
+	echo roc-validator | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+	    --upgrade --no-annotate - --output-file requirements/roc.txt
 	echo uv | $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --upgrade \
 	    --no-annotate - --output-file requirements/uv.txt
 

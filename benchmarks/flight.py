@@ -58,7 +58,7 @@ def steps(root: Path) -> list[tuple[str, ...]]:
         step |= {"refined_track": "refine", "speed_accuracy": "", "whole": ""}
         if step.get(name, name):
             found.append((step.get(name, name), *where))
-    return [one if one[0] not in {"scene", "cube", "terrain", "coverage"} else one[:1] for one in found]
+    return [one if one[0] not in {"scene", "cube", "terrain", "coverage", "map"} else one[:1] for one in found]
 
 
 def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, object]:

@@ -43,8 +43,11 @@ from apertura.steps import (
     mosaic,
     profile,
     refine,
+    ro_crate,
     scene,
+    stac,
     terrain,
+    webmap,
 )
 from apertura.store import open_stage
 
@@ -111,6 +114,9 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
             export.export_fused(campaign, flight.name)
         coverage.coverage(campaign)
         mosaic.mosaic(campaign)
+        webmap.webmap(campaign)
+        stac.stac(campaign)
+        ro_crate.ro_crate(campaign)
     return campaign
 
 

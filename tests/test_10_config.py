@@ -10,6 +10,7 @@ import yaml
 from typer.main import get_command
 from typer.testing import CliRunner
 
+import apertura
 from apertura.cli import app
 from apertura.errors import CampaignError
 from apertura.settings import Processing, Settings, validated
@@ -69,7 +70,7 @@ def test_the_schema_accepts_the_template_and_refuses_a_misspelt_key():
         jsonschema.validate(document, json.loads(config_schema()))
 
 
-def test_environment_yml_asks_for_what_pyproject_asks():
+def test_environment_yml_asks_for_what_pyproject_asks_and_installs_this_version():
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -77,8 +78,9 @@ def test_environment_yml_asks_for_what_pyproject_asks():
     asked = {CONDA_NAMES.get(name, name): bound for name, bound in asked.items()} | {
         "python": project["requires-python"]
     }
-    conda = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
-    assert dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in conda) == asked
+    *conda, pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    assert dict(re.match(r"([\w.-]+)(.*)", d).groups() for d in conda) == asked | {"pip": ""}
+    assert pip == {"pip": [f"apertura=={apertura.__version__}"]}
 
 
 def test_every_requirement_is_locked_by_hash_and_no_registry_is_named():

@@ -84,7 +84,7 @@ def raised_in(path):
             holder = node.targets[0].value
             if (isinstance(holder, ast.Name) and holder.id in HOLDERS) or "flags" in ast.unparse(holder):
                 found |= names_of(node.targets[0].slice, constants)
-    return found
+    return {name for name in found if name == name.lower()}
 
 
 def known(name):

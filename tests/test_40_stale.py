@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 20 + 4 + 3
+    assert len(results) == 33
     for name, result in results:
         if name in ON_DEMAND:
             continue
@@ -169,6 +169,7 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
         ("f01/fused/image.json", "f01/fused/export"),
         ("f01/uav1-uav1/mask.tif", "f01/uav1-uav1/layers"),
         ("coverage.geojson", "coverage"),
+        ("map/map.json", "map/map"),
         ("scene.json", "scene"),
         ("f01/assessment.json", "f01/assessment"),
         ("cube.zarr/zarr.json", "cube"),
@@ -207,7 +208,7 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
     for path in finished.rglob("*.manifest.json"):
         path.unlink()
     campaign = Campaign.load(finished)
-    assert names(stale_results(campaign)) == {"export", "layers", "coverage"}
+    assert names(stale_results(campaign)) == {"export", "layers", "coverage", "map", "stac", "ro_crate"}
     with pytest.raises(CampaignError, match=r"export\.manifest\.json: no such file"):
         print_summary(campaign)
 

@@ -110,6 +110,9 @@ def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
     with rasterio.open(root / "results/pass1/radar-radar/slc.tif") as raster:
         image, crs = raster.read(1), raster.crs
     assert crs.to_wkt().startswith('LOCAL_CS["gotcha"')
+    shown = json.loads((root / "results/map/map.json").read_text())
+    assert shown["crs"] == {"name": "gotcha", "code": None, "local": True, "proj4": None, "control": []}
+    assert shown["coverage_url"] is None
     for x, y in ((-15.61, 21.61), (-27.79, 38.82)):
         row, column = int((50.0 - y) / 0.2), int((x + 40.0) / 0.2)
         window = np.abs(image[row - 8 : row + 9, column - 8 : column + 9])

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
-from folders import complaint, copy_writable, edit_config, run_steps
+from folders import ROOT, complaint, copy_writable, edit_config, run_steps
+from walked import walk
 
 from apertura.campaign import Campaign
 from apertura.interferometry.coherence import chance, coherence
@@ -171,3 +173,12 @@ def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
     said = complaint(lambda: cube.cube(Campaign.load(root)))
     assert "'view' missing" in said
     assert "Run the workflow again" in said
+
+
+def test_every_block_of_the_how_to_runs_and_prints_what_it_shows(campaign, tmp_path, monkeypatch):
+    copy_writable(campaign.root, tmp_path / "campaign")
+    monkeypatch.chdir(tmp_path)
+    walk(ROOT / "docs/howto/xarray.md")
+    with rasterio.open("phase.tif") as raster:
+        assert raster.crs.to_epsg() == 32632
+        assert tuple(raster.bounds) == pytest.approx(campaign.settings.scene.bounds_m, abs=1e-6)

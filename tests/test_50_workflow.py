@@ -72,9 +72,12 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
         "export_fused",
         "image",
         "layers",
+        "map",
         "mosaic",
         "profile",
         "refine",
+        "ro_crate",
+        "stac",
     }
 
 

@@ -31,6 +31,7 @@ app.command()(product_commands.score)
 app.command()(product_commands.verify)
 app.command()(product_commands.reproduce)
 app.command()(product_commands.diff)
+app.command()(product_commands.check_crate)
 app.command()(product_commands.report)
 app.command("map")(product_commands.map_page)
 

@@ -65,29 +65,37 @@ def diff(
     raise typer.Exit(print_differences(path, there))
 
 
+def check_crate(
+    folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
+) -> None:
+    """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
+    path = leave_working_folder(folder)
+    from apertura.audit.passed_on import print_checked
+
+    raise typer.Exit(print_checked(path))
+
+
 def report(
     campaign: Annotated[Path, typer.Argument(help="campaign folder")],
     cores: Annotated[int, typer.Option(min=1, help="cores to use")] = os.cpu_count() or 1,
 ) -> None:
     """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
-    from apertura.atomic import replacement
     from apertura.campaign import Campaign
-    from apertura.paths import shipped
-    from apertura.steps.page import PAGE
+    from apertura.steps.page import PAGE, open_report
     from apertura.workflow import run_workflow
 
     campaign = campaign.absolute()
     status = run_workflow(campaign, cores, "all", "pages")
-    if status == 0:
-        opened = Campaign.load(leave_working_folder(campaign))
-        style = ["--report-stylesheet", str(shipped() / "workflow" / "report" / "report.css")]
-        with replacement(opened.result(PAGE)) as temporary:
-            status = run_workflow(campaign, 1, "all", "pages", "--report", str(temporary), *style, show="errors")
-            if status:
-                raise SystemExit(status)
-        for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
-            typer.echo(path)
-    raise SystemExit(status)
+    if status:
+        raise SystemExit(status)
+    opened = Campaign.load(leave_working_folder(campaign))
+    with open_report(opened) as (temporary, style):
+        asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
+        status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
+        if status:
+            raise SystemExit(status)
+    for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
+        typer.echo(path)
 
 
 def map_page(

@@ -39,6 +39,9 @@ STEPS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "map",
+    "stac",
+    "ro-crate",
 )
 """Every command of a run in its order."""
 
@@ -59,6 +62,9 @@ TARGETS = (
     "export f01 fused",
     "coverage",
     "mosaic",
+    "map",
+    "stac",
+    "ro-crate",
 )
 """One command of every kind."""
 

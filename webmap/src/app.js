@@ -30,7 +30,12 @@ class Page {
     this.restore(permalink.read(location.hash));
     this.listen();
     if (data.coverage_url) this.chart.cover(data.coverage_url).catch((error) => notice(error.message));
-    else for (const name of ['tracks', 'footprints']) this.boxes[name].disabled = true;
+    else this.untracked();
+  }
+
+  /** Without a place on Earth, tracks are in no file that a map could read. */
+  untracked() {
+    for (const one of [this.boxes.tracks, this.boxes.footprints, byId('fit-tracks')]) one.disabled = true;
   }
 
   /** Words about the campaign that stay. */
@@ -38,7 +43,7 @@ class Page {
     const { campaign, crs } = this.data;
     document.title = `${campaign} · apertura map`;
     byId('campaign').textContent = campaign;
-    byId('crs').textContent = [crs.name, crs.code].filter(Boolean).join(' · ');
+    byId('crs').textContent = crs.local ? 'local axes, no place on Earth' : `${crs.name} · ${crs.code}`;
     const right = this.places.convergence();
     const north =
       right === null ? 'up is the local y axis' : `up is grid north; true north is ${number(Math.abs(right), 2)}° to the ${right < 0 ? 'left' : 'right'}`;
@@ -211,7 +216,9 @@ async function start() {
   const data = await answer.json();
   if (data.format !== FORMAT) throw new Error('map.json is of another version than this page: run the workflow again');
   const page = new Page(data);
-  page.chart.map.on('rendercomplete', () => document.documentElement.setAttribute('data-drawn', ''));
+  page.chart.map.on('rendercomplete', () => {
+    if (page.chart.drawn) document.documentElement.setAttribute('data-drawn', '');
+  });
 }
 
 start().catch((error) => notice(`No map: ${error.message}`));

@@ -94,10 +94,17 @@ export class Chart {
       projection: this.places.projection,
       transition: 0,
     });
-    source.on('change', () => source.getState() === 'error' && explain(layer));
+    source.on('change', () => {
+      if (source.getState() === 'error') explain(layer); // no value: one of false would keep the event from the layer
+    });
     const made = new TileLayer({ source, style: style(), zIndex });
     this.map.addLayer(made);
     return made;
+  }
+
+  /** Whether the raster's own file has been opened. */
+  get drawn() {
+    return !this.raster || this.raster.getSource()?.getState() === 'ready';
   }
 
   stretch(low, high) {

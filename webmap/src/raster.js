@@ -1,5 +1,6 @@
 // Values of one GeoTIFF at full resolution, read by ranges of bytes: what the readout, peaks and cuts tell.
 import { fromUrl } from 'geotiff';
+import { top } from './peak.js';
 
 const SAMPLES_AT_ONCE = 256;
 const MOST_SAMPLES = 4000;
@@ -46,10 +47,11 @@ export class Raster {
     return window ? window.at(row, column) : NaN;
   }
 
-  /** The highest pixel around a place, and its top between the pixels by a paraboloid through its neighbours. */
+  /** The highest pixel around a place, and its top between the pixels. */
   async peak(place, reach) {
     const [row, column] = this.places.pixelOf(place).map(Math.round);
-    const window = await this.window(row - reach - 1, column - reach - 1, row + reach + 2, column + reach + 2);
+    const wide = reach + 3; // of which `top` looks at the neighbours
+    const window = await this.window(row - wide, column - wide, row + wide + 1, column + wide + 1);
     if (!window) return null;
     let best = null;
     for (let y = row - reach; y <= row + reach; y++)
@@ -87,18 +89,6 @@ export class Raster {
       sample.value = window ? between(window.at, pixels[index]) : NaN;
     });
   }
-}
-
-/** Where a paraboloid through 3 × 3 dB is highest, down and right of the middle, pixels; cells lie askew: it is turned. */
-function top(at) {
-  const slope = [(at(1, 0) - at(-1, 0)) / 2, (at(0, 1) - at(0, -1)) / 2];
-  const bend = [at(1, 0) - 2 * at(0, 0) + at(-1, 0), at(0, 1) - 2 * at(0, 0) + at(0, -1)];
-  const twist = (at(1, 1) - at(1, -1) - at(-1, 1) + at(-1, -1)) / 4;
-  const determinant = bend[0] * bend[1] - twist * twist;
-  if (!(bend[0] < 0 && determinant > 0)) return [0, 0];
-  const down = (twist * slope[1] - bend[1] * slope[0]) / determinant;
-  const right = (twist * slope[0] - bend[0] * slope[1]) / determinant;
-  return Math.max(Math.abs(down), Math.abs(right)) <= 1 ? [down, right] : [0, 0];
 }
 
 const nearest = (at, [row, column]) => at(Math.round(row), Math.round(column));

@@ -8,9 +8,13 @@ export class Readout {
   constructor(chart, places, raster, mask, classes) {
     Object.assign(this, { chart, places, raster, mask, classes, asked: 0 });
     const { map } = chart;
-    map.on('pointermove', (event) => !event.dragging && this.at(event.coordinate));
+    map.on('pointermove', (event) => {
+      if (!event.dragging) this.at(event.coordinate);
+    });
     map.on('singleclick', (event) => this.at(event.coordinate));
-    map.getTargetElement().addEventListener('keydown', () => this.keyed = true);
+    map.getTargetElement().addEventListener('keydown', () => {
+      this.keyed = true;
+    });
     map.getTargetElement().addEventListener('pointermove', () => {
       this.keyed = false;
       byId('cross').hidden = true;

@@ -91,5 +91,24 @@ OF_IMAGES = {
         "bound of the error, and the accuracy asked, dB",
         "the error is not known to be below the accuracy asked, 95 % sure",
         "processing.accuracy_db, processing.engine", "imaging/certify.py, imaging/backproject.py"),
+    "interferogram_decorrelated": Flag(
+        "pixels more coherent than chance, of all that both images see; coherence, chance, and what geometry leaves",
+        "most pixels of two images have nothing in common: no phase, no height",
+        "distance of the tracks; what changed between the flights; focus of both images", "interferometry/flags.py"),
+    "height_insensitive": Flag(
+        "pixels where one turn of the phase is more height than the range, of all that both images see",
+        "tracks lie too close together for a height: there is none", "tracks further apart", "interferometry/flags.py"),
+    "height_ambiguous": Flag(
+        "pixels in parts apart, or jumps of the phase where nobody unwraps; height of one turn",
+        "heights are known up to multiples of the height of one turn, or left out where parts do not hang together",
+        "extra unwrap; tracks closer together; a wider interferometry.window_px", "interferometry/flags.py"),
+    "unwrapping_inconsistent": Flag(
+        "loops of four pixels around which the phase contradicts itself, of all; places that several pixels show",
+        "the phase changes by more than half a turn per pixel, or is noise: heights may err by whole turns",
+        "tracks closer together; a DEM; interferometry.window_px", "interferometry/flags.py"),
+    "height_relative": Flag(
+        "that no point of known height shows",
+        "a constant of the phase is not observable: heights count from the terrain, and an error of it changes over "
+        "the scene", "scene.reference_points", "interferometry/flags.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.flags.FLAGS`."""

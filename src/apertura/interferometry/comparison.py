@@ -15,7 +15,7 @@ from apertura.interferometry.level import Known, Level, level, levelled
 from apertura.interferometry.sensitivity import Sensitivity
 from apertura.interferometry.unwrapping import Unwrapped, unwrap
 
-LEAST_SPREAD = 2.0
+LEAST_SPREAD = 4.0
 """Looks that a window's energy must be spread over: else a point beside its middle is all that it tells."""
 
 Floats = NDArray[np.float64]

@@ -52,6 +52,9 @@ MOST_INCOHERENT = 0.5
 MOST_RESIDUES = 1e-3
 """Residues per loop of four pixels."""
 
+MOST_FOLDED = 0.01
+"""Share of the pixels told whose places several pixels show."""
+
 
 def raised(measured: Measured) -> dict[str, str]:
     """Return the limits that an interferogram exceeds: flag → what was measured.
@@ -84,7 +87,7 @@ def raised(measured: Measured) -> dict[str, str]:
         )
     if ambiguous:
         flags["height_ambiguous"] = "; ".join(ambiguous)
-    if one.residues > MOST_RESIDUES * one.loops or one.folded:
+    if one.residues > MOST_RESIDUES * one.loops or one.folded > MOST_FOLDED * one.told:
         folded = f"; {one.folded} places are shown by several pixels and left out" if one.folded else ""
         flags["unwrapping_inconsistent"] = (
             f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back to itself, "

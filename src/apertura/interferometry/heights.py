@@ -16,6 +16,7 @@ MARGIN = 1.4
 Floats = NDArray[np.float64]
 
 _STEPS = 30  # of the search for the pixel that shows a place
+_MOST_COVERED = 1.5  # twice is folded over
 _FOUND_PX = 0.05  # a pixel that shows the place so nearly is the one
 
 
@@ -128,15 +129,27 @@ def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) ->
         apart, shown = np.abs(target - shown).max(axis=0), target
         if not (apart > _FOUND_PX).any():
             break
-    folds = map_coordinates((_stretch(moved) <= 0).astype(np.float64), shown, order=0, mode="nearest") > 0
+    folds = _covered(place + moved, np.abs(_stretch(moved)) * known) > _MOST_COVERED
     found = (apart <= _FOUND_PX) & ~folds
     height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))
     folded = int(((apart > _FOUND_PX) | folds)[np.isfinite(height)].sum())
     return Placed(np.where(found, height, np.nan), np.where(found, std, np.nan), folded)
 
 
+def _covered(to: Floats, area: Floats) -> Floats:
+    """Return how often each place is shown: the mean over 3 × 3 of the areas of the pixels that show it."""
+    from scipy.ndimage import uniform_filter
+
+    inside = np.logical_and.reduce(
+        [(np.round(at) >= 0) & (np.round(at) < size) for at, size in zip(to, area.shape, strict=True)]
+    )
+    row, column = (np.round(at[inside]).astype(np.int64) for at in to)
+    cover = np.bincount(row * area.shape[1] + column, area[inside], minlength=area.size).reshape(area.shape)
+    return np.asarray(uniform_filter(cover, 3, mode="nearest"))
+
+
 def _stretch(moved: Floats) -> Floats:
-    """Return the area of ground that a pixel shows, in pixels: none or less where it is folded over."""
+    """Return the area of ground that a pixel shows, in pixels: negative where it is folded over."""
     size = moved.shape[1:]
     rows, columns = (
         [np.gradient(one, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)] for one in moved

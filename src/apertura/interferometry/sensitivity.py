@@ -34,7 +34,7 @@ class Sensitivity:
 
     Notes
     -----
-    Source: docs/theory/interferometry.md, eqs. 9 to 14.
+    Source: docs/theory/interferometry.md, eqs. 9 to 11 and 14.
     """
 
     slope: Floats

@@ -14,7 +14,17 @@ from apertura.paths import shipped
 from apertura.provenance import sha256_tree
 from apertura.settings import CLOCKS, CONFIG, FLIGHTS, SEGMENTS, SampledWaveform
 
-__all__ = ["INTERFEROMETRY", "ON_DEMAND", "RESULTS", "STUDY", "charted", "on_demand", "result_of", "results_of"]
+__all__ = [
+    "INTERFEROMETRY",
+    "ON_DEMAND",
+    "RESULTS",
+    "STUDY",
+    "charted",
+    "on_demand",
+    "places_of",
+    "result_of",
+    "results_of",
+]
 
 ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
@@ -50,8 +60,14 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
 
 def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
     """Yield every result of a campaign with its key of `RESULTS`, each after those it is made from."""
+    for result, _, made in places_of(campaign):
+        yield result, made
+
+
+def places_of(campaign: Campaign) -> Iterator[tuple[str, tuple[str, ...], Result]]:
+    """Yield every result as `results_of` does, with what it is of, as `result_of` takes it."""
     for result, *where in _order(campaign):
-        yield result, result_of(campaign, result, *where)
+        yield result, tuple(where), result_of(campaign, result, *where)
 
 
 def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:

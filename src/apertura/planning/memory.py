@@ -20,7 +20,7 @@ _READ_BYTES = 3  # per byte of a block while it is read: as stored, as decoded, 
 _SUM_BYTES = 8  # per pixel of the sum of pulse blocks
 _CHECKED_PULSES, _CHECKED_BYTES = 1024, 40  # read at once for certificate and focus; bytes per subcarrier of one
 _LEAST_PULSES = 64  # of a block: the kernel sums that many at a time
-_PRODUCT_BYTES = 60  # per pixel: image, its part of the cube, three rasters with overviews, before compression
+_PRODUCT_BYTES = 76  # per pixel: image, its part of the cube, three rasters with overviews, before compression
 
 
 def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, asked: int | None = None) -> int:

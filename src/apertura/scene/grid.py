@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
-from apertura.scene.map_crs import check_crs, grid_mapping
+from apertura.scene.map_crs import axis_attributes, check_crs, grid_mapping
 from apertura.scene.pixel_positions import BLOCK_PX, block
 
 Floats = NDArray[np.float64]
@@ -98,11 +98,8 @@ class SceneGrid:
         """Coordinates y, x and spatial_ref of an xarray raster on this grid, as CF wants them."""
         step, _, west, _, _, north = self.transform
         reference = {**grid_mapping(self.crs_wkt), "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
-        axes = {
-            side: {"units": "m", "axis": side.upper(), "standard_name": f"projection_{side}_coordinate"}
-            for side in "yx"
-        }
-        return {"y": ("y", self.y_m, axes["y"]), "x": ("x", self.x_m, axes["x"]), "spatial_ref": ((), 0, reference)}
+        y, x = (axis_attributes(side, projected=self.crs != LOCAL) for side in "yx")
+        return {"y": ("y", self.y_m, y), "x": ("x", self.x_m, x), "spatial_ref": ((), 0, reference)}
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:

@@ -30,6 +30,18 @@ def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
     return {**CRS(crs_wkt).to_cf(), "crs_wkt": crs_wkt}
 
 
+def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
+    """Return the attributes of coordinate 'x' or 'y' of a raster, as CF names them.
+
+    Examples
+    --------
+    >>> axis_attributes("x", projected=False)
+    {'units': 'm', 'axis': 'X', 'long_name': 'easting'}
+    """
+    standard = {"standard_name": f"projection_{side}_coordinate"} if projected else {}
+    return {"units": "m", "axis": side.upper(), "long_name": {"x": "easting", "y": "northing"}[side], **standard}
+
+
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
 

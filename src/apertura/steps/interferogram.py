@@ -5,6 +5,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rasterio import Affine
 
 from apertura.atomic import write_json
@@ -70,6 +71,9 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
 def _report(found: Compared, two: TwoImages) -> dict[str, Any]:
     """Return what interferogram.json says."""
     flagged = {name: stage.attrs["flags"] for name, stage in zip(two.names, two.images, strict=True)}
+    stds = found.panels["height_std"]
+    there = stds[np.isfinite(stds)]
+    std_m = round(float(np.median(there)), 4) if there.size else None
     measured = {key: round(one, 4) if isinstance(one, float) else one for key, one in asdict(found.measured).items()}
     return {
         "images": list(two.names),
@@ -77,8 +81,21 @@ def _report(found: Compared, two: TwoImages) -> dict[str, Any]:
         "looks": round(found.looks, 3) if isfinite(found.looks) else None,
         "measured": measured,
         "level": None if found.level is None else {**asdict(found.level), "says": _says(found.level)},
+        "height_std_m": std_m,
+        "says": _told(found, std_m),
         "flags": raised(found.measured),
     }
+
+
+def _told(found: Compared, std_m: float | None) -> str:
+    """Return what came of it, in one line."""
+    coherence = f"coherence {found.measured.coherence:.2f}, {found.measured.chance:.2f} by chance"
+    if found.level is None or std_m is None:
+        return f"{coherence}; no heights"
+    return (
+        f"{coherence}; heights to {std_m:.2g} m, {found.measured.ambiguity_m:.3g} m for a turn of the phase; "
+        f"{_says(found.level)}"
+    )
 
 
 def _says(level: Level) -> str:

@@ -1,6 +1,5 @@
 """Which job of the workflow makes a result: its rule, and the command that a person can paste."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 _OTHERWISE = {
@@ -22,21 +21,21 @@ class RuleRun(NamedTuple):
     command: str
 
 
-def job_of(result: str, manifest: str) -> RuleRun:
+def job_of(result: str, where: tuple[str, ...]) -> RuleRun:
     """Return the job that makes a result.
 
     Parameters
     ----------
     result
         A key of `apertura.lineage.RESULTS`.
-    manifest
-        Its manifest, relative to the campaign folder.
+    where
+        What it is of, as `apertura.lineage.result_of` takes it.
 
     Examples
     --------
-    >>> job_of("raw", "results/f01/uav1/raw.manifest.json")
+    >>> job_of("raw", ("f01", "uav1"))
     RuleRun(rule='ingest', where=('f01', 'uav1'), command='apertura step ingest f01 uav1')
     """
     rule, step = _OTHERWISE.get(result, (result, result.replace("_", "-")))
-    where: Sequence[str] = manifest.split("/")[1:-1]
-    return RuleRun(rule, tuple(where), " ".join(["apertura step", step, *where]))
+    asked = (*where, "fused") if result == "fused" else where
+    return RuleRun(rule, where, " ".join(["apertura step", step, *asked]))

@@ -1,13 +1,15 @@
 """Rule `page`: what the report says of a flight, as the results section of a paper would: one file that prints."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rasterio.enums import Resampling
 
-from apertura.atomic import write_text
+from apertura.atomic import replacement, write_text
 from apertura.campaign import Campaign
+from apertura.digests import Result
 from apertura.documents import undamaged
 from apertura.errors import CampaignError, shown
 from apertura.lineage import result_of
@@ -186,3 +188,24 @@ def landing(campaign: Campaign) -> dict[str, Any]:
         "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
         "flags": rst_table(FLAGGED, raised) if raised else "",
     }
+
+
+@contextmanager
+def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
+    """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
+
+    Raises
+    ------
+    CampaignError
+        If results/report.html is there and is not as it was written: it is somebody's own, and is not overwritten.
+    """
+    path, manifest = campaign.result(PAGE), campaign.result("report.manifest.json")
+    known = read_manifest(manifest)["files"].get(PAGE) if manifest.is_file() else None
+    if path.exists() and known != sha256_file(path):
+        raise CampaignError("not as it was written", path, "no file, or the report as it was", "Move it away.")
+    pages = tuple(campaign.manifest("page", flight.name) for flight in campaign.image_flights)
+    made_from = Result(campaign.relative(manifest), (*pages, campaign.manifest("coverage")), campaign.values)
+    lineage = made_from.begin(campaign.root, [__name__])
+    with replacement(path) as temporary:
+        yield temporary, shipped() / "workflow" / "report" / "report.css"
+    record_files(manifest, [path], lineage)

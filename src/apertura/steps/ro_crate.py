@@ -13,7 +13,7 @@ from apertura.catalog.stac import RECORDED
 from apertura.digests import Result
 from apertura.documents import read_json, undamaged
 from apertura.environment import lock_sha256, software
-from apertura.lineage import on_demand, result_of, results_of
+from apertura.lineage import on_demand, places_of, result_of
 from apertura.paths import inside, shipped
 from apertura.provenance import sha256_text
 from apertura.steps.code import code_of
@@ -57,19 +57,20 @@ class _Made(NamedTuple):
     """A result, and what its manifest says."""
 
     name: str
+    where: tuple[str, ...]
     result: Result
     recorded: Mapping[str, Any]
 
 
 def _results(campaign: Campaign) -> Iterator[_Made]:
     """Yield every result that the crate tells of."""
-    for name, result in results_of(campaign):
+    for name, where, result in places_of(campaign):
         if name != "ro_crate" and not on_demand(result.manifest):
             path = campaign.root / result.manifest
             recorded, expected = read_manifest(path), "a manifest that says what a result was made from"
             with undamaged(path, expected=expected, remedy=f"Delete {path} and run the workflow again."):
                 told = {key: str(recorded[key]) for key in ("code", "settings")}
-                yield _Made(name, result, {**recorded, **told, "sources": dict(recorded["sources"])})
+                yield _Made(name, where, result, {**recorded, **told, "sources": dict(recorded["sources"])})
 
 
 def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[Job]:
@@ -86,7 +87,7 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
     """
     code, jobs = cache(code_of), dict[RuleRun, list[_Made]]()
     for one in made:
-        jobs.setdefault(job_of(one.name, one.result.manifest), []).append(one)
+        jobs.setdefault(job_of(one.name, one.where), []).append(one)
     for job, parts in jobs.items():
         doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, code(one.name), known)]
         yield Job(

@@ -54,12 +54,13 @@ class _Described:
         """Return what the catalog says of each flight: every pair, then every sum."""
         images = []
         for flight in self.campaign.image_flights:
-            pairs = [self._pair(flight.name, pair) for pair in flight.pairs]
-            looks = np.sum([few_looks(self.campaign, flight.name, pair) for pair in flight.pairs], axis=0)
-            images += pairs + [self._sum(flight.name, name, pairs, looks) for name in _SUMS]
+            looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
+            pairs = [self._pair(flight.name, pair, looks[pair]) for pair in flight.pairs]
+            together = np.sum(list(looks.values()), axis=0)
+            images += pairs + [self._sum(flight.name, name, pairs, together) for name in _SUMS]
         return images
 
-    def _pair(self, flight: str, pair: str) -> Image:
+    def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
         mode = "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"
         told = {"sar:instrument_mode": mode, "sar:product_type": "SLC", "sar:looks_range": 1, "sar:looks_azimuth": 1}
@@ -67,7 +68,7 @@ class _Described:
             flight,
             pair,
             f"{self.campaign.settings.campaign} · flight {flight} · {pair}",
-            self._footprint(few_looks(self.campaign, flight, pair)),
+            self._footprint(looks),
             self._acquisition(flight, pair),
             {**told, **self._properties(flight, pair)},
             *self._assets(files),
@@ -117,11 +118,15 @@ class _Described:
             return {
                 **self._shared,
                 **(_resolution(report.get("brightest") or {}) if verdict == "focused" else {}),
-                "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {lock_sha256()}",
+                "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {self._lock}",
                 "apertura:verdict": verdict,
                 "apertura:flags": sorted(report["flags"]),
                 "apertura:numerical_error_db": float(report["numerical_error_db"]),
             }
+
+    @cached_property
+    def _lock(self) -> str:
+        return lock_sha256()
 
     @cached_property
     def _shared(self) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """`apertura summary`: what every image of a finished campaign says of itself, its flags explained, and what to open."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -7,6 +8,7 @@ from apertura.campaign import Campaign
 from apertura.documents import undamaged
 from apertura.errors import shown
 from apertura.flags import FLAGS
+from apertura.lineage import INTERFEROMETRY
 from apertura.store import open_listed
 
 if TYPE_CHECKING:
@@ -51,7 +53,10 @@ def print_summary(campaign: Campaign) -> None:
     silent = dict.fromkeys(cause for report in reports.values() for cause in _silent(report))
     if silent:
         console.print(f"not stated, so not in the budget; image.json tells what they would do: {', '.join(silent)}")
-    _print_flags(console, reports)
+    compared = dict(_interferograms(campaign))
+    for (_, name), report in compared.items():
+        console.print(f"interferogram {name}: {report['says']}", soft_wrap=True)
+    _print_flags(console, {**reports, **compared})
     print_products(campaign)
 
 
@@ -64,8 +69,14 @@ def print_products(campaign: Campaign) -> None:
             path = campaign.result(flight.name, "fused", name)
             if path.is_file():
                 print(f"  {campaign.relative(path)}  {why}")
+    for name in campaign.settings.interferometry.pairs:
+        path = campaign.result(INTERFEROMETRY, name, "height.tif")
+        if path.is_file():
+            print(f"  {campaign.relative(path)}  in a GIS, with its deviation beside it")
     if len(flights) > _MOST_FLIGHTS:
         print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
+    if campaign.result("map", "index.html").is_file():
+        print(f"  all of them on a map: apertura map {shlex.quote(str(campaign.root))}")
 
 
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
@@ -79,6 +90,17 @@ def _report(campaign: Campaign, flight: str, name: str) -> dict[str, Any]:
     with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
         flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
         return {**report, "flags": flags, "numerical_error_db": float(report["numerical_error_db"])}
+
+
+def _interferograms(campaign: Campaign) -> Iterator[tuple[tuple[str, str], dict[str, Any]]]:
+    """Yield what each interferogram that is there says of itself."""
+    for name in campaign.settings.interferometry.pairs:
+        path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
+        if path.is_file():
+            report = open_listed(path, path.with_name("interferogram.manifest.json"))
+            with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
+                flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
+                yield (INTERFEROMETRY, name), {"says": shown(report["says"], 400), "flags": flags}
 
 
 def _print_flags(console: "Console", reports: Reports) -> None:

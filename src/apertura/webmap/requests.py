@@ -45,7 +45,7 @@ def asked_file(target: str) -> tuple[str, str | None]:
     (('f01/a-b/db.tif', '0f'), ('', None), ('', None))
     """
     try:
-        if not target.startswith("/") or target.startswith("//"):
+        if not target.startswith("/"):
             return "", None
         split = urlsplit(target)
         name = unquote(split.path[1:], errors="strict")

@@ -1,0 +1,1 @@
+"""roc-validator on a finished campaign: `python -m tests.crate CAMPAIGN`."""

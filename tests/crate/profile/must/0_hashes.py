@@ -1,0 +1,31 @@
+"""A requirement for roc-validator: every file of the crate has a sha256, and is what it says."""
+
+import hashlib
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from rocrate_validator.models import ValidationContext
+from rocrate_validator.requirements.python import PyFunctionCheck, check, requirement
+
+
+@requirement(name="Hashes of files")
+class Hashes(PyFunctionCheck):
+    """Every file of the crate MUST have a sha256, which is that of its bytes."""
+
+    @check(name="Hashes of files")
+    def check_hashes(self, context: ValidationContext) -> bool:
+        """Compare every file with its hash."""
+        root, good = Path(unquote(urlsplit(str(context.ro_crate.uri)).path)), True
+        for entity in context.ro_crate.metadata.get_file_entities():
+            stated = entity.get_property("sha256")
+            path = root / unquote(entity.id)
+            if stated is None:
+                context.result.add_issue(f"{entity.id}: states no sha256", self)
+            elif not path.is_file():
+                context.result.add_issue(f"{entity.id}: is not there", self)
+            elif hashlib.sha256(path.read_bytes()).hexdigest() != stated:
+                context.result.add_issue(f"{entity.id}: is not the file that was made", self)
+            else:
+                continue
+            good = False
+        return good

@@ -1,0 +1,162 @@
+"""Pictures and words of the report say what was measured, whatever the names, and the same to the byte."""
+
+import io
+
+import numpy as np
+import pytest
+from docutils.core import publish_parts
+from matplotlib.image import imread
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.report.budget import Measured, draw_budget
+from apertura.report.cuts import DrawnCut, draw_cuts
+from apertura.report.geometry import FlownGeometry, draw_geometry
+from apertura.report.landing import rst_table, rst_text
+from apertura.report.page import Heading, Paragraph, Picture, Table, page
+from apertura.report.panels import draw_panels
+from apertura.report.phase import draw_phase, sidelink_error_rad, steadiness
+from apertura.report.pulses import PulseRecord, draw_pulses
+from apertura.report.waterfall import Waterfall, draw_waterfall
+
+HOSTILE = """`a <javascript:alert(1)>`_ |b| *c* {{ 7 * 7 }} <script>alert("1")</script> $\\frac{x$ ../../etc &amp; it's
+.. raw:: html
+
+   <img src=x onerror=alert(1)>
+"""
+TAGS = {"APERTURA_VERSION": "0", "hostile": HOSTILE}
+SHARED = {"title": "flight f01, a-b", "tags": TAGS}
+TIME_S = np.arange(200) / 20.0
+
+
+def geometry(path):
+    track = np.stack([691500 + TIME_S, np.full(200, 5333000.0), 650 + np.sin(TIME_S)], -1)
+    receiver = track + [3.0, 2.0, 1.0]
+    scene = 691500.0, 5333010.0, 691520.0, 5333030.0
+    ring = np.array([[691501.0, 5333012.0], [691515, 5333012], [691515, 5333028], [691501.0, 5333012.0]])
+    target = np.array([691510.0, 5333020.0, 620.0])
+    tracks = {"transmitter": track, "receiver": receiver}
+    draw_geometry(path, FlownGeometry(TIME_S, tracks, scene, 620.0, target, [ring], "WGS 84 / UTM zone 32N"), **SHARED)
+
+
+def pulses(path):
+    kept = np.arange(200) % 17 != 0
+    snr = np.where(np.arange(200) == 5, np.nan, 20 + np.sin(TIME_S))[kept]
+    reasons = {"unpaired": 9, "sidelink_lost": 2, "time_tag_outlier": 1}
+    draw_pulses(path, PulseRecord(TIME_S, kept, reasons, TIME_S[kept], snr, snr), **SHARED)
+
+
+def phase(path):
+    turns = np.random.default_rng(1).normal(size=200)
+    phasors = {"before": np.exp(9j * turns), "after": np.exp(0.1j * turns), "refined": np.ones(200, complex)}
+    draw_phase(path, TIME_S, phasors, **SHARED)
+
+
+def cuts(path):
+    along = np.linspace(-1.5, 1.5, 601)
+    cut = DrawnCut("cross-range", along, np.sinc(along / 0.2) ** 2, 0.177, -13.3, -10.0)
+    draw_cuts(path, [cut, DrawnCut("ground range", along, np.ones(601), np.nan, np.nan, np.nan)], **SHARED)
+
+
+def waterfall(path):
+    falling = Waterfall(np.linspace(100, 120, 200), 0.4, 60)
+    falling.add(0, np.ones((200, 60), np.complex64))
+    draw_waterfall(path, falling, TIME_S, np.linspace(110, 130, 200), **SHARED)
+
+
+def panels(path):
+    power = np.outer(np.hanning(60), np.hanning(90)) ** 8
+    powers = {
+        "uav1-uav1": power,
+        "uav1-uav2": power,
+        "coherent sum": power,
+        "noncoherent sum": np.full((60, 90), np.nan),
+    }
+    draw_panels(path, powers, size_m=(9.0, 6.0), target_m=(4.5, 3.0), **SHARED)
+
+
+def budget(path):
+    lines = [
+        {"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1},
+        {
+            "cause": "between epochs",
+            "stated": "not stated; 1 m would do this",
+            "loss_db": -3.0,
+            "shift_m": 5.0,
+            "phase_rad": None,
+        },
+        {"cause": "clock", "stated": "0", "loss_db": 0.0, "shift_m": 0.0, "phase_rad": 0.0},
+    ]
+    draw_budget(path, lines, Measured(-0.3, 0.1, -0.2), **SHARED)
+
+
+DRAWN = (geometry, pulses, phase, cuts, waterfall, panels, budget)
+
+
+@pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
+def test_a_picture_is_as_wide_as_a_page_clips_nothing_and_is_the_same_every_time(draw, tmp_path):
+    draw(tmp_path / "one.png")
+    draw(tmp_path / "two.png")
+    data = (tmp_path / "one.png").read_bytes()
+    assert data == (tmp_path / "two.png").read_bytes()
+    drawn = imread(io.BytesIO(data), format="png")[..., :3]
+    assert drawn.shape[1] / 220 == pytest.approx(6.7, abs=0.01)  # inches between the margins of A4
+    edge = np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]])
+    assert (edge == 1).all()  # what leaves the sheet would colour its edge
+    assert (drawn < 0.5).any()
+
+
+def test_the_sidelink_takes_out_what_clocks_and_triggers_put_in():
+    generator, wavenumber = np.random.default_rng(3), 2 * np.pi * 1.3e9 / SPEED_OF_LIGHT_M_S
+    turned, length_m = generator.uniform(-np.pi, np.pi, 500), 8 + generator.normal(size=500)
+    sidelink = np.angle(np.exp(1j * (turned - wavenumber * length_m)))
+    corrected = np.full(500, 2 - 1j)
+    error = sidelink_error_rad(sidelink, length_m, wavenumber_rad_m=wavenumber)
+    before = corrected * np.exp(1j * error)
+    np.testing.assert_allclose(before, corrected * np.exp(1j * turned), atol=1e-9)
+    assert steadiness(corrected) == pytest.approx((0.0, 1.0), abs=1e-6)
+    assert steadiness(before)[0] > 1.5
+    assert steadiness(before)[1] < 0.15
+
+
+def test_a_waterfall_shows_a_path_where_it_is_however_profiles_begin():
+    start = np.random.default_rng(5).uniform(50, 58, 90)
+    falling = Waterfall(start, 0.5, 100)
+    at = (start[:, None] + 0.5 * np.arange(100) - 80.0) / 0.5  # samples from a path of 80 m
+    for first in range(0, 90, 32):
+        falling.add(first, np.sinc(at[first : first + 32] / 2).astype(np.complex64))
+    low, high = falling.span_m
+    rows, columns = falling.mean.shape
+    centres = low + (np.arange(rows) + 0.5) * (high - low) / rows
+    brightest = centres[np.nanargmax(falling.mean, axis=0)]
+    assert columns == 90
+    assert np.abs(brightest - 80.0).max() < 0.8
+
+
+def test_a_long_flight_becomes_a_small_waterfall_of_the_same_mean_power():
+    start = np.full(3000, 10.0)
+    falling = Waterfall(start, 0.1, 2000)
+    for first in range(0, 3000, 500):
+        falling.add(first, np.full((500, 2000), 3.0, np.complex64))
+    assert falling.mean.shape == (667, 500)
+    np.testing.assert_allclose(falling.mean[:-1], 9.0)
+
+
+def test_text_of_strangers_stays_text_on_the_page():
+    blocks = [Heading(1, HOSTILE), Paragraph(HOSTILE), Table(HOSTILE, [HOSTILE], [[HOSTILE]]), Picture(b"png", HOSTILE)]
+    html = page(HOSTILE, blocks)
+    assert html.count("<script") == html.count("onerror=alert(1)>") == 0
+    assert html.count("<img") == html.count("<table>") == html.count("<h1>") == 1
+    assert "default-src 'none'" in html
+    assert 'alt="Figure 1. `a &lt;javascript' in html
+    assert "&amp;amp; it&#x27;s" in html
+
+
+def test_text_of_strangers_stays_text_on_the_landing_page():
+    text = f"{rst_text(HOSTILE)}\n\n{rst_table([HOSTILE], [[HOSTILE], ['']])}"
+    body = publish_parts(text, writer="html")["body"]
+    assert "<script" not in body
+    assert "<img" not in body
+    assert "<a " not in body
+    assert "system-message" not in body
+    assert body.count("{{ 7 * 7 }}") == 3
+    assert body.count(".. raw:: html &lt;img src=x onerror=alert(1)&gt;") == 3

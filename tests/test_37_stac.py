@@ -1,0 +1,199 @@
+"""Images as STAC items: valid by the shipped schemas, and refused by each where it is broken."""
+
+import json
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pystac
+import pytest
+from pyproj import CRS
+from rasterio import Affine
+
+from apertura.catalog import CATALOG
+from apertura.catalog.assets import asset_of, told_by
+from apertura.catalog.fields import EXTENSIONS, Acquisition, projection
+from apertura.catalog.stac import Image, catalog_files, instant, item_of
+from apertura.catalog.validation import document_problem, stac_problems
+from apertura.errors import CampaignError
+from apertura.export.cog import write_slc
+
+START = datetime(2025, 5, 14, 9, 30, tzinfo=UTC)
+FLOWN = Acquisition(START, START + timedelta(seconds=15), 1.4e9, 4e8)
+SQUARE = {"type": "Polygon", "coordinates": [[[9, 48], [9.1, 48], [9.1, 48.1], [9, 48.1], [9, 48]]]}
+PLACE = Affine(0.5, 0, 500000, 0, -0.5, 100)
+WKT = CRS("EPSG:32632").to_wkt()
+DIGEST = "ab" * 32
+HOSTILE = '<script>alert("x")</script> ../../etc \u202e\n"}'
+
+
+def told():
+    return {
+        **projection(WKT, (4, 6), PLACE[:6]),
+        "sar:instrument_mode": "bistatic",
+        "sar:product_type": "SLC",
+        "processing:level": "L1",
+        "processing:lineage": "apertura step export f01 a-b",
+        "processing:software": {"apertura": "1", "python": "3", "gdal": "3", "proj": "9"},
+    }
+
+
+@pytest.fixture(scope="module")
+def slc(tmp_path_factory):
+    path = tmp_path_factory.mktemp("slc") / "slc.tif"
+    tags = {"APERTURA_INPUTS": json.dumps({"raw/codes.npy": DIGEST})}
+    write_slc(path, np.ones((4, 6), "c8"), transform=PLACE, crs=WKT, tags=tags, title="a")
+    return path
+
+
+def image(slc, name="a-b", **changes):
+    asset = asset_of(slc, f"../../../f01/{name}/slc.tif", sha256=DIGEST, told=told_by(slc))
+    inputs = {"raw/codes.npy": DIGEST}
+    return Image(**{
+        "flight": "f01", "name": name, "title": "a scene", "geometry": SQUARE, "acquisition": FLOWN,
+        "properties": told(), "assets": {"slc": asset}, "inputs": inputs, **changes,
+    })  # fmt: skip
+
+
+def item(slc, **changes):
+    return item_of(image(slc, **changes), "../../../..").to_dict()
+
+
+def test_a_raster_says_its_bands_and_inputs(slc):
+    found = told_by(slc)
+    assert found.bands == [
+        {"data_type": "cfloat32", "sampling": "area", "spatial_resolution": 0.5, "nodata": "nan", "unit": "1"}
+    ]
+    assert found.inputs == {"raw/codes.npy": DIGEST}
+
+
+def test_a_file_that_is_no_geotiff_is_one_message(tmp_path):
+    path = tmp_path / "db.tif"
+    path.write_text("no raster")
+    with pytest.raises(CampaignError, match=r"db\.tif: cannot be read as GeoTIFF; expected a GeoTIFF of the workflow"):
+        told_by(path)
+
+
+def test_an_item_declares_and_keeps_every_extension(slc):
+    document = item(slc)
+    assert sorted(document["stac_extensions"]) == sorted(EXTENSIONS.values())
+    assert document_problem(document) is None
+
+
+BROKEN = {
+    "sar: band of no letter": lambda found: found["properties"].update({"sar:frequency_band": "Q"}),
+    "sar: no mode": lambda found: found["properties"].pop("sar:instrument_mode"),
+    "projection: half a shape": lambda found: found["properties"].update({"proj:shape": [4]}),
+    "projection: no transform": lambda found: found["properties"].pop("proj:transform"),
+    "processing: no lineage": lambda found: found["properties"].pop("processing:lineage"),
+    "processing: unnamed GDAL": lambda found: found["properties"]["processing:software"].pop("gdal"),
+    "file: sha256 of 31 bytes": lambda found: found["assets"]["slc"].update({"file:checksum": "1220" + "ab" * 31}),
+    "file: no size": lambda found: found["assets"]["slc"].pop("file:size"),
+    "file: input by md5": lambda found: found["links"][0].update({"file:checksum": "d50110" + "ab" * 16}),
+    "raster: no bands": lambda found: found["assets"]["slc"].pop("raster:bands"),
+    "raster: type of no name": lambda found: found["assets"]["slc"]["raster:bands"][0].update({"data_type": "complex"}),
+    "core: no geometry": lambda found: found.pop("geometry"),
+    "core: place without footprint": lambda found: found.update({"geometry": None}),
+    "core: no time": lambda found: found["properties"].update({"datetime": "yesterday"}),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_item_is_refused(slc, name):
+    document = item(slc)
+    BROKEN[name](document)
+    assert document_problem(document)
+
+
+def test_an_extension_without_a_schema_here_is_not_believed(slc):
+    document = item(slc)
+    document["stac_extensions"].append("https://example.com/schema.json")
+    assert document_problem(document) == "no schema of https://example.com/schema.json here"
+
+
+def written(folder, images, campaign="tandem"):
+    for name, document in catalog_files(campaign, images).items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(document))
+    return folder
+
+
+def test_pystac_finds_every_item_and_file_from_the_catalog_down(slc, tmp_path):
+    sums = image(slc, "coherent", made_from=["a-b"])
+    folder = written(tmp_path / "results" / "stac", [sums, image(slc)])
+    assert stac_problems(folder) == []
+    catalog = pystac.Catalog.from_file(folder / CATALOG)
+    items = {one.id: one for one in catalog.get_items(recursive=True)}
+    assert sorted(items) == ["f01-a-b", "f01-coherent"]
+    assert items["f01-a-b"].assets["slc"].get_absolute_href() == str(tmp_path / "results/f01/a-b/slc.tif")
+    links = [link for link in items["f01-coherent"].links if link.rel == "derived_from"]
+    assert links[0].get_absolute_href() == str(tmp_path / "raw" / "codes.npy")
+    assert links[0].extra_fields["file:checksum"] == "1220" + DIGEST
+    assert links[1].get_absolute_href() == items["f01-a-b"].self_href
+
+
+def test_links_are_relative_and_no_file_names_itself(slc, tmp_path):
+    files = catalog_files("tandem", [image(slc)])
+    hrefs = [link["href"] for document in files.values() for link in document["links"]]
+    assert all(href.startswith(".") for href in hrefs)
+    assert not [link for document in files.values() for link in document["links"] if link["rel"] == "self"]
+
+
+def test_a_catalog_of_which_an_item_is_gone_or_edited_is_wrong(slc, tmp_path):
+    folder = written(tmp_path, [image(slc), image(slc, "coherent")])
+    (folder / "images/f01/a-b.json").unlink()
+    path = folder / "images/f01/coherent.json"
+    path.write_text(path.read_text().replace('"sar:frequency_band": "L"', '"sar:frequency_band": "l"'))
+    problems = sorted(stac_problems(folder))
+    assert problems[0] == "images/f01/a-b.json: no such file"
+    assert problems[1].startswith("images/f01/coherent.json: properties/sar:frequency_band: 'l' is not one of")
+
+
+def test_a_link_out_of_the_catalog_is_not_followed(slc, tmp_path):
+    folder = written(tmp_path / "stac", [image(slc)])
+    path = folder / "collection.json"
+    document = json.loads(path.read_text())
+    document["links"].append({"rel": "item", "href": "../../secret.json"})
+    path.write_text(json.dumps(document))
+    assert stac_problems(folder) == ["../../secret.json: path '../../secret.json' leads out of the campaign folder"]
+
+
+def test_a_campaign_without_a_place_has_items_without_geometry_and_no_collection(slc, tmp_path):
+    local = CRS.from_wkt('LOCAL_CS["yard",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]').to_wkt()
+    properties = {**told(), **projection(local, (4, 6), PLACE[:6])}
+    folder = written(tmp_path, [image(slc, geometry=None, properties=properties)])
+    assert stac_problems(folder) == []
+    (found,) = pystac.Catalog.from_file(folder / CATALOG).get_items(recursive=True)
+    assert found.geometry is None
+    assert found.bbox is None
+    assert found.properties["proj:code"] is None
+    assert found.collection_id is None
+    assert not (folder / "collection.json").exists()
+
+
+def test_a_frequency_between_the_letters_is_stated_without_the_extension(slc):
+    document = item(slc, acquisition=Acquisition(START, START, 0.7e9, 1e8))
+    assert document["properties"]["sar:center_frequency"] == 0.7
+    assert EXTENSIONS["sar"] not in document["stac_extensions"]
+    assert document_problem(document) is None
+
+
+def test_times_of_a_recording_without_a_clock_say_so(slc):
+    counted = Acquisition(instant(0), instant(10**9), 9.6e9, 6e8)
+    assert item(slc, acquisition=counted)["properties"]["apertura:clock"].startswith("none:")
+    assert "apertura:clock" not in item(slc)["properties"]
+
+
+def test_hostile_names_stay_text_and_addresses_are_encoded(slc, tmp_path):
+    inputs = {'raw/a b#?"<x>.npy': DIGEST}
+    folder = written(tmp_path, [image(slc, title=HOSTILE, inputs=inputs)], campaign=HOSTILE)
+    assert stac_problems(folder) == []
+    found = json.loads((folder / "images/f01/a-b.json").read_text())
+    assert found["properties"]["title"] == HOSTILE
+    assert found["links"][0]["href"] == "../../../../raw/a%20b%23%3F%22%3Cx%3E.npy"
+    assert sorted(path.name for path in tmp_path.rglob("*.json")) == ["a-b.json", CATALOG, "collection.json"]
+
+
+def test_the_same_images_in_any_order_give_the_same_catalog(slc):
+    images = [image(slc), image(slc, "coherent", made_from=["a-b"])]
+    assert json.dumps(catalog_files("tandem", images)) == json.dumps(catalog_files("tandem", images[::-1]))

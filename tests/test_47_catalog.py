@@ -1,0 +1,271 @@
+"""A finished campaign as STAC and as RO-Crate: who made what from what, by which code, and whether it still is so."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from urllib.parse import unquote
+
+import pystac
+import pytest
+import rasterio
+from crate import validator
+from folders import contents, copy_writable
+from rasterio.warp import transform_bounds
+from rocrate.rocrate import ROCrate
+
+from apertura.campaign import Campaign
+from apertura.catalog import CATALOG, CRATE
+from apertura.catalog.crate_check import changed_files
+from apertura.catalog.validation import stac_problems
+from apertura.environment import lock_sha256, software
+from apertura.errors import CampaignError
+from apertura.lineage import RESULTS, on_demand, places_of, results_of
+from apertura.provenance import sha256_file
+from apertura.steps.code import code_of
+from apertura.steps.jobs import job_of
+from apertura.steps.ro_crate import ro_crate
+from apertura.steps.stac import stac
+from apertura.store import read_manifest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def finished(finished_tiny, tmp_path):
+    """The tiny campaign with all its results, to be spoilt at will."""
+    return copy_writable(finished_tiny.root, tmp_path / "campaign")
+
+
+@pytest.fixture(scope="module")
+def told(finished_tiny):
+    """Identifier → entity of the crate."""
+    document = json.loads((finished_tiny.results / CRATE).read_text())
+    entities = {entity["@id"]: entity for entity in document["@graph"]}
+    assert len(entities) == len(document["@graph"])
+    return entities
+
+
+def ids(references):
+    return [one["@id"] for one in ([references] if isinstance(references, dict) else references)]
+
+
+def edit(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_every_image_has_an_item_whose_files_are_those_on_the_disk(finished_tiny):
+    assert stac_problems(finished_tiny.results / "stac") == []
+    items = list(pystac.Catalog.from_file(finished_tiny.results / "stac" / CATALOG).get_items(recursive=True))
+    assert sorted(item.id for item in items) == ["f01-coherent", "f01-noncoherent", "f01-uav1-uav1", "f01-uav1-uav2"]
+    assets = [asset for item in items for asset in item.assets.values()]
+    assert len(assets) > 30
+    for asset in assets:
+        path = Path(asset.get_absolute_href()).resolve()
+        assert asset.extra_fields["file:checksum"] == "1220" + sha256_file(path)
+        assert asset.extra_fields["file:size"] == path.stat().st_size
+    files = {Path(asset.href).name for item in items if item.id == "f01-coherent" for asset in [*item.assets.values()]}
+    assert not [name for name in files if name.startswith("noncoherent")]
+
+
+def test_an_item_lies_where_its_raster_lies(finished_tiny):
+    item = pystac.Item.from_file(finished_tiny.results / "stac/images/f01/uav1-uav2.json")
+    with rasterio.open(finished_tiny.result("f01", "uav1-uav2", "db.tif")) as raster:
+        assert item.properties["proj:code"] == str(raster.crs)
+        assert item.properties["proj:transform"] == list(raster.transform)[:6]
+        assert item.properties["proj:shape"] == list(raster.shape)
+        assert item.properties["proj:bbox"] == pytest.approx(list(raster.bounds), abs=1e-6)
+        assert item.bbox == pytest.approx(transform_bounds(raster.crs, "OGC:CRS84", *raster.bounds), abs=2e-7)
+
+
+def test_an_item_tells_time_and_band_of_what_was_recorded(finished_tiny):
+    item = pystac.Item.from_file(finished_tiny.results / "stac/images/f01/uav1-uav2.json")
+    meta = json.loads((finished_tiny.root / "raw/f01/uav1.sigmf-meta").read_text())
+    first = pystac.utils.str_to_datetime(meta["captures"][0]["core:datetime"])
+    last = pystac.utils.str_to_datetime(meta["captures"][-1]["core:datetime"])
+    assert first <= item.common_metadata.start_datetime <= item.datetime <= item.common_metadata.end_datetime <= last
+    waveform = finished_tiny.settings.waveform
+    band_hz = waveform.subcarriers * waveform.subcarrier_spacing_hz
+    assert item.properties["sar:bandwidth"] == pytest.approx(band_hz / 1e9)
+    middle_hz = waveform.carrier_hz + (band_hz - waveform.subcarrier_spacing_hz) / 2
+    assert item.properties["sar:center_frequency"] == pytest.approx(middle_hz / 1e9)
+
+
+def test_every_file_of_every_result_is_in_the_crate_with_its_hash_and_size(finished_tiny, told):
+    expected = {}
+    for name, result in results_of(finished_tiny):
+        if name != "ro_crate" and not on_demand(result.manifest):
+            manifest = finished_tiny.root / result.manifest
+            paths = [manifest, *(manifest.parent / file for file in read_manifest(manifest)["files"])]
+            expected |= {path.relative_to(finished_tiny.results).as_posix(): path for path in paths}
+    files = {unquote(name): one for name, one in told.items() if "File" in one["@type"]}
+    assert set(files) == set(expected) | {name for name in files if name.startswith("workflow/")}
+    for name, path in expected.items():
+        assert files[name]["sha256"] == sha256_file(path)
+        assert files[name]["contentSize"] == str(path.stat().st_size)
+    loose = {unquote(part) for part in ids(told["./"]["hasPart"])}
+    inner = {unquote(part) for one in told.values() if one["@id"].endswith(".zarr/") for part in ids(one["hasPart"])}
+    assert set(files) <= loose | inner
+
+
+def test_recordings_and_config_are_named_by_their_hashes(finished_tiny, told):
+    inputs = {name.removeprefix("#input/"): one for name, one in told.items() if name.startswith("#input/")}
+    there = [path.relative_to(finished_tiny.root).as_posix() for path in finished_tiny.root.glob("raw/**/*.*")]
+    assert set(inputs) == {*there, "config/config.yaml", "config/flights.tsv", "truth.json"}
+    assert all(one["sha256"] == sha256_file(finished_tiny.root / name) for name, one in inputs.items())
+
+
+def test_every_job_says_its_command_parameters_code_sources_and_results(told):
+    job = told["#job/image/f01/uav1-uav2"]
+    assert job["name"] == "apertura step image f01 uav1-uav2"
+    tool = told[job["instrument"]["@id"]]
+    assert tool["identifier"] == f"sha256:{code_of('image')}"
+    assert {"f01/uav1-uav2/profile.manifest.json", "f01/refined_track.manifest.json"} < set(ids(job["object"]))
+    settings = [told[one] for one in ids(job["object"]) if one.startswith("#setting/")]
+    assert {one["name"]: one["value"] for one in settings}["accuracy_db"] == "auto"
+    assert ids(job["result"]) == ["f01/uav1-uav2/image.zarr/", "f01/uav1-uav2/image.manifest.json"]
+    assert "#input/raw/f01/uav2.sigmf-data" in ids(told["#job/ingest/f01/uav2"]["object"])
+    assert all(
+        told[one] for action in told.values() if "Action" in str(action["@type"]) for one in ids(action["object"])
+    )
+
+
+def test_environment_lock_and_code_stand_in_the_crate(told):
+    found = {one["name"]: one["version"] for name, one in told.items() if name.startswith("#software/")}
+    assert found == software()
+    assert {"python", "gdal", "proj", "numpy"} < set(found)
+    assert told["#lock"]["value"] == lock_sha256()
+    assert ids(told["#job/cube"]["environment"]) == ["#lock"]
+    assert ids(told["#control/cube"]["object"]) == ["#job/cube"]
+
+
+def test_a_product_made_by_other_code_or_settings_says_so(finished):
+    manifest = finished / "results/f01/uav1-uav2/layers.manifest.json"
+    document = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**document, "code": "0" * 64, "settings": "1" * 64}))
+    ro_crate(Campaign.load(finished))
+    graph = json.loads((finished / "results" / CRATE).read_text())["@graph"]
+    described = {one["@id"]: one["description"] for one in graph if one["@id"].startswith("#job/")}
+    said = described["#job/layers/f01/uav1-uav2"]
+    assert f"made by other code than is installed now, which is {code_of('layers')}" in said
+    assert f"made under other settings than these, of sha256 {'1' * 64}" in said
+    assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
+    assert described["#job/echo/f01/uav1-uav2"] == "As the code and settings of today would make it."
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "results/f01/uav1-uav1/db.tif",
+        "results/f01/uav1-uav1/image.zarr/image/c/0/0",
+        "results/f01/uav1-uav1/echo.manifest.json",
+        "results/stac/images/f01/coherent.json",
+        "results/workflow/Snakefile",
+        "raw/f01/uav2.sigmf-data",
+        "config/flights.tsv",
+    ],
+)
+def test_a_file_changed_or_gone_is_named(finished, name):
+    assert changed_files(finished / "results") == {}
+    edit(finished / name)
+    assert changed_files(finished / "results") == {name.removeprefix("results/"): "changed"}
+    (finished / name).unlink()
+    assert changed_files(finished / "results") == {name.removeprefix("results/"): "missing"}
+    assert bool(changed_files(finished / "results", inputs=False)) == name.startswith("results/")
+
+
+@pytest.mark.parametrize(
+    "name", ["../config/config.yaml", "%2E%2E/config/config.yaml", "/etc/passwd", "a%00b", "#input/../x"]
+)
+def test_a_crate_that_leads_out_of_its_folder_is_refused(finished, name):
+    path = finished / "results" / CRATE
+    document = json.loads(path.read_text())
+    document["@graph"].append({"@id": name, "@type": "File", "sha256": "0"})
+    path.write_text(json.dumps(document))
+    with pytest.raises(CampaignError, match=re.escape(CRATE)):
+        changed_files(finished / "results")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"@graph": [{"sha256": 1}]}', '{"@graph": 3}'])
+def test_a_damaged_crate_is_one_message(finished, text):
+    (finished / "results" / CRATE).write_text(text)
+    with pytest.raises(CampaignError, match="damaged"):
+        changed_files(finished / "results")
+
+
+def test_catalog_and_crate_have_the_same_bytes_from_another_folder(finished_tiny, finished):
+    names = ("stac/", "workflow/", CRATE)
+    campaign = Campaign.load(finished)
+    shutil.rmtree(finished / "results/stac")
+    stac(campaign)
+    ro_crate(campaign)
+    made, expected = contents(finished / "results"), contents(finished_tiny.results)
+    some = [name for name in expected if name.startswith(names)]
+    assert len(some) > 10
+    assert [name for name in some if made.get(name) != expected[name]] == []
+
+
+def test_hostile_campaign_names_stay_text(finished):
+    name = "../../x $(id) %2F {0} 'quoted'"
+    config = finished / "config" / "config.yaml"
+    config.write_text(re.sub("(?m)^campaign:.*$", lambda _: f"campaign: {json.dumps(name)}", config.read_text()))
+    campaign = Campaign.load(finished)
+    before = set(contents(finished))
+    stac(campaign)
+    ro_crate(campaign)
+    assert set(contents(finished)) == before
+    graph = {one["@id"]: one for one in json.loads((finished / "results" / CRATE).read_text())["@graph"]}
+    assert graph["./"]["name"] == name
+    assert stac_problems(finished / "results" / "stac") == []
+
+
+def test_the_crate_is_read_by_its_library(finished_tiny):
+    crate = ROCrate(finished_tiny.results)
+    assert crate.mainEntity.id == "workflow/Snakefile"
+    made = [action for action in crate.root_dataset["mentions"] if action.type == "CreateAction"]
+    assert {action["instrument"].type for action in made if action.id != "#run"} == {"SoftwareApplication"}
+
+
+def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
+    text = "\n".join(path.read_text() for path in (ROOT / "workflow" / "rules").glob("*.smk"))
+    found = re.findall(r'(?s)\nrule (\w+):.*?shell:\s+"apertura (step [^"]+?)(?: --threads| >)', "\n" + text)
+    rules = {rule: re.sub(r"{wildcards\.(\w+)}", r"\1", command) for rule, command in found}
+    kinds = {"raw": ("flight", "node"), "track": ("flight", "node"), "fused": ("flight",), "interferogram": ("two",)}
+    kinds |= dict.fromkeys(("calibration", "refined_track", "assessment", "page"), ("flight",))
+    for name, where, _ in places_of(finished_tiny):
+        if name not in {"speed_accuracy", "whole"}:
+            job = job_of(name, kinds.get(name, ("flight", "pair")[: len(where)]))
+            assert job.command == f"apertura {rules[job.rule]}"
+    assert set(kinds) <= set(RESULTS)
+
+
+@pytest.mark.slow
+def test_roc_validator_passes_and_fails_with_one_file_changed(finished):
+    try:
+        validator.make_environment()
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"roc-validator cannot be installed here: {str(getattr(error, 'stderr', error))[-300:]}")
+    assert validator.issues(finished / "results") == []
+    edit(finished / "results/f01/uav1-uav1/db.tif")
+    (problem,) = validator.issues(finished / "results")
+    assert problem.endswith("f01/uav1-uav1/db.tif: is not the file that was made")
+    path = finished / "results" / CRATE
+    document = json.loads(path.read_text())
+    document["@graph"] = [one for one in document["@graph"] if one["@id"] != "workflow/Snakefile"]
+    path.write_text(json.dumps(document))
+    assert len(validator.issues(finished / "results")) > 1
+
+
+def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):
+    monkeypatch.chdir(finished.parent)
+    page = (ROOT / "docs/howto/catalog.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", page, flags=re.DOTALL)
+    assert len(blocks) == 3
+    names = {}
+    for code, printed in blocks:
+        exec(compile(code, "catalog.md", "exec"), names)
+        said, expected = capsys.readouterr().out, printed.partition("    ...\n")[0]
+        assert said.startswith(expected)
