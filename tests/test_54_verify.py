@@ -1,24 +1,19 @@
 """`apertura verify`: whatever is touched between a product and the raw samples is named, and nothing else is."""
 
 import functools
-import json
 import shutil
 import subprocess
 import sys
 
 import pytest
-import rasterio
-from folders import complaint, copy_writable, edit_config
+from folders import copy_writable, edit_config
 from PIL import Image, PngImagePlugin
+from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
-from apertura.audit.verify import print_verified, verify
+from apertura.audit.verify import verify
 from apertura.provenance import PACKAGE, canonical_json, sha256_file
 from apertura.steps.code import code_of
 
-DB = "results/f01/uav1-uav2/db.tif"
-EXPORT = "results/f01/uav1-uav2/export.manifest.json"
-IMAGE = "results/f01/uav1-uav2/image.zarr"
-RAW = "raw/f01/uav2.sigmf-data"
 CODE_OF = functools.cache(code_of)
 
 
@@ -31,18 +26,6 @@ def code_is_hashed_once(monkeypatch):
 def root(finished_tiny, tmp_path):
     """The tiny campaign with all its results, to be spoilt at will."""
     return copy_writable(finished_tiny.root, tmp_path / "finished")
-
-
-def flip(path, at=None):
-    """Change one bit of one byte."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 if at is None else at] ^= 1
-    path.write_bytes(data)
-
-
-def wrong(root, product=DB):
-    """Link → state, of those that are not the same."""
-    return {link.name: link.state for link in verify(root / product).links if link.state != "same"}
 
 
 def test_every_link_of_an_untouched_product_is_the_same(root):
@@ -82,13 +65,6 @@ def test_one_byte_of_a_stage_is_reported_at_the_stage(root, file):
     assert file in "".join(next(link for link in verify(root / DB).links if link.name == IMAGE).why)
 
 
-def edited(path, change):
-    """Write a JSON file as the workflow would, with something changed."""
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")
-
-
 def test_any_byte_of_the_last_manifest_is_noticed(root):
     """Nothing has recorded its hash: what it says is compared with all that it speaks of, and how it is written."""
     whole = (root / EXPORT).read_bytes()
@@ -97,16 +73,6 @@ def test_any_byte_of_the_last_manifest_is_noticed(root):
         assert wrong(root, EXPORT), whole[at - 20 : at + 20]
         (root / EXPORT).write_bytes(whole)
     assert wrong(root, EXPORT) == {}
-
-
-def retag(path, **tags):
-    with rasterio.Env(GDAL_PAM_ENABLED=False), rasterio.open(path, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as raster:
-        raster.update_tags(**{f"APERTURA_{name}": text for name, text in tags.items()})
-
-
-def tag(path, name):
-    with rasterio.open(path) as raster:
-        return json.loads(raster.tags()[f"APERTURA_{name}"])
 
 
 @pytest.mark.parametrize(
@@ -122,15 +88,6 @@ def test_a_tag_edited_together_with_the_hash_of_its_file_is_reported(root, name,
     retag(root / DB, **{name: canonical_json(change(tag(root / DB, name)))})
     edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
     assert wrong(root) == {f"tags of {DB}": "changed"}
-
-
-@pytest.mark.parametrize("text", ["{", "[1]", '{"a": 3}', "[" * 100_000, "\x1b[31m", "NaN"])
-def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
-    retag(root / DB, SOURCES=text)
-    assert print_verified(root / DB) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith(f"changed  tags of {DB}: ") for line in lines)
-    assert all(line.isprintable() and len(line) < 400 for line in lines)
 
 
 def test_the_tags_of_a_picture_are_looked_at_too(root):
@@ -196,80 +153,6 @@ def test_what_is_new_in_a_stage_is_reported(root):
     (root / IMAGE / "image/c/9").mkdir()
     (root / IMAGE / "image/c/9/9").write_bytes(b"more")
     assert wrong(root) == {IMAGE: "changed"}
-
-
-def test_a_chunk_that_is_a_link_is_reported_and_not_followed(root, tmp_path):
-    chunk = root / IMAGE / "image/c/0/0"
-    shutil.copy(chunk, tmp_path / "elsewhere")
-    chunk.unlink()
-    chunk.symlink_to(tmp_path / "elsewhere")
-    assert wrong(root) == {IMAGE: "changed"}
-
-
-@pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "a\x1b[31m", "x.zarr/../../../../etc/passwd"])
-def test_a_manifest_that_leads_out_of_the_campaign_is_refused(root, capsys, name):
-    edited(root / EXPORT, lambda document: document["files"].update({name: "0" * 64}))
-    assert print_verified(root / EXPORT, quiet=True) == 1
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(("changed  ", "missing  "))
-    assert line.isprintable()
-    assert "root:" not in line
-
-
-def test_sources_that_lead_in_a_circle_end(root):
-    edited(root / EXPORT, lambda document: document["sources"].update({EXPORT: "0" * 64}))
-    assert wrong(root)[EXPORT] == "changed"
-
-
-def test_a_manifest_of_an_older_version_is_told(root):
-    edited(root / EXPORT, lambda document: [document.pop(key) for key in ("sources", "settings", "code")])
-    (link,) = [link for link in verify(root / DB).links if link.name == EXPORT]
-    assert link.state == "changed"
-    assert "versions before 0.1.0" in link.why[0]
-
-
-def test_other_versions_are_noted_and_change_nothing(root, capsys):
-    software = tag(root / DB, "SOFTWARE") | {"numpy": "1.0"}
-    retag(root / DB, SOFTWARE=canonical_json(software), VERSION="0.0.9", LOCK_SHA256="0" * 64)
-    edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
-    assert print_verified(root / DB, quiet=True) == 0
-    version, numpy, lock = capsys.readouterr().out.splitlines()
-    assert version.startswith(f"made by apertura 0.0.9, such as {DB}; ")
-    assert "numpy 1.0, here " in numpy
-    assert lock == "made under another requirements/all.txt"
-
-
-def test_a_config_that_is_wrong_hides_no_other_link(root):
-    (root / "config/config.yaml").write_text("scene: [")
-    flip(root / RAW)
-    assert wrong(root) == {"campaign": "changed", RAW: "changed"}
-
-
-def test_a_copy_elsewhere_tells_its_tags_and_is_known_again_in_its_campaign(root, tmp_path, capsys):
-    copy = shutil.copy(root / DB, tmp_path / "copy.tif")
-    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "copy.tif"))
-    assert f"APERTURA_INPUTS {RAW} {sha256_file(root / RAW)}" in capsys.readouterr().out.splitlines()
-    assert print_verified(tmp_path / "copy.tif", root) == 0
-    assert f"copy.tif, a copy of a file of {EXPORT}" in capsys.readouterr().out
-    retag(copy, ERROR_DB="-200")
-    assert print_verified(tmp_path / "copy.tif", root, quiet=True) == 1
-    assert capsys.readouterr().out.startswith("changed  copy.tif: no file of that campaign has its bytes")
-
-
-def test_what_is_no_product_is_one_message(root, tmp_path):
-    (tmp_path / "note.txt").write_text("")
-    (tmp_path / "plain.tif").write_bytes(b"II*\0")
-    assert "no such file" in complaint(lambda: print_verified(tmp_path / "nowhere.tif"))
-    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "note.txt"))
-    assert "not readable as GeoTIFF" in complaint(lambda: print_verified(tmp_path / "plain.tif"))
-    assert "no manifest lists it" in complaint(lambda: print_verified(tmp_path / "note.txt", root))
-    assert "is no result" in complaint(lambda: print_verified(root / "results/f01"))
-
-
-def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root, capsys):
-    shutil.copy(root / DB, root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif")
-    assert print_verified(root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif", quiet=True) == 1
-    assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
 
 
 def test_verifying_writes_nothing(root):

@@ -1,0 +1,120 @@
+"""`apertura verify` on what strangers, older versions and editors leave: one line for each link, and no harm."""
+
+import functools
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from folders import complaint, copy_writable
+from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
+
+from apertura.audit.verify import print_verified, verify
+from apertura.provenance import canonical_json, sha256_file
+from apertura.steps.code import code_of
+
+CODE_OF = functools.cache(code_of)
+
+
+@pytest.fixture(autouse=True)
+def code_is_hashed_once(monkeypatch):
+    monkeypatch.setattr("apertura.audit.chain.code_of", CODE_OF)
+
+
+@pytest.fixture
+def root(finished_tiny, tmp_path):
+    """The tiny campaign with all its results, to be spoilt at will."""
+    return copy_writable(finished_tiny.root, tmp_path / "finished")
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"a": 3}', "[" * 100_000, "\x1b[31m", "NaN"])
+def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
+    retag(root / DB, SOURCES=text)
+    assert print_verified(root / DB) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"changed  tags of {DB}: ") for line in lines)
+    assert all(line.isprintable() and len(line) < 400 for line in lines)
+
+
+def test_a_chunk_that_is_a_link_is_reported_and_not_followed(root, tmp_path):
+    chunk = root / IMAGE / "image/c/0/0"
+    shutil.copy(chunk, tmp_path / "elsewhere")
+    chunk.unlink()
+    chunk.symlink_to(tmp_path / "elsewhere")
+    assert wrong(root) == {IMAGE: "changed"}
+
+
+@pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "a\x1b[31m", "x.zarr/../../../../etc/passwd"])
+def test_a_manifest_that_leads_out_of_the_campaign_is_refused(root, capsys, name):
+    edited(root / EXPORT, lambda document: document["files"].update({name: "0" * 64}))
+    assert print_verified(root / EXPORT, quiet=True) == 1
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(("changed  ", "missing  "))
+    assert line.isprintable()
+    assert "root:" not in line
+
+
+def test_sources_that_lead_in_a_circle_end(root):
+    edited(root / EXPORT, lambda document: document["sources"].update({EXPORT: "0" * 64}))
+    assert wrong(root)[EXPORT] == "changed"
+
+
+def test_a_manifest_of_an_older_version_is_told(root):
+    edited(root / EXPORT, lambda document: [document.pop(key) for key in ("sources", "settings", "code")])
+    (link,) = [link for link in verify(root / DB).links if link.name == EXPORT]
+    assert link.state == "changed"
+    assert "versions before 0.1.0" in link.why[0]
+
+
+def test_other_versions_are_noted_and_change_nothing(root, capsys):
+    software = tag(root / DB, "SOFTWARE") | {"numpy": "1.0"}
+    retag(root / DB, SOFTWARE=canonical_json(software), VERSION="0.0.9", LOCK_SHA256="0" * 64)
+    edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
+    assert print_verified(root / DB, quiet=True) == 0
+    version, numpy, lock = capsys.readouterr().out.splitlines()
+    assert version.startswith(f"made by apertura 0.0.9, such as {DB}; ")
+    assert "numpy 1.0, here " in numpy
+    assert lock == "made under another requirements/all.txt"
+
+
+def test_a_config_that_is_wrong_hides_no_other_link(root):
+    (root / "config/config.yaml").write_text("scene: [")
+    flip(root / RAW)
+    assert wrong(root) == {"campaign": "changed", RAW: "changed"}
+
+
+def test_a_copy_elsewhere_tells_its_tags_and_is_known_again_in_its_campaign(root, tmp_path, capsys):
+    copy = shutil.copy(root / DB, tmp_path / "copy.tif")
+    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "copy.tif"))
+    assert f"APERTURA_INPUTS {RAW} {sha256_file(root / RAW)}" in capsys.readouterr().out.splitlines()
+    assert print_verified(tmp_path / "copy.tif", root) == 0
+    assert f"copy.tif, a copy of a file of {EXPORT}" in capsys.readouterr().out
+    retag(copy, ERROR_DB="-200")
+    assert print_verified(tmp_path / "copy.tif", root, quiet=True) == 1
+    assert capsys.readouterr().out.startswith("changed  copy.tif: no file of that campaign has its bytes")
+
+
+def test_what_is_no_product_is_one_message(root, tmp_path):
+    (tmp_path / "note.txt").write_text("")
+    (tmp_path / "plain.tif").write_bytes(b"II*\0")
+    assert "no such file" in complaint(lambda: print_verified(tmp_path / "nowhere.tif"))
+    assert "lies in no campaign" in complaint(lambda: print_verified(tmp_path / "note.txt"))
+    assert "not readable as GeoTIFF" in complaint(lambda: print_verified(tmp_path / "plain.tif"))
+    assert "no manifest lists it" in complaint(lambda: print_verified(tmp_path / "note.txt", root))
+    assert "is no result" in complaint(lambda: print_verified(root / "results/f01"))
+
+
+def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root, capsys):
+    shutil.copy(root / DB, root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif")
+    assert print_verified(root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif", quiet=True) == 1
+    assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
+
+
+@pytest.mark.parametrize("words", [("verify", "nowhere.tif"), ("diff", "nowhere.tif", "there.tif"), ("reproduce", ".")])
+def test_a_question_that_cannot_be_answered_ends_with_2_and_one_line(tmp_path, words):
+    apertura = Path(sys.executable).parent / "apertura"
+    done = subprocess.run([apertura, *words], text=True, capture_output=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
