@@ -8,7 +8,8 @@ from folders import SHARED, copy_writable, run_steps
 from apertura.focus.engines import ENGINES, native, native_binding
 from apertura.simulation import ImageGrid, preset, simulate
 
-collect_ignore = ["crate/contexts.py", "crate/profile"]  # they run in the environment of roc-validator
+# They run in other environments: of roc-validator, of QGIS.
+collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
 
 
 @pytest.fixture(scope="session")

@@ -39,6 +39,7 @@ from apertura.steps import (
     export,
     image,
     ingest,
+    interferogram,
     layers,
     mosaic,
     profile,
@@ -92,6 +93,10 @@ def make_images(campaign: Campaign, flight: str) -> None:
         image.image(campaign, flight, pair, threads=2)
 
 
+STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
+"""Results that stand on every image of a campaign."""
+
+
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
@@ -113,6 +118,8 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
                 export.export(campaign, flight.name, pair)
             export.export_fused(campaign, flight.name)
         coverage.coverage(campaign)
+        for name in campaign.settings.interferometry.pairs:
+            interferogram.interferogram(campaign, name)
         mosaic.mosaic(campaign)
         webmap.webmap(campaign)
         stac.stac(campaign)

@@ -162,13 +162,15 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
 
 def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
     run_steps(tiny)
-    products = sorted(path for path in finished_tiny.results.rglob("*") if path.suffix in {".tif", ".png"})
+    products = sorted(
+        path for path in finished_tiny.results.rglob("*") if path.suffix in {".tif", ".png", ".qml", ".vrt", ".geojson"}
+    )
     assert len(products) >= 14
     for product in products:
         other = tiny / "results" / product.relative_to(finished_tiny.results)
         assert other.read_bytes() == product.read_bytes(), product.name
     manifests = sorted(finished_tiny.results.rglob("*.manifest.json"))
-    assert len(manifests) == 20  # two nodes, two pairs, what they add up to, and the campaign
+    assert len(manifests) == 24  # two nodes, two pairs, what they add up to, and the campaign
     for manifest in manifests:
         assert (tiny / "results" / manifest.relative_to(finished_tiny.results)).read_bytes() == manifest.read_bytes()
 

@@ -22,6 +22,7 @@ from readers import (
 )
 
 from apertura.campaign import Campaign
+from apertura.check.stale import damaged_results
 from apertura.errors import CampaignError
 from apertura.export import exports_in, mosaics, product_files, write_exports
 from apertura.export.mosaic import write_mosaic
@@ -61,9 +62,11 @@ def test_another_gdal_agrees_with_rasterio_on_every_raster(finished_tiny):
 
 
 @needs_qgis
-def test_qgis_agrees_with_rasterio_on_every_raster_and_finds_every_style(finished_tiny):
-    paths = {name: finished_tiny.results / name for name in RASTERS}
+def test_qgis_agrees_with_rasterio_on_every_raster_finds_every_style_and_changes_none(finished_tiny, tmp_path):
+    results = copy_writable(finished_tiny.root, tmp_path / "campaign") / "results"
+    paths = {name: results / name for name in RASTERS}
     told = ask_qgis(tell=[str(path) for path in paths.values()])["told"]
+    assert not damaged_results(Campaign.load(results.parent))
     for name, path in paths.items():
         found = told[str(path)]
         assert found["valid"], name
@@ -79,8 +82,8 @@ def test_qgis_agrees_with_rasterio_on_every_raster_and_finds_every_style(finishe
         if path.with_suffix(".qml").name in {"incidence.qml", "looks.qml"}:
             assert found["renderer"] == "singlebandpseudocolor"
     assert (
-        len(STYLED) == 2 * 6 * 2 + 2 * 2
-    )  # of each pair db and five layers, of sums two; in the flight, in the mosaic
+        len(STYLED) == (2 * 7 + 5) * 2
+    )  # of each pair two and five layers, of sums five; in the flight, in the mosaic
 
 
 def known_rasters():

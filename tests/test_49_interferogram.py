@@ -69,8 +69,7 @@ def made(folder, **choices):
         config["interferometry"] = {"pairs": {NAME: ["f01/uav1-uav1", "f02/uav1-uav1"]}}
 
     edit_config(root, ask)
-    campaign = run_steps(root)
-    interferogram(campaign, NAME)
+    run_steps(root)
     return root
 
 

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
 
-from tests.attack.faults_campaign import STEPS, TARGETS, make_campaign
+from tests.attack.faults_campaign import MODULES, STEPS, TARGETS, make_campaign
 from tests.attack.faults_control import (
     ENVIRONMENT,
     FAIL,
@@ -82,7 +82,7 @@ def _campaign_of_faults(asked: argparse.Namespace) -> int:
     for module in ("apertura.cli", "matplotlib.pyplot", "rasterio", "zarr", "xarray", "scipy.signal", "dask.array"):
         importlib.import_module(module)
     for step in {step.split()[0] for step in STEPS} - {"tiles", "calibrate"}:
-        importlib.import_module(f"apertura.steps.{step}")
+        importlib.import_module(f"apertura.steps.{MODULES.get(step, step)}")
     with tempfile.TemporaryDirectory() as folder:
         bench, began = Bench(make_campaign(Path(folder).resolve()), shared_page()), time.perf_counter()
         bench.prepare(tuple(asked.steps))

@@ -87,18 +87,22 @@ class Export:
 EXPORTS: tuple[Export, ...] = (
     Export("slc.tif", "image", "apertura.export.cog:write_slc", laid=False),
     Export("power.tif", "image", "apertura.export.cog:write_power"),
+    Export("power.qml", "image", "apertura.export.style:write_linear_style"),
     Export("db.tif", "image", "apertura.export.db:write_db"),
     Export("db.qml", "image", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("coherent_slc.tif", "coherent", "apertura.export.cog:write_slc", laid=False),
     Export("coherent_power.tif", "coherent", "apertura.export.cog:write_power"),
+    Export("coherent_power.qml", "coherent", "apertura.export.style:write_linear_style"),
     Export("coherent_db.tif", "coherent", "apertura.export.db:write_db"),
     Export("coherent_db.qml", "coherent", "apertura.export.style:write_db_style"),
     Export("quicklook.png", "coherent", "apertura.export.quicklook:write_quicklook", pictured=True),
     Export("noncoherent_power.tif", "noncoherent", "apertura.export.cog:write_power"),
+    Export("noncoherent_power.qml", "noncoherent", "apertura.export.style:write_linear_style"),
     Export("noncoherent_db.tif", "noncoherent", "apertura.export.db:write_db"),
     Export("noncoherent_db.qml", "noncoherent", "apertura.export.style:write_db_style"),
     Export("noncoherent_magnitude.tif", "magnitude", "apertura.export.cog:write_magnitude"),
+    Export("noncoherent_magnitude.qml", "magnitude", "apertura.export.style:write_linear_style"),
     Export("incidence.tif", "incidence", "apertura.export.layers:write_incidence"),
     Export("incidence.qml", "incidence", "apertura.export.style:write_layer_style"),
     Export("bistatic_angle.tif", "bistatic_angle", "apertura.export.layers:write_bistatic_angle"),
@@ -110,10 +114,15 @@ EXPORTS: tuple[Export, ...] = (
     Export("nesz.tif", "nesz", "apertura.export.layers:write_nesz"),
     Export("nesz.qml", "nesz", "apertura.export.style:write_layer_style"),
     Export("phase.tif", "phase", "apertura.export.interferogram:write_phase"),
+    Export("phase.qml", "phase", "apertura.export.style:write_layer_style"),
     Export("coherence.tif", "coherence", "apertura.export.interferogram:write_coherence"),
+    Export("coherence.qml", "coherence", "apertura.export.style:write_layer_style"),
     Export("unwrapped.tif", "unwrapped", "apertura.export.interferogram:write_unwrapped"),
+    Export("unwrapped.qml", "unwrapped", "apertura.export.style:write_layer_style"),
     Export("height.tif", "height", "apertura.export.interferogram:write_height"),
+    Export("height.qml", "height", "apertura.export.style:write_layer_style"),
     Export("height_std.tif", "height_std", "apertura.export.interferogram:write_height_std"),
+    Export("height_std.qml", "height_std", "apertura.export.style:write_layer_style"),
     Export("quicklook.png", "panels", "apertura.export.interferogram:write_panels", pictured=True),
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
@@ -205,7 +214,7 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     Examples
     --------
     >>> list(product_files({"f01": ["a-b"]}))[2:5]
-    ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/db.tif']
+    ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/power.qml']
     """
     yield from COVERAGE
     for flight, names in pairs.items():

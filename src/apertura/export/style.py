@@ -6,12 +6,13 @@ a scene that is mostly noise, and whiten the noise.
 
 import json
 from collections.abc import Iterable
-from math import ceil, floor
+from math import ceil, floor, log10
 from pathlib import Path
 from xml.etree import ElementTree as ET  # only written, never parsed
 
 import numpy as np
 import rasterio
+from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from apertura.atomic import write_text
@@ -60,12 +61,19 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     top, below = about.get("peak_db"), about.get("noise_floor_db")
     if top is None or below is None:
         raise ContractError(f"{path.name}: no peak and noise floor in tag {TAG}")
-    renderer = _renderer("singlebandgray", grayBand="1", gradient="BlackToWhite")
-    stretch = ET.SubElement(renderer, "contrastEnhancement")
-    ends = {"minValue": round(top + min(below, -_LEAST_DB), 2), "maxValue": round(top, 2)}
-    for name, value in {**ends, "algorithm": "StretchToMinimumMaximum"}.items():
-        ET.SubElement(stretch, name).text = str(value)
-    _write(path, renderer)
+    _write(path, _grey(round(top + min(below, -_LEAST_DB), 2), round(top, 2)))
+
+
+def write_linear_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of power or magnitude: black where there is none, white from a tenth of the largest value.
+
+    Parameters as `write_db_style`. A style of their own also keeps QGIS from measuring the raster, and from
+    writing what it measured into a mosaic or beside an image.
+    """
+    with rasterio.open(_beside(path)) as raster:
+        values = _few(raster)
+    largest = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
+    _write(path, _grey(0.0, float(f"{largest / 10 or 1.0:.3g}")))
 
 
 def write_mask_style(path: Path, *_: object, **__: object) -> None:
@@ -88,21 +96,44 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
     Parameters as `write_db_style`.
     """
     with rasterio.open(_beside(path)) as raster:
-        fewer = max(1.0, max(raster.shape) / _DOTS)
-        shape = tuple(ceil(size / fewer) for size in raster.shape)
-        values = raster.read(1, out_shape=shape, resampling=Resampling.average)
-        unit = raster.units[0]
-    known = values[np.isfinite(values)]
-    low = floor(known.min()) if known.size else 0
-    high = max(low + 1, ceil(known.max()) if known.size else 0)
-    renderer = _renderer("singlebandpseudocolor", band="1", classificationMin=str(low), classificationMax=str(high))
-    ends = {"minimumValue": str(low), "maximumValue": str(high)}
+        values, unit = _few(raster), raster.units[0]
+    low, high = _round_ends(values[np.isfinite(values)])
+    told = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
+    renderer = _renderer("singlebandpseudocolor", band="1", **told)
+    ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
     for share, colour in zip(np.linspace(0, 1, len(_RAMP)), _RAMP, strict=True):
         value = f"{low + share * (high - low):g}"
         ET.SubElement(shader, "item", value=value, color=colour, alpha="255", label=f"{value} {unit}")
     _write(path, renderer)
+
+
+def _few(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
+    """Return a raster averaged to few places, NaN where it holds nothing."""
+    fewer = max(1.0, max(raster.shape) / _DOTS)
+    shape = tuple(ceil(size / fewer) for size in raster.shape)
+    values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average, masked=True).filled(
+        np.nan
+    )
+    return values
+
+
+def _round_ends(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the ends of some values, rounded outwards to a tenth of the power of ten below their span."""
+    if not values.size:
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    step = 10.0 ** floor(log10(max(high - low, 1e-3 * abs(high), 1e-9))) / 10
+    return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
+
+
+def _grey(low: float, high: float) -> ET.Element:
+    renderer = _renderer("singlebandgray", grayBand="1", gradient="BlackToWhite")
+    stretch = ET.SubElement(renderer, "contrastEnhancement")
+    for name, value in {"minValue": low, "maxValue": high, "algorithm": "StretchToMinimumMaximum"}.items():
+        ET.SubElement(stretch, name).text = str(value)
+    return renderer
 
 
 def _beside(path: Path) -> Path:

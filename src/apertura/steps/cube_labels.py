@@ -65,7 +65,7 @@ def _middle(images: Images, flight: str) -> Any:
 def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[str, float | str | None]:
     """Return what an image and its flight's assessment say: name of a row of `QUOTED` → value; None: nothing."""
     quality = image.attrs["quality"]
-    view, focus, pulses = quality["view"], quality["focus"], quality["pulses"]
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # phase history tells none
     return {
         "heading": view["heading_deg"],
         "look_direction": view["look_deg"],
@@ -80,8 +80,8 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[s
         "numerical_error": quality["numerical_error_db"],
         "entropy": quality["entropy"],
         "noise_floor": quality["noise_floor_db"],
-        "pulses_used": pulses["used"],
-        "pulses_dropped": pulses["dropped"],
+        "pulses_used": pulses.get("used"),
+        "pulses_dropped": pulses.get("dropped"),
         "peak": quality["brightest"]["amplitude"],
         "phase_removed": assessed["fusion"]["phases_rad"].get(pair),
         "verdict": focus["verdict"],
