@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from apertura.code_imports import PACKAGE, import_closure
 from apertura.focus.engines import ENGINES
-from apertura.provenance import PACKAGE, Provenance, code_sha256, import_closure, merged
+from apertura.provenance import Provenance, code_sha256, merged
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from PIL import Image, PngImagePlugin
 from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
 from apertura.audit.verify import verify
-from apertura.provenance import PACKAGE, canonical_json, sha256_file
+from apertura.code_imports import PACKAGE
+from apertura.provenance import canonical_json, sha256_file
 from apertura.steps.code import code_of
 
 CODE_OF = functools.cache(code_of)

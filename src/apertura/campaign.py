@@ -1,5 +1,6 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -151,25 +152,11 @@ class Campaign(RawFolder):
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
         """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
         settings, processing = self.values, self.values["processing"]
-        nodes = {  # echo asks only whether there are beams, image what they are
-            node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
-            for node in pair.split("-")
-            if node
-        }
         beams = self.antennas(pair) if pair else {}
         stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
         antennas = {"antennas": stated} if stated else {}
-        segments = [list(segment) for segment in self.segments_of(flight, pair)]
-        clocks = [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks]
         chosen: dict[str, dict[str, Any]] = {
-            "echo": {
-                "waveform": settings["waveform"],
-                "nodes": nodes,
-                **({"beams": sorted(beams)} if beams else {}),
-                **({"segments": segments} if segments else {}),
-                **({"clocks": clocks} if clocks else {}),
-                **{key: processing[key] for key in ("sidelink", "accuracy_db")},
-            },
+            "echo": self._relevant_to_echo(flight, pair, beams),
             "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
             "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
             "scene": {
@@ -196,6 +183,23 @@ class Campaign(RawFolder):
             },
         }
         return chosen.get(stage, {})
+
+    def _relevant_to_echo(self, flight: str, pair: str, beams: Collection[str]) -> dict[str, Any]:
+        """Return what matters for a pair's echo: whether there are beams, not what they are."""
+        settings = self.values
+        nodes = {
+            node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
+            for node in pair.split("-")
+            if node
+        }
+        stated = {
+            "beams": sorted(beams),
+            "segments": [list(segment) for segment in self.segments_of(flight, pair)],
+            "clocks": [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks],
+        }
+        asked = {key: settings["processing"][key] for key in ("sidelink", "accuracy_db")}
+        always = {"waveform": settings["waveform"], "nodes": nodes, **asked}
+        return always | {name: value for name, value in stated.items() if value}
 
     def log_settings(self, node: str) -> dict[str, Any]:
         """Return the settings that a node's log is read by, as JSON values."""

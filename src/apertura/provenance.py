@@ -1,26 +1,16 @@
 """Where a product comes from: settings, inputs and code, its own and those of the stages before it."""
 
-import functools
 import hashlib
-import importlib.util
 import json
-import re
-import sysconfig
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from apertura import __version__
-
-PACKAGE = Path(__file__).parent
+from apertura.code_imports import PACKAGE, built_from, import_closure
 
 _READ_BYTES = 1 << 20
-
-_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
-_NAME = re.compile(r"[\w.]+")
-_TYPING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTILINE)  # never run
-_ROW = re.compile(r"[\"'](apertura(?:\.\w+)+):\w+[\"']")  # a row that names a function, imported when it is used
 
 
 class Stage(Protocol):
@@ -184,7 +174,7 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     closure = import_closure(modules, package=package)
     for name, path in sorted(closure.items()):
         digest.update(f"{name}\0{sha256_file(path)}\n".encode())
-    for path in _compiled(closure, package):
+    for path in built_from(closure, package):
         digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
     return digest.hexdigest()
 
@@ -223,57 +213,3 @@ def joined(*sources: Mapping[str, str]) -> dict[str, str]:
         for name, versions in source.items():
             found.setdefault(name, set()).update(versions.split(", "))
     return {name: ", ".join(sorted(versions)) for name, versions in sorted(found.items())}
-
-
-def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
-    """Return dotted name → source of `modules` and of every apertura module they import; as `code_sha256`."""
-    closure: dict[str, Path] = {}
-    waiting = list(modules)
-    outside = {name for name in waiting if not _is_ours(name)}
-    while waiting:
-        name = waiting.pop()
-        path = _source(name, package) if _is_ours(name) else _source_outside(name) if name in outside else None
-        if path is None or name in closure:
-            continue
-        closure[name] = path
-        waiting += _imports(path.read_text(encoding="utf-8"))
-    return closure
-
-
-def _is_ours(name: str) -> bool:
-    return name.split(".", maxsplit=1)[0] == PACKAGE.name
-
-
-def _source(name: str, package: Path) -> Path | None:
-    parts = name.split(".")[1:]
-    if not parts:  # the package itself only hands out public names
-        return None
-    base = package.joinpath(*parts)
-    return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
-
-
-def _source_outside(name: str) -> Path | None:
-    spec = importlib.util.find_spec(name)
-    return Path(spec.origin) if spec is not None and spec.origin else None
-
-
-@functools.cache
-def _imports(source: str) -> tuple[str, ...]:
-    """Return the dotted names that a source may import; a parser would take ten times as long."""
-    names: list[str] = []
-    for module, members, modules in _IMPORT.findall(_TYPING.sub("", source)):
-        names += [module, *(f"{module}.{member}" for member in _NAME.findall(members))] if module else []
-        names += _NAME.findall(modules)
-    return tuple(name for name in [*names, *_ROW.findall(source)] if _is_ours(name))
-
-
-def _compiled(closure: Mapping[str, Path], package: Path) -> list[Path]:
-    """Return what compiled code beside the modules was built from; an editable install keeps it elsewhere."""
-    digests: dict[str, Path] = {}
-    folders = {name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}
-    for folder in sorted(filter(_is_ours, folders)):
-        relative = Path(*folder.split(".")[1:])
-        for place in (package / relative, Path(sysconfig.get_path("platlib"), PACKAGE.name, relative)):
-            for path in sorted(place.glob("*.sha256")):
-                digests.setdefault(path.name, path)
-    return [digests[name] for name in sorted(digests)]

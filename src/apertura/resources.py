@@ -242,11 +242,8 @@ class RuleResources:
         work, demand = self._work(wildcards), self.demand
         grows = demand.pulse_bytes * work.pulses
         grows += demand.pixel_bytes * min(work.pixels, _AT_ONCE_PIXELS)
-        grows += (
-            demand.image_bytes * work.images
-            + demand.tile_bytes * work.tiles
-            + demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
-        )
+        grows += demand.image_bytes * work.images + demand.tile_bytes * work.tiles
+        grows += demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
         return math.ceil(_BESIDE_MB + demand.base_mb + grows / 1e6) << attempt - 1
 
     def runtime(self, wildcards: Any, attempt: int) -> int:

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from apertura.echo.sidelink_state import ECHO_DB, GATE_CELLS, SidelinkState
+from apertura.echo.sidelink_arrivals import GATE_CELLS
+from apertura.echo.sidelink_state import ECHO_DB, SidelinkState
 
 
 def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.echo.line_of_sight import Complexes, LineOfSight, fit_line_of_sight, phasor
-from apertura.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
+from apertura.echo.sidelink_arrivals import GATE_CELLS
+from apertura.echo.sidelink_state import ECHO_DB, NULL_DB, SidelinkState, measure
 
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 

@@ -5,15 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainccinv
 
 from apertura.echo.captures import AT_ONCE
-from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_block, joined
+from apertura.echo.line_of_sight import Complexes, Floats, LineOfSight, fit_block, joined
+from apertura.echo.sidelink_arrivals import GATE_CELLS, changing_near, decibels, ripple, strongest_echo
 from apertura.echo.sidelink_average import Averaging, SidelinkAverage
 from apertura.errors import CampaignError
-
-GATE_CELLS = 16
-"""Half width of the gate, in cells of 1/B around the direct path."""
 
 ECHO_DB = -20.0
 """Ghosts this far below the image are tolerated; an echo of the sidelink makes one as strong as itself."""
@@ -131,22 +128,22 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
     """Return the state of a sidelink from its direct path and the average of its locked pulses."""
     subcarriers = average.power.size
     snr = float(np.median(path.amplitude[path.locked] ** 2 / np.maximum(path.noise_power[path.locked], 1e-30)))
-    echo_db, echo_cells = _strongest_echo(average)
+    echo_db, echo_cells = strongest_echo(average)
     # transmit ripple and a path of constant excess look alike; hardware reflects little, the ground may a lot
-    ripple_db, ripple_cells, fine_ripple_db = _ripple(
+    ripple_db, ripple_cells, fine_ripple_db = ripple(
         average, one_sided=not (0 < abs(echo_cells) <= GATE_CELLS and echo_db > ECHO_DB)
     )
     flat = average.spectrum - average.noise * subcarriers
     state = SidelinkState(
         subcarriers=subcarriers,
-        snr_db=_db(snr),
+        snr_db=decibels(snr),
         echo_db=echo_db,
         echo_cells=echo_cells,
         echo_stays=bool(np.abs(average.mean[echo_cells]) ** 2 > (average.power[echo_cells] - average.noise) / 2),
         ripple_db=ripple_db,
         ripple_cells=ripple_cells,
         fine_ripple_db=fine_ripple_db,
-        near_db=_changing_near(average),
+        near_db=changing_near(average),
         # a null is seen only where the noise lies well below it
         null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
         locked=path.locked,
@@ -154,66 +151,6 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
         flags={},
     )
     return replace(state, flags=_flags(state))
-
-
-def _strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
-    """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
-
-    Ripple makes echoes on both sides of the direct path, a reflection on one; only the excess of one side counts.
-    """
-    cells = np.arange(2, average.power.size - 1)
-    excess = average.power - average.noise
-    one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
-    best = int(np.argmax(one_sided))
-    level, cell = float(one_sided[best]), int(cells[best])
-    # what the highest of N averages of exponential noise passes with the chance of a false lock
-    highest = gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
-    seen = average.noise * (float(highest) - 1)
-    # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
-    highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
-    if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
-        level, cell = average.second_power, average.second_cell
-    if level <= seen:
-        return _db(seen), 0
-    return _db(level), cell if cell < average.power.size / 2 else cell - average.power.size
-
-
-def _ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, float]:
-    """Return ripple (peak to peak, dB) inside the gate, its strongest cell, and ripple outside.
-
-    It is told by echoes that all pulses have in common:
-
-    cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
-    inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
-    """
-    power = np.abs(average.mean / average.mean[0]) ** 2
-    cells = np.arange(1, power.size // 2)
-    noise = average.noise / average.pulses
-    sides = np.stack([power[cells], power[-cells]]) - noise
-    single = np.sqrt(np.where(sides > 9 * noise, sides, 0.0)).sum(0)
-    paired = np.sqrt(np.where(sides.min(0) > 5 * noise, sides.min(0), 0.0)) * 2
-    inside = cells <= GATE_CELLS
-    amplitudes = (single if one_sided else paired)[inside], paired[~inside]
-    coarse, fine = (min(float(np.sqrt((amplitude**2).sum())), 0.95) for amplitude in amplitudes)
-    strongest = int(cells[inside][amplitudes[0].argmax()]) if coarse else 0
-    return _peak_to_peak_db(coarse), strongest, _peak_to_peak_db(fine)
-
-
-def _changing_near(average: SidelinkAverage) -> float:
-    """Return what changes from pulse to pulse within two cells of the direct path, dB; -300 where it is noise."""
-    near = [1, 2, -1, -2]
-    excess = average.power[near] - np.abs(average.mean[near]) ** 2 - average.noise
-    seen = 5 * average.noise * np.sqrt(len(near) / average.pulses)
-    total = float(excess.sum())
-    return _db(total) if total > seen and average.pulses > 1 else -300.0
-
-
-def _peak_to_peak_db(amplitude: float) -> float:
-    return float(20 * np.log10((1 + amplitude) / (1 - amplitude)))
-
-
-def _db(power: float) -> float:
-    return float(10 * np.log10(max(power, 1e-30)))
 
 
 def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineOfSight, where: str) -> SidelinkState:
@@ -231,7 +168,7 @@ def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineO
     locked = np.zeros(pulses, bool)
     locked[1:] |= common.locked
     locked[:-1] |= common.locked
-    snr_db = _db(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
+    snr_db = decibels(product + np.sqrt(product**2 + product))  # noise of both factors: product = snr²/(2·snr + 1)
     line = (
         f"the sidelink ({snr_db:.0f} dB) does not carry the given code: this image is divided by it and right without "
         "one, monostatic images of the transmitter are wrong"

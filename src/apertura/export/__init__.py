@@ -254,8 +254,8 @@ def write_exports(
     """
     written = []
     for export in exports_in(kind):
-        written.append(folder / export.file)
-        source = export.source
+        path, source = folder / export.file, export.source
         means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
-        export.write(written[-1], rasters[source], title=titles[source], tags={**tags, **means}, **shared)
+        export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
+        written.append(path)
     return written
