@@ -72,7 +72,7 @@ def test_a_mosaic_spans_the_levels_of_all_flights_and_says_only_what_holds_for_a
     write_mosaic(folder / "power.vrt", files)
     with rasterio.open(folder / "power.vrt") as raster:
         told = json.loads(raster.tags()[TAG])
-    assert (told["peak_db"], told["noise_floor_db"]) == (40.0, -70.0)
+    assert (told["peak_db"], told["noise_floor_re_peak_db"]) == (40.0, -70.0)
     assert told["quantity"] == "echo power, linear"
     assert "divided_by" not in told
 

@@ -11,7 +11,7 @@ from folders import copy_writable
 
 from apertura.campaign import Campaign
 from apertura.check import stale
-from apertura.check.stale import damaged_results, stale_lines, stale_results
+from apertura.check.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.digests import Sources, digest_of
 from apertura.errors import CampaignError
 from apertura.lineage import ON_DEMAND, results_of
@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 22 + 4 + 5
+    assert len(results) == 22 + 4 + 6
     for name, result in results:
         if name in ON_DEMAND:
             continue
@@ -196,6 +196,21 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
     found = stale_results(Campaign.load(finished))
     reason = "is gone" if how == "gone" else "is not as it was written"
     assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
+
+
+@pytest.mark.parametrize("before", [0, 1])
+def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, before, capsys):
+    folder = finished / "results/f01/uav1-uav1"
+    for number in range(before):
+        (folder / "db.edited.qml").write_text(f"mine {number}")
+    (folder / "db.qml").write_text("styled by hand")
+    campaign = Campaign.load(finished)
+    make_again(campaign, stale_results(campaign), remove=True)
+    kept = "db.edited-1.qml" if before else "db.edited.qml"
+    assert (folder / kept).read_text() == "styled by hand"
+    assert not (folder / "db.qml").exists()
+    assert (folder / "db.tif").is_file()
+    assert f"kept as results/f01/uav1-uav1/{kept}" in capsys.readouterr().err
 
 
 def test_a_stage_of_which_a_chunk_is_gone_is_made_again(finished):

@@ -234,7 +234,7 @@ def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
     kinds = {"raw": ("flight", "node"), "track": ("flight", "node"), "fused": ("flight",), "interferogram": ("two",)}
     kinds |= dict.fromkeys(("calibration", "refined_track", "assessment", "page"), ("flight",))
     for name, where, _ in places_of(finished_tiny):
-        if name not in {"speed_accuracy", "whole"}:
+        if name not in {"speed_accuracy", "whole", "report"}:
             job = job_of(name, kinds.get(name, ("flight", "pair")[: len(where)]))
             assert job.command == f"apertura {rules[job.rule]}"
     assert set(kinds) <= set(RESULTS)

@@ -75,7 +75,7 @@ def test_qgis_agrees_with_rasterio_on_every_raster_finds_every_style_and_changes
         if name.endswith("db.tif"):
             radiometry = json.loads(rasterio.open(path).tags()["APERTURA_RADIOMETRY"])
             top = radiometry["peak_db"]
-            assert found["stretch"] == pytest.approx([top + radiometry["noise_floor_db"], top], abs=0.01)
+            assert found["stretch"] == pytest.approx([top + radiometry["noise_floor_re_peak_db"], top], abs=0.01)
         if name.endswith("mask.tif"):
             assert found["classes"]["2"] == ["layover", 255]
             assert found["classes"]["0"] == ["valid", 0]
@@ -169,8 +169,8 @@ def test_qgis_paints_the_brightest_place_white_and_the_noise_floor_black(finishe
         decibel, radiometry = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(picture) as png:
         grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels, four dots each
-    floor_db = radiometry["peak_db"] + radiometry["noise_floor_db"]
-    expected = np.clip((decibel - floor_db) / -radiometry["noise_floor_db"], 0, 1) * 255
+    floor_db = radiometry["peak_db"] + radiometry["noise_floor_re_peak_db"]
+    expected = np.clip((decibel - floor_db) / -radiometry["noise_floor_re_peak_db"], 0, 1) * 255
     assert np.abs(grey - expected).max() < 3
 
 

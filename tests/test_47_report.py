@@ -1,10 +1,13 @@
 """The report of a finished campaign: what it shows agrees with what its images say."""
 
+import json
+
 import numpy as np
 import pytest
 from docutils.core import publish_parts
 from folders import complaint, copy_writable, edit_config
 
+from apertura.audit.tags import read_tags
 from apertura.campaign import Campaign
 from apertura.report.phase import steadiness
 from apertura.steps.page import landing, page
@@ -35,6 +38,15 @@ def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_ma
     assert "results/f01/uav1-uav1/pictures.manifest.json" in listed["sources"]
 
 
+@pytest.mark.parametrize("manifest", ["uav1-uav2/pictures", "page"])
+def test_every_picture_says_what_it_was_made_from(reported, manifest):
+    path = reported.result("f01", f"{manifest}.manifest.json")
+    listed = read_manifest(path)
+    for name in listed["files"]:
+        if name.endswith(".png"):
+            assert json.loads(read_tags(path.parent / name)["APERTURA_SOURCES"]) == listed["sources"]
+
+
 def test_the_page_holds_every_picture_every_decision_and_the_campaigns_name_as_text(reported):
     html = reported.result("f01", "report.html").read_text()
     report = reported.result("f01", "uav1-uav2", "image.json")
@@ -48,8 +60,6 @@ def test_the_page_holds_every_picture_every_decision_and_the_campaigns_name_as_t
 
 
 def _models(path):
-    import json
-
     return json.loads(path.read_text())["models"]
 
 

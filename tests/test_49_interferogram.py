@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from folders import complaint, contents, copy_writable, edit_config, run_steps
 
+from apertura.audit.verify import print_verified
 from apertura.campaign import Campaign
 from apertura.export import exports_in
 from apertura.lineage import result_of
@@ -123,6 +124,10 @@ def test_its_lineage_names_both_images_and_all_that_their_geometry_is_from(small
             assert f"results/{flight}/uav1-uav1/{stage}.manifest.json" in sources
     manifest = json.loads((small / "results/interferometry" / NAME / "interferogram.manifest.json").read_text())
     assert set(manifest["sources"]) == set(sources)
+
+
+def test_verify_finds_every_link_as_it_was(small, capsys):
+    assert print_verified(small, quiet=True) == 0, capsys.readouterr().out
 
 
 def test_heights_of_sparse_ground_lie_about_the_ramp(small):

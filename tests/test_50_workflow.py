@@ -51,6 +51,14 @@ def larger(root):
     path.write_text(yaml.safe_dump(document))
 
 
+def test_a_name_that_looks_like_a_wildcard_is_text(tiny):
+    path = tiny / "config" / "config.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"campaign": "{{7*7}} {config} {flight} %s"}))
+    code, output = finished(snakemake(tiny, "-n", "all", "pages", "phase_history", "whole_chart"))
+    assert code == 0, output
+    assert "Job stats" in output
+
+
 @pytest.mark.slow
 def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_touches(tiny):
     code, output = finished(snakemake(tiny))

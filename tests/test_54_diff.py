@@ -171,7 +171,7 @@ def test_lines_are_bounded_and_printable(tmp_path, capsys):
     assert print_differences(tmp_path / "a.json", tmp_path / "b.json") == 1
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 21
-    assert lines[-1].endswith("and 480 more")
+    assert lines[-1].endswith("and 480 more: --all")
     assert all(line.isprintable() and len(line) < 420 for line in lines)
 
 

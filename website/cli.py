@@ -12,7 +12,8 @@ from apertura.cli import app
 _HEAD = """# Command line
 
 `apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something has to be seen to, in one message;
-130, ended by a signal; 1, a defect of apertura. Written by `make pages` from the commands.
+130, ended by a signal; 1, what `verify`, `diff`, `reproduce` or `check-crate` was asked about is
+not the same, or a defect of apertura. Written by `make pages` from the commands.
 """
 
 

@@ -56,13 +56,15 @@ def reproduce(
 def diff(
     first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
     second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+    *,
+    whole: Annotated[bool, typer.Option("--all", help="every line of a section, however many")] = False,
 ) -> None:
     """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
     there = second.absolute()
     path = leave_working_folder(first)
     from apertura.audit.diff import print_differences
 
-    raise typer.Exit(print_differences(path, there))
+    raise typer.Exit(print_differences(path, there, whole=whole))
 
 
 def check_crate(

@@ -52,7 +52,8 @@ export class Places {
     if (!this.toGeographic) return '';
     const [longitude, latitude] = this.toGeographic([...at]);
     const decimals = this.decimals + 5;
-    return `${number(latitude, decimals)}° N  ${number(longitude, decimals)}° E`;
+    const part = (degrees, ahead, behind) => `${number(Math.abs(degrees), decimals)}° ${degrees < 0 ? behind : ahead}`;
+    return `${part(latitude, 'N', 'S')}  ${part(longitude, 'E', 'W')}`;
   }
 
   /** By how much true north lies to the right of the map's, degrees; null where nothing is north. */

@@ -48,7 +48,7 @@ rule whole_chart:
         mem_mb=asked["whole_chart"].mem_mb,
         runtime=asked["whole_chart"].runtime,
     params:
-        settings=campaign.values,
+        settings=lambda _: campaign.values,
         code=code_of("whole"),
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"

@@ -39,7 +39,7 @@ rule calibrate:
         mem_mb=asked["calibrate"].mem_mb,
         runtime=asked["calibrate"].runtime,
     params:
-        settings=campaign.relevant("calibration"),
+        settings=lambda _: campaign.relevant("calibration"),
         code=code_of("calibration"),
     message:
         "{wildcards.flight}: estimating path offsets from the reflector"

@@ -27,7 +27,7 @@ rule export:
         mem_mb=asked["export"].mem_mb,
         runtime=asked["export"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("export"),
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
@@ -53,7 +53,7 @@ rule cphd:
         mem_mb=asked["cphd"].mem_mb,
         runtime=asked["cphd"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("cphd"),
     message:
         "{wildcards.flight}: writing the phase history of {wildcards.pair}"
@@ -89,7 +89,7 @@ rule export_fused:
         mem_mb=asked["export_fused"].mem_mb,
         runtime=asked["export_fused"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("fused"),
     message:
         "{wildcards.flight}: writing what the pairs add up to"
@@ -115,7 +115,7 @@ rule coverage:
         mem_mb=asked["coverage"].mem_mb,
         runtime=asked["coverage"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("coverage"),
     message:
         "drawing what the flights cover"
@@ -140,7 +140,7 @@ rule mosaic:
         mem_mb=asked["mosaic"].mem_mb,
         runtime=asked["mosaic"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("mosaic"),
     message:
         "laying the files of all flights upon one another"

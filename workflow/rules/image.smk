@@ -20,7 +20,7 @@ rule scene:
         mem_mb=asked["scene"].mem_mb,
         runtime=asked["scene"].runtime,
     params:
-        settings=result_of(campaign, "scene").settings,
+        settings=lambda _: result_of(campaign, "scene").settings,
         code=code_of("scene"),
     message:
         "settling the campaign's grid"
@@ -44,7 +44,7 @@ rule terrain:
         mem_mb=asked["terrain"].mem_mb,
         runtime=asked["terrain"].runtime,
     params:
-        settings=campaign.relevant("terrain"),
+        settings=lambda _: campaign.relevant("terrain"),
         code=code_of("terrain"),
     message:
         "bringing the DEM onto the campaign's grid"
@@ -93,7 +93,7 @@ rule refine:
         mem_mb=asked["refine"].mem_mb,
         runtime=asked["refine"].runtime,
     params:
-        settings=campaign.relevant("refined_track"),
+        settings=lambda _: campaign.relevant("refined_track"),
         code=code_of("refined_track"),
     message:
         "{wildcards.flight}: refining the tracks of its nodes where that pays"
@@ -172,7 +172,7 @@ rule assess:
         mem_mb=asked["assess"].mem_mb,
         runtime=asked["assess"].runtime,
     params:
-        settings=campaign.relevant("assess"),
+        settings=lambda _: campaign.relevant("assess"),
         code=code_of("assessment"),
     message:
         "{wildcards.flight}: comparing the images with each other"

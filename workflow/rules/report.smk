@@ -24,7 +24,7 @@ rule pictures:
         mem_mb=asked["pictures"].mem_mb,
         runtime=asked["pictures"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("pictures"),
     message:
         "{wildcards.flight}: drawing {wildcards.pair} for the report"
@@ -60,7 +60,7 @@ rule page:
         mem_mb=asked["page"].mem_mb,
         runtime=asked["page"].runtime,
     params:
-        settings=campaign.settings.campaign,
+        settings=lambda _: campaign.settings.campaign,
         code=code_of("page"),
     message:
         "{wildcards.flight}: writing the page of the report"

@@ -165,7 +165,8 @@ class Chain:
             folder, _, stage = source.rpartition("/")
             if stage == "image.manifest.json":
                 spec = _spec(inside(self.root, f"{folder}/image.zarr/zarr.json", where=link.name))
-                if spec is not None and spec not in (told, told.get(folder.rpartition("/")[2])):
+                image = folder.removeprefix("results/")  # of several, each has its own under its name
+                if spec is not None and spec not in (told, told.get(image), told.get(image.rpartition("/")[2])):
                     link.add("changed", f"APERTURA_RUNSPEC: {folder}/image.zarr was made with other settings")
 
 

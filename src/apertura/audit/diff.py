@@ -57,8 +57,7 @@ def _lines(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
     if bool(one) != bool(other):
         return [f"{len(one or other)} entries → absent" if one else f"absent → {len(other)} entries"]
     keys = [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
-    lines = [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys[:_LINES]]
-    return [*lines, f"and {len(keys) - _LINES} more"] if len(keys) > _LINES else lines
+    return [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys]
 
 
 def _cut(text: str | None) -> str:
@@ -203,10 +202,13 @@ def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:
     return f"{(10 if power else 20) * np.log10(value / tally.peak):.1f} dB"
 
 
-def print_differences(first: Path, second: Path) -> int:
+def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
     """Print what tells two products apart, a line each; return 0 if nothing does, else 1; raises as `differences`."""
     found = differences(first, second)
     for section, lines in found.items():
-        for line in lines or ["same"]:
+        most = len(lines) if whole else _LINES
+        for line in lines[:most] or ["same"]:
             print(shown(f"{section:<9}{line}", 400))
+        if len(lines) > most:
+            print(f"{section:<9}and {len(lines) - most} more: --all")
     return 1 if any(found.values()) else 0

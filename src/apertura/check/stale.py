@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -84,9 +85,28 @@ def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) ->
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
     for manifest in reversed(list(stale)) if remove else ():  # what stands on others first: a kill leaves no gap below
+        for kept in _kept(campaign.root, manifest):
+            print(f"what was edited by hand is kept as {kept}", file=sys.stderr, flush=True)
         (campaign.root / manifest).unlink(missing_ok=True)
     if stale and not remove:
         print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
+
+
+def _kept(root: Path, manifest: str) -> Iterator[str]:
+    """Put files of a result that were edited since out of the workflow's way; yield their new names."""
+    path = root / manifest
+    try:
+        files = read_manifest(path)["files"]
+    except CampaignError:  # nobody knows how they were
+        return
+    for name, digest in files.items():
+        file = inside(path.parent, name, where=path)
+        if ".zarr/" in name or not file.is_file() or digest_of(root, file.relative_to(root).as_posix()) == digest:
+            continue
+        free = (file.with_stem(f"{file.stem}.edited{f'-{number}' if number else ''}") for number in count())
+        kept = next(other for other in free if not other.exists())
+        file.rename(kept)
+        yield kept.relative_to(root).as_posix()
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:

@@ -110,8 +110,8 @@ def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.E
 def _common(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what the rasters agree on of what their values mean, and levels that span them all."""
     common = {name: value for name, value in told[-1].items() if all(one.get(name) == value for one in told)}
-    if all({"peak_db", "noise_floor_db"} <= one.keys() for one in told):
+    if all({"peak_db", "noise_floor_re_peak_db"} <= one.keys() for one in told):
         top = max(one["peak_db"] for one in told)
-        floor = min(one["peak_db"] + one["noise_floor_db"] for one in told)
-        common |= {"peak_db": top, "noise_floor_db": round(floor - top, 2)}
+        floor = min(one["peak_db"] + one["noise_floor_re_peak_db"] for one in told)
+        common |= {"peak_db": top, "noise_floor_re_peak_db": round(floor - top, 2)}
     return common

@@ -28,7 +28,7 @@ class Radiometry:
         Pair → largest amplitude of its image, by which it was divided before it was added.
     phases_taken_off_rad
         Pair → constant phase taken off before it was added; pairs that a coherent sum leaves out are missing.
-    peak_db, noise_floor_db
+    peak_db, noise_floor_re_peak_db
         Power of the brightest target, dB re 1; median power against the peak, dB; None where nobody measured.
     """
 
@@ -38,9 +38,9 @@ class Radiometry:
     divided_by: Mapping[str, float] = field(default_factory=dict)
     phases_taken_off_rad: Mapping[str, float] = field(default_factory=dict)
     peak_db: float | None = None
-    noise_floor_db: float | None = None
+    noise_floor_re_peak_db: float | None = None
 
-    def measured(self, amplitude: float, noise_floor_db: float) -> "Radiometry":
+    def measured(self, amplitude: float, noise_floor_re_peak_db: float) -> "Radiometry":
         """Return it with the largest amplitude of one raster, and its median power against that.
 
         Examples
@@ -48,7 +48,9 @@ class Radiometry:
         >>> ECHO.measured(10.0, -49.0).peak_db
         20.0
         """
-        return replace(self, peak_db=round(20 * log10(amplitude), 2) + 0.0, noise_floor_db=noise_floor_db)
+        return replace(
+            self, peak_db=round(20 * log10(amplitude), 2) + 0.0, noise_floor_re_peak_db=noise_floor_re_peak_db
+        )
 
     @property
     def report(self) -> dict[str, Any]:

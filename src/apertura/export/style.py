@@ -50,7 +50,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     >>> from apertura.export.db import write_db
     >>> with TemporaryDirectory() as folder:
     ...     image, path = np.full((2, 3), 1j, "c8"), Path(folder) / "db.qml"
-    ...     tags = {TAG: '{"peak_db": 32.0, "noise_floor_db": -49.0}'}
+    ...     tags = {TAG: '{"peak_db": 32.0, "noise_floor_re_peak_db": -49.0}'}
     ...     write_db(path.with_suffix(".tif"), image, transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags=tags)
     ...     write_db_style(path)
     ...     [line.strip() for line in path.read_text().splitlines() if "Value>" in line]
@@ -58,7 +58,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     """
     with rasterio.open(_beside(path)) as raster:
         about = json.loads(raster.tags().get(TAG, "{}"))
-    top, below = about.get("peak_db"), about.get("noise_floor_db")
+    top, below = about.get("peak_db"), about.get("noise_floor_re_peak_db")
     if top is None or below is None:
         raise ContractError(f"{path.name}: no peak and noise floor in tag {TAG}")
     _write(path, _grey(round(top + min(below, -_LEAST_DB), 2), round(top, 2)))
@@ -121,10 +121,8 @@ def _few(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
 
 def _round_ends(values: NDArray[np.float32]) -> tuple[float, float]:
     """Return the ends of some values, rounded outwards to a tenth of the power of ten below their span."""
-    if not values.size:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    step = 10.0 ** floor(log10(max(high - low, 1e-3 * abs(high), 1e-9))) / 10
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    step = 10.0 ** floor(log10(high - low)) / 10 if high > low else 1.0
     return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
 
 

@@ -26,7 +26,7 @@ __all__ = [
     "results_of",
 ]
 
-ON_DEMAND = frozenset({"cphd", "page", "pictures", "speed_accuracy", "whole"})
+ON_DEMAND = frozenset({"cphd", "page", "pictures", "report", "speed_accuracy", "whole"})
 """Results that are made when they are asked for, and not with the images."""
 
 
@@ -95,6 +95,7 @@ def _order(campaign: Campaign) -> Iterator[tuple[str, ...]]:
     for flight in campaign.image_flights:
         yield from (("pictures", flight.name, pair) for pair in flight.pairs)
         yield "page", flight.name
+    yield ("report",)
     yield ("map",)
     yield from (("speed_accuracy",), ("whole",))
     yield ("ro_crate",)

@@ -116,6 +116,11 @@ def _page(campaign: Campaign, flight: str) -> Result:
     return Result(campaign.manifest("page", flight), sources, campaign.values)
 
 
+def _report(campaign: Campaign) -> Result:
+    pages = tuple(campaign.manifest("page", flight.name) for flight in campaign.image_flights)
+    return Result(campaign.manifest("report"), (*pages, campaign.manifest("coverage")), campaign.values)
+
+
 def _speed_accuracy(campaign: Campaign) -> Result:
     formed, pair = image(campaign, *charted(campaign)), list(charted(campaign))
     return Result(campaign.manifest("speed_accuracy", STUDY), formed.sources, {"pair": pair, **formed.settings})
@@ -143,6 +148,7 @@ PRODUCTS: Mapping[str, Callable[..., Result]] = {
     "stac": _stac,
     "pictures": _pictures,
     "page": _page,
+    "report": _report,
     "map": _map,
     "interferogram": _interferogram,
     "speed_accuracy": _speed_accuracy,

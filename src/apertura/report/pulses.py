@@ -76,7 +76,9 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
 
 def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     last = float(record.sent_s.max()) if record.sent_s.size else 0.0
-    edges = np.linspace(0.0, last or 1.0, _BINS + 1)
+    interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
+    width = interval * max(1, np.ceil(last / interval / _BINS))  # of whole intervals, else columns seem to lack pulses
+    edges = np.arange(-interval / 2, last + width, width)
     kept, left = (np.histogram(record.sent_s[some], edges)[0] for some in (record.kept, ~record.kept))
     axes.stairs(kept, edges, fill=True, color=BLUE, label=f"kept: {int(record.kept.sum())}")
     axes.stairs(
@@ -90,7 +92,7 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
         linewidth=0,
         label=f"left out: {int((~record.kept).sum())}{_why(record.reasons)}",
     )
-    axes.set(title="pulses", ylabel=f"pulses in {edges[1]:.2g} s", ylim=(0, 1.45 * max(1, (kept + left).max())))
+    axes.set(title="pulses", ylabel=f"pulses in {width:.2g} s", ylim=(0, 1.45 * max(1, (kept + left).max())))
     axes.legend(loc="upper right", ncols=2)
 
 

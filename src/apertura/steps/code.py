@@ -10,6 +10,7 @@ _MODULES = {
     "refined_track": "apertura.steps.refine",
     "assessment": "apertura.steps.assess",
     "fused": "apertura.steps.export",
+    "report": "apertura.steps.page",
     "map": "apertura.steps.webmap",
     "speed_accuracy": "apertura.study.chart.speed_accuracy",
     "whole": "apertura.study.chart.whole",

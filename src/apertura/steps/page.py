@@ -9,7 +9,7 @@ from rasterio.enums import Resampling
 
 from apertura.atomic import replacement, write_text
 from apertura.campaign import Campaign
-from apertura.digests import Result
+from apertura.digests import Lineage
 from apertura.documents import undamaged
 from apertura.errors import CampaignError, shown
 from apertura.lineage import result_of
@@ -37,6 +37,7 @@ from apertura.report.words import (
 )
 from apertura.scene.raster import opened_raster
 from apertura.steps.pictures import PICTURES
+from apertura.steps.stamping import tags_of
 from apertura.store import open_listed, open_stage, read_manifest, record_files
 
 PAGE = "report.html"
@@ -50,7 +51,7 @@ def page(campaign: Campaign, flight: str) -> list[Path]:
     lineage = result_of(campaign, "page", flight).begin(campaign.root, [__name__])
     reports = reports_of(campaign, flight)
     panels, text = campaign.result(flight, "fused", PANELS), campaign.result(flight, PAGE)
-    _write_panels(panels, campaign, flight, reports["fused"])
+    _write_panels(panels, campaign, flight, reports["fused"], lineage)
     title = f"{campaign.settings.campaign}, flight {flight}"
     write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
     written = [text, panels]
@@ -128,7 +129,7 @@ def _checked(path: Path, manifest: str, folder: Path) -> bytes:
     return path.read_bytes()
 
 
-def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any]) -> None:
+def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
     scene, pairs = settled_scene(campaign), campaign.flight(flight).pairs[:_MOST_PANELS]
     files = {pair: campaign.result(flight, pair, "power.tif") for pair in pairs}
     for kind in ("coherent", "noncoherent"):
@@ -142,7 +143,7 @@ def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[st
     west, south, east, north = scene.grid.bounds_m
     brightest = fused["brightest"]["x_m"] - west, fused["brightest"]["y_m"] - south
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    tags = Provenance.of([__name__], images).tags()
+    tags = tags_of(Provenance.of([__name__], images), lineage)
     draw_panels(
         path, powers, size_m=(east - west, north - south), target_m=brightest, title=f"flight {flight}", tags=tags
     )
@@ -203,9 +204,7 @@ def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     known = read_manifest(manifest)["files"].get(PAGE) if manifest.is_file() else None
     if path.exists() and known != sha256_file(path):
         raise CampaignError("not as it was written", path, "no file, or the report as it was", "Move it away.")
-    pages = tuple(campaign.manifest("page", flight.name) for flight in campaign.image_flights)
-    made_from = Result(campaign.relative(manifest), (*pages, campaign.manifest("coverage")), campaign.values)
-    lineage = made_from.begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "report").begin(campaign.root, [__name__])
     with replacement(path) as temporary:
         yield temporary, shipped() / "workflow" / "report" / "report.css"
     record_files(manifest, [path], lineage)

@@ -33,6 +33,7 @@ from apertura.report.sheet import thinned
 from apertura.report.waterfall import Waterfall, draw_waterfall
 from apertura.settings import SampledWaveform
 from apertura.steps.coverage import crs_name, few_looks
+from apertura.steps.stamping import tags_of
 from apertura.store import blocks_of_rows, open_stage, record_files
 
 Floats = NDArray[np.float64]
@@ -48,7 +49,7 @@ def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     written = [campaign.result(flight, pair, "pictures", f"{name}.png") for name in PICTURES]
     geometry, pulses, phase, cuts, profiles, budget = written
     origin = Provenance.of([__name__], [shown.echo, shown.profile, shown.image], settings=shown.scene.spec)
-    drawn: dict[str, Any] = {"title": f"flight {flight}, {pair}", "tags": origin.tags()}
+    drawn: dict[str, Any] = {"title": f"flight {flight}, {pair}", "tags": tags_of(origin, lineage)}
     quality = shown.image.attrs["quality"]
     draw_geometry(geometry, shown.geometry(), **drawn)
     draw_pulses(pulses, shown.record(), **drawn)

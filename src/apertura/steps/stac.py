@@ -62,8 +62,12 @@ class _Described:
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
-        mode = "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"
-        told = {"sar:instrument_mode": mode, "sar:product_type": "SLC", "sar:looks_range": 1, "sar:looks_azimuth": 1}
+        told = {
+            "sar:instrument_mode": _mode(pair),
+            "sar:product_type": "SLC",
+            "sar:looks_range": 1,
+            "sar:looks_azimuth": 1,
+        }
         return Image(
             flight,
             pair,
@@ -77,7 +81,10 @@ class _Described:
     def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
         others = tuple(f"{other}_" for other in _SUMS if other != name)
         listed = self._listed(flight, "fused", "export")
-        told = {"sar:instrument_mode": "multistatic", "sar:product_type": _SUMS[name]}
+        told = {
+            "sar:instrument_mode": "multistatic" if len(pairs) > 1 else _mode(pairs[0].name),
+            "sar:product_type": _SUMS[name],
+        }
         return Image(
             flight,
             name,
@@ -159,3 +166,8 @@ def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
     """Return the widths at -3 dB of an image's brightest point, as they were measured."""
     widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
     return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
+
+
+def _mode(pair: str) -> str:
+    """Return whether a pair's transmitter is its receiver, in the words of the extension sar."""
+    return "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"
