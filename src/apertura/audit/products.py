@@ -58,7 +58,8 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
     product = Product(results.parent, _manifest(results, path), path) if results is not None else Product(path.parent)
     known = (product.root / product.manifest).is_file()
     if not path.exists() and not known:
-        raise CampaignError("no such file or folder", path, _EXPECTED, "Correct the path.")
+        remedy = "Correct the path." if results is None else "Correct the path, or run the workflow (`apertura run`)."
+        raise CampaignError("no such file or folder", path, _EXPECTED, remedy)
     if not known and not (product.root / CONFIG).is_file():
         remedy = "Name the folder of its campaign with --campaign."
         raise CampaignError("lies in no campaign: its chain cannot be walked", path, "a file below results/", remedy)
