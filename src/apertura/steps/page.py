@@ -195,16 +195,10 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
 
-    Raises
-    ------
-    CampaignError
-        If results/report.html is there and is not as it was written: it is somebody's own, and is not overwritten.
+    What it is made from is looked at when it is written: snakemake settles the times of files before.
     """
-    path, manifest = campaign.result(PAGE), campaign.result("report.manifest.json")
-    known = read_manifest(manifest)["files"].get(PAGE) if manifest.is_file() else None
-    if path.exists() and known != sha256_file(path):
-        raise CampaignError("not as it was written", path, "no file, or the report as it was", "Move it away.")
-    lineage = result_of(campaign, "report").begin(campaign.root, [__name__])
+    path = campaign.result(PAGE)
     with replacement(path) as temporary:
         yield temporary, shipped() / "workflow" / "report" / "report.css"
-    record_files(manifest, [path], lineage)
+        lineage = result_of(campaign, "report").begin(campaign.root, [__name__])
+    record_files(campaign.root / lineage.result.manifest, [path], lineage)
