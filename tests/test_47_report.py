@@ -9,9 +9,10 @@ from folders import complaint, copy_writable, edit_config
 
 from apertura.audit.tags import read_tags
 from apertura.campaign import Campaign
+from apertura.report import PICTURES
 from apertura.report.phase import steadiness
 from apertura.steps.page import landing, page
-from apertura.steps.pictures import PICTURES, Shown, pictures
+from apertura.steps.pictures import Shown, pictures
 from apertura.store import open_document, read_manifest
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"

@@ -81,10 +81,10 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
         str(tiny),
         "--cores",
         "2",
-        "--set-scatter",
-        "tiles=2",
         "all",
         "pages",
+        "--set-scatter",
+        "tiles=2",
     ]
     done = subprocess.run(command, cwd=ROOT, env=environment, text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -83,7 +83,8 @@ def report(
 ) -> None:
     """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
     from apertura.campaign import Campaign
-    from apertura.steps.page import PAGE, open_report
+    from apertura.report import PAGE
+    from apertura.steps.page import open_report
     from apertura.workflow import run_workflow
 
     campaign = campaign.absolute()

@@ -16,6 +16,7 @@ from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.paths import shipped
 from apertura.provenance import Provenance, sha256_file
+from apertura.report import PAGE, PANELS, PICTURES
 from apertura.report.landing import rst_table, rst_text
 from apertura.report.page import Block, Heading, Paragraph, Picture, Table
 from apertura.report.page import page as page_of
@@ -36,12 +37,9 @@ from apertura.report.words import (
     verdict_row,
 )
 from apertura.scene.raster import opened_raster
-from apertura.steps.pictures import PICTURES
 from apertura.steps.stamping import tags_of
 from apertura.store import open_listed, open_stage, read_manifest, record_files
 
-PAGE = "report.html"
-PANELS = "panels.png"
 _DOTS = 480  # of the longer side of a panel
 _MOST_PANELS = 2  # pairs beside their sums
 

@@ -24,6 +24,7 @@ from apertura.load.scene import OpenScene, open_scene
 from apertura.progress import progress
 from apertura.provenance import Provenance
 from apertura.quality.point_targets import cut_through, find_peak, line_through
+from apertura.report import PICTURES
 from apertura.report.budget import Measured, draw_budget
 from apertura.report.cuts import DrawnCut, draw_cuts
 from apertura.report.geometry import FlownGeometry, draw_geometry
@@ -37,9 +38,6 @@ from apertura.steps.stamping import tags_of
 from apertura.store import blocks_of_rows, open_stage, record_files
 
 Floats = NDArray[np.float64]
-
-PICTURES = ("geometry", "pulses", "phase", "cuts", "range_profiles", "budget")
-"""What is drawn of a pair, in the order in which it is read."""
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
