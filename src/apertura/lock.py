@@ -11,7 +11,7 @@ from typing import IO
 from apertura.errors import CampaignError, shown
 
 _LOCK = Path("results/.run.lock")
-_TRIES, _BETWEEN_S = 3, 0.05
+_TRIES, _BETWEEN_S = 20, 0.02
 
 
 def hold(root: Path) -> IO[str]:
