@@ -137,7 +137,6 @@ COVERAGE = ("coverage.png", "coverage.geojson")
 MOSAICS = "mosaic"
 """Folder of the rasters of all flights."""
 
-
 MAP = "map/index.html"
 """The page that shows all of them in a browser."""
 

@@ -1,8 +1,12 @@
-"""A layer of a pair, opened as the workflow left it."""
+"""A layer of a pair, opened as the workflow left it; any raster, read to few places."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
@@ -32,3 +36,24 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
         raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
     with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
         yield raster
+
+
+def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
+    """Return a raster averaged to few places, from its overviews.
+
+    Parameters
+    ----------
+    raster
+        Open for reading.
+    dots
+        Places along the longer side, at most.
+
+    Returns
+    -------
+    ndarray
+        (row, column) float32.
+    """
+    fewer = max(1.0, max(raster.shape) / dots)
+    shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
+    values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
+    return values

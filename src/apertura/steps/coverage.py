@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rasterio import Affine
-from rasterio.enums import Resampling
 
 from apertura.atomic import replacement
 from apertura.campaign import Campaign
@@ -15,7 +14,7 @@ from apertura.export.coverage import Covered, feature_collection, write_coverage
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
 from apertura.imaging.stages import aperture_of
 from apertura.lineage import result_of
-from apertura.load.layer import opened_layer
+from apertura.load.layer import averaged, opened_layer
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.provenance import Provenance, canonical_json
 from apertura.scene.grid import SceneGrid
@@ -64,10 +63,7 @@ def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]
         If the file is not as step `layers` wrote it.
     """
     with opened_layer(campaign, flight, pair, "looks.tif") as raster:
-        fewer = max(1.0, max(raster.shape) / _DOTS)
-        shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
-        looks: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
-    return looks
+        return averaged(raster, _DOTS)
 
 
 def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:

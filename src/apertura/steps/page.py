@@ -5,14 +5,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rasterio.enums import Resampling
-
 from apertura.atomic import replacement, write_text
 from apertura.campaign import Campaign
 from apertura.digests import Lineage
 from apertura.documents import undamaged
 from apertura.errors import CampaignError, shown
 from apertura.lineage import result_of
+from apertura.load.layer import averaged
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.paths import shipped
 from apertura.provenance import Provenance, sha256_file
@@ -135,9 +134,7 @@ def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[st
     powers = {}
     for name, file in files.items():
         with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
-            fewer = max(1.0, max(raster.shape) / _DOTS)
-            shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
-            powers[name] = raster.read(1, out_shape=shape, resampling=Resampling.average).astype("f8")
+            powers[name] = averaged(raster, _DOTS).astype("f8")
     west, south, east, north = scene.grid.bounds_m
     brightest = fused["brightest"]["x_m"] - west, fused["brightest"]["y_m"] - south
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
