@@ -4,6 +4,7 @@
 #include <string>
 
 #include "job.hpp"
+#include "tree_job.hpp"
 
 namespace {
 
@@ -84,6 +85,48 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(EchoJob, samples_per_metre),
     APERTURA_FIELD(EchoJob, turns_per_metre),
     {"EchoJob", 0, sizeof(EchoJob)},
+    APERTURA_FIELD(TreeTile, surface),
+    APERTURA_FIELD(TreeTile, pixels),
+    APERTURA_FIELD(TreeTile, image),
+    APERTURA_FIELD(TreeTile, weight),
+    APERTURA_FIELD(TreeTile, way),
+    APERTURA_FIELD(TreeTile, nodes),
+    APERTURA_FIELD(TreeTile, centre),
+    APERTURA_FIELD(TreeTile, degree),
+    APERTURA_FIELD(TreeTile, rows),
+    APERTURA_FIELD(TreeTile, columns),
+    APERTURA_FIELD(TreeTile, row_slot),
+    APERTURA_FIELD(TreeTile, column_slot),
+    APERTURA_FIELD(TreeTile, top),
+    {"TreeTile", 0, sizeof(TreeTile)},
+    APERTURA_FIELD(TreeJob, samples),
+    APERTURA_FIELD(TreeJob, start),
+    APERTURA_FIELD(TreeJob, transmitter),
+    APERTURA_FIELD(TreeJob, receiver),
+    APERTURA_FIELD(TreeJob, stray),
+    APERTURA_FIELD(TreeJob, taps),
+    APERTURA_FIELD(TreeJob, supports),
+    APERTURA_FIELD(TreeJob, places),
+    APERTURA_FIELD(TreeJob, spread),
+    APERTURA_FIELD(TreeJob, mix),
+    APERTURA_FIELD(TreeJob, tiles),
+    APERTURA_FIELD(TreeJob, first),
+    APERTURA_FIELD(TreeJob, pulses),
+    APERTURA_FIELD(TreeJob, length),
+    APERTURA_FIELD(TreeJob, up),
+    APERTURA_FIELD(TreeJob, lead),
+    APERTURA_FIELD(TreeJob, stride),
+    APERTURA_FIELD(TreeJob, count),
+    APERTURA_FIELD(TreeJob, levels),
+    APERTURA_FIELD(TreeJob, mono),
+    APERTURA_FIELD(TreeJob, phase_polynomial),
+    APERTURA_FIELD(TreeJob, expanded),
+    APERTURA_FIELD(TreeJob, sizes),
+    APERTURA_FIELD(TreeJob, step),
+    APERTURA_FIELD(TreeJob, wavenumber),
+    APERTURA_FIELD(TreeJob, band),
+    APERTURA_FIELD(TreeJob, phase_coefficients),
+    {"TreeJob", 0, sizeof(TreeJob)},
 };
 
 struct Constant {

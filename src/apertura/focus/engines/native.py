@@ -15,16 +15,10 @@ from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines.engine import EngineOptions
 from apertura.focus.engines.native_beams import weights_of
-from apertura.focus.engines.native_binding import (
-    INSTRUCTION_SETS,
-    ApertureJob,
-    TableJob,
-    available,
-    call,
-    instruction_set,
-)
+from apertura.focus.engines.native_binding import INSTRUCTION_SETS, available, call, instruction_set
 from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.engines.native_prediction import candidates
+from apertura.focus.engines.native_structs import ApertureJob, TableJob
 from apertura.focus.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table
 from apertura.focus.inputs import Profiles
 

@@ -138,7 +138,7 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
     return float(10 * np.log10((squared_error * power).sum() / power.sum()))
 
 
-def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
+def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
     """Return (cells, samples) that cover the same path, with at least `oversampling` cells per Nyquist cell.
 
     Examples
@@ -152,7 +152,7 @@ def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
 
 @lru_cache(maxsize=64)
 def design_table(
-    profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: int, degree: int
+    profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: float, degree: int
 ) -> TableDesign:
     """Design the filters and the phase polynomials of a table, and predict its error.
 

@@ -1,0 +1,194 @@
+"""What trees of all tiles share: profiles, the filters that expand them, and tables for what goes directly."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.engines import native
+from apertura.focus.engines.native_tables import TableDesign, Tables, design_table
+from apertura.focus.engines.tree_surface import Surface
+from apertura.focus.inputs import Profiles
+
+LEAF = 16
+"""Pulses that a leaf sums at its nodes one by one."""
+
+CELLS_AT_ONCE = 4
+"""Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
+
+_SAMPLED = 64  # pulses at which a rough tile is looked at
+
+
+class Directly(NamedTuple):
+    """How the direct kernel takes what a tree cannot."""
+
+    oversampling: int
+    tolerance_rad: float
+
+
+DIRECTLY_AT = {
+    -50: Directly(4, 1.5e-3),
+    -56: Directly(4, 1.5e-3),
+    -62: Directly(5, 1.5e-3),
+    -68: Directly(5, 1.5e-3),
+    -74: Directly(6, 1.5e-3),
+    -80: Directly(8, 7e-4),
+    -86: Directly(10, 3e-4),
+    -92: Directly(12, 1.5e-4),
+}
+"""Error of one interpolation between nodes, dB → the direct kernel's setting beside it, which errs less than a tree."""
+
+
+class _DirectTables:
+    """Tables of the direct kernel, made when a tile first asks for them and shared by all."""
+
+    def __init__(self, profiles: Profiles):
+        self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
+
+    def __getitem__(self, oversampling: int) -> Tables:
+        with self._lock:
+            if oversampling not in self._tables:
+                self._tables[oversampling] = native.prepare(self._profiles, oversampling=oversampling, degree=2)
+            return self._tables[oversampling]
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Pulses as trees read them.
+
+    Attributes
+    ----------
+    profiles
+        The pulses, contiguous.
+    design
+        Of the cells: which filters make them.
+    stray_m
+        (leaf,) float32, metres by which pulses of a leaf leave the parabola through its first, middle and last one.
+    first
+        Number of the first pulse among those prepared.
+    tables
+        Of the direct kernel, for all pulses prepared.
+    """
+
+    profiles: Profiles
+    design: TableDesign
+    stray_m: NDArray[np.float32]
+    first: int
+    tables: _DirectTables
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.profiles)
+
+    def __getitem__(self, pulses: slice) -> "Trees":
+        """Return those of pulses from a multiple of a leaf on."""
+        first, last, _ = pulses.indices(len(self))
+        return replace(
+            self,
+            profiles=self.profiles[first:last],
+            stray_m=self.stray_m[first // LEAF : -(-last // LEAF)],
+            first=self.first + first,
+        )
+
+    def chunks(self, size: int) -> Iterator[slice]:
+        """Yield slices of `size` pulses; they end at the same pulses whichever tile takes them."""
+        first = 0
+        while first < len(self):
+            last = min(len(self), first + size - (self.first + first) % size)
+            yield slice(first, last)
+            first = last
+
+    def direct(self, nodes_db: int) -> Tables:
+        """Return the direct kernel's tables for these pulses."""
+        return self.tables[DIRECTLY_AT[nodes_db].oversampling][self.first : self.first + len(self)]
+
+    def roughness(self, surface: Surface) -> float:
+        """Return the mean squared error of pixels that do not lie on the surface of their tile, relative.
+
+        Notes
+        -----
+        Source: docs/theory/tree.md, eq. 9.
+        """
+        if surface.rough_m == 0 or not np.isfinite(surface.rough_m):
+            return 0.0 if surface.rough_m == 0 else np.inf
+        aperture = self.profiles.aperture[self.profiles.aperture.sample(_SAMPLED)]
+        rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
+        k = 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        return float(surface.rough_m**2 * (k**2 * rate.var() + self.band_rad_m**2 / 3 * (rate**2).mean()))
+
+    @property
+    def band_rad_m(self) -> float:
+        """Half the band as a wavenumber, πB/c."""
+        return float(np.pi / (self.profiles.step_m * self.profiles.oversampling))
+
+
+def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
+    """Return how many cells a sample is expanded to, for at least so many per resolution cell.
+
+    Examples
+    --------
+    >>> cells_per_sample(2.0, 24), cells_per_sample(2.5, 24)
+    (12, 12)
+    """
+    return CELLS_AT_ONCE * int(np.ceil(oversampling / profile_oversampling / CELLS_AT_ONCE - 1e-9))
+
+
+def design(profiles_oversampling: float, carrier_rad_per_sample: float, oversampling: float) -> TableDesign:
+    """Return the filters that expand profiles: straight lines in each cell."""
+    cells = cells_per_sample(profiles_oversampling, oversampling)
+    return design_table(
+        profiles_oversampling, carrier_rad_per_sample, oversampling=cells * profiles_oversampling, degree=1
+    )
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 24) -> Trees:
+    """Return what trees of all tiles share; pulses are expanded to cells later, tile by tile.
+
+    Parameters
+    ----------
+    profiles
+        Band-limited profiles.
+    oversampling
+        Table cells per Nyquist cell c/B of total path, at least.
+
+    Raises
+    ------
+    ValueError
+        If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
+    """
+    if not profiles.oversampling >= 1.5:
+        raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
+    if not len(profiles):
+        raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
+    if not all(np.isfinite(values).all() for values in (profiles.start_m, *profiles.aperture.legs)):
+        raise ValueError("phase centres and starts of the profiles must be finite")
+    held = replace(
+        profiles,
+        samples=np.ascontiguousarray(profiles.samples, np.complex64),
+        start_m=np.ascontiguousarray(profiles.start_m, np.float64),
+    )
+    turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
+    stray = sum(_stray(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs)
+    found = design(profiles.oversampling, turn, oversampling)
+    return Trees(held, found, np.asarray(stray, np.float32), 0, _DirectTables(held))
+
+
+def _stray(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf,) how far pulses of each leaf lie from the parabola through its first, middle and last, metres."""
+    count = -(-len(places_m) // LEAF)
+    padded = np.concatenate([places_m, np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)])
+    leaves = padded.reshape(count, LEAF, 3)
+    x = np.linspace(-1, 1, LEAF)
+    middle = (LEAF - 1) // 2
+    three = np.array([0, middle, LEAF - 1])
+    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
+    rest = leaves - np.einsum("pt,ntc->npc", to_all, leaves[:, three])
+    return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
