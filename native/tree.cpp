@@ -1,14 +1,11 @@
 // Subaperture trees on tiles of pixels, compiled once per instruction set; APERTURA_ISA names the copy.
-#include "tree_leaf.hpp"
-#include "tree_merge.hpp"
 #include "tree_plan.hpp"
+#include "tree_rows.hpp"
 
 #define APERTURA_JOIN2(a, b) a##b
 #define APERTURA_JOIN(a, b) APERTURA_JOIN2(a, b)
 
 namespace {
-
-constexpr int64_t kRowBytes = 1 << 19;  // of cells in work: what the second-level cache holds beside a tile
 
 struct Work {
   Rows rows;
@@ -48,18 +45,25 @@ void climb(const TreeJob& job, TileState& state, int64_t begin, int64_t end, boo
   }
 }
 
+// Sums one leaf of every tile at its nodes: by fewer pulses where they stand for all of them.
 template <class Phase>
-void add_leaf(const TreeJob& job, TileState& state, int64_t begin, int64_t end, Work& work) {
-  const TreeTile& tile = state.tile;
-  const bool taken = tile.way[begin / apertura::kTreeGroup] == apertura::kByTree;
-  if (taken) {
-    const uint8_t* nodes = tile.nodes + 2 * (begin / job.sizes[0]);
-    const LeafNodes& leaf = leaf_of(job, state, nodes[0], nodes[1]);
-    sum_leaf<Phase>(job, state, leaf, begin, end, work.rows, work.leaf);
-    take_reference_off(job, state, leaf, apertura::middle_of(job, begin, job.sizes[0]), pair_stride(nodes[0]),
-                       work.leaf);
+void sum_leaves(const TreeJob& job, std::vector<std::unique_ptr<TileState>>& states, int64_t begin, int64_t end,
+                Work& work) {
+  std::vector<TileState*> plain;
+  for (auto& state : states) {
+    const TreeTile& tile = state->tile;
+    const int64_t number = begin / job.sizes[0];
+    if (tile.way[number] != apertura::kByTree) continue;
+    state->leaf = &leaf_of(job, *state, tile.nodes[2 * number], tile.nodes[2 * number + 1]);
+    for (Floats* plane : {&state->re, &state->im}) plane->assign(size_t(state->leaf->at.count + kLanes), 0.0f);
+    if (!tile.fewer[number])
+      plain.push_back(state.get());
+    else if (job.mono)
+      sum_fewer<Phase, true>(job, *state, *state->leaf, begin, work.leaf);
+    else
+      sum_fewer<Phase, false>(job, *state, *state->leaf, begin, work.leaf);
   }
-  climb(job, state, begin, end, taken, work);
+  if (!plain.empty()) sum_each<Phase>(job, plain, begin, end, work.rows);
 }
 
 template <class Phase>
@@ -68,27 +72,26 @@ void form(const TreeJob& job) {
   for (int64_t n = 0; n < job.count; n++)
     if (job.tiles[n].top >= 0 && any_taken(job, job.tiles[n], 0, job.pulses))
       states.emplace_back(new TileState(job.tiles[n]));
-  if (states.empty()) return;
   Work work;
-  fold_carrier(job, work.rows);
-  const int64_t leaf = job.sizes[0], row = int64_t(sizeof(float)) * kRecord * work.rows.width;
-  const int64_t block = leaf * std::max<int64_t>(1, std::min<int64_t>(apertura::kTreeGroup, kRowBytes / row) / leaf);
-  work.rows.cells.resize(size_t(block * kRecord * work.rows.width));
-  work.rows.padded.resize(size_t(2 * (job.expanded + apertura::kTaps)));
-  for (int64_t begin = 0; begin < job.pulses; begin += block) {
-    const int64_t end = std::min(begin + block, job.pulses);
-    work.rows.begin = begin;
-    for (int64_t pulse = begin; pulse < end; pulse++) expand_pulse(job, pulse, work.rows);
-    for (auto& state : states)
-      for (int64_t at = begin; at < end; at += leaf)
-        add_leaf<Phase>(job, *state, at, std::min(at + leaf, end), work);
+  for (int64_t begin = 0; begin < job.pulses && !states.empty(); begin += job.sizes[0]) {
+    const int64_t end = std::min(begin + job.sizes[0], job.pulses);
+    sum_leaves<Phase>(job, states, begin, end, work);
+    for (auto& state : states) {
+      const bool taken = state->tile.way[begin / job.sizes[0]] == apertura::kByTree;
+      if (taken)
+        take_reference_off(job, *state, *state->leaf, apertura::middle_of(job, begin, job.sizes[0]),
+                           pair_stride(state->leaf->columns), work.leaf);
+      climb(job, *state, begin, end, taken, work);
+    }
   }
 }
 
 }  // namespace
 
-// Fills `top`, `way` and `nodes` of the tiles, and what is to be expanded.
-extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) { plan_tree(*job); }
+// Fills `top`, `way`, `nodes`, `fewer` and the samples of the tiles.
+extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) {
+  for (int64_t n = 0; n < job->count; n++) plan_tile(*job, job->tiles[n]);
+}
 
 // Adds the pulses that go by tree to the image.
 extern "C" void APERTURA_JOIN(apertura_form_tree_, APERTURA_ISA)(TreeJob* job) {

@@ -56,6 +56,23 @@ inline void mix_eta(const float* weight, int64_t terms, const float* pairs, int6
   }
 }
 
+// (8): weights times lines.
+template <int64_t kRows, int64_t kVectors>
+inline void mix_lines(const float* weight, int64_t terms, const float* lines, int64_t wide, int64_t row, int64_t column,
+                      float* out) {
+  Lanes sum[kRows][kVectors] = {};
+  for (int64_t k = 0; k < terms; k++) {
+    Lanes p[kVectors];
+    for (int64_t v = 0; v < kVectors; v++) p[v] = load(lines + k * wide + column + v * kLanes);
+    for (int64_t r = 0; r < kRows; r++) {
+      const float a = weight[(row + r) * terms + k];
+      for (int64_t v = 0; v < kVectors; v++) sum[r][v] += a * p[v];
+    }
+  }
+  for (int64_t r = 0; r < kRows; r++)
+    for (int64_t v = 0; v < kVectors; v++) store(out + r * wide + column + v * kLanes, sum[r][v]);
+}
+
 template <int64_t kCount>
 struct Size {
   static constexpr int64_t value = kCount;

@@ -18,12 +18,11 @@ struct Legs {
   double range;  // |w| of both legs
 };
 
-inline Legs legs_of(const TreeJob& job, const double* centre, int64_t pulse) {
+inline Legs legs_between(const double* centre, const double* transmitter, const double* receiver) {
   Legs legs;
   double square[2] = {};
   for (int64_t axis = 0; axis < 3; axis++) {
-    const double t = centre[axis] - job.transmitter[3 * pulse + axis];
-    const double r = centre[axis] - job.receiver[3 * pulse + axis];
+    const double t = centre[axis] - transmitter[axis], r = centre[axis] - receiver[axis];
     legs.transmitter[axis] = float(2 * t), legs.receiver[axis] = float(2 * r);
     square[0] += t * t, square[1] += r * r;
   }
@@ -31,6 +30,9 @@ inline Legs legs_of(const TreeJob& job, const double* centre, int64_t pulse) {
   for (int64_t leg = 0; leg < 2; leg++) legs.squares[leg] = float(square[leg]), legs.ranges[leg] = float(range[leg]);
   legs.range = range[0] + range[1];
   return legs;
+}
+inline Legs legs_of(const TreeJob& job, const double* centre, int64_t pulse) {
+  return legs_between(centre, job.transmitter + 3 * pulse, job.receiver + 3 * pulse);
 }
 
 // Offsets of places from a tile's centre, and their squared distances, metres: x, y, z, square, `count` of each.

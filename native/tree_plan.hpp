@@ -10,7 +10,12 @@ namespace {
 using apertura::kDirectly;
 using apertura::kSilently;
 using apertura::kTreeGroup;
+using apertura::kTreeCurves;
 using apertura::kTreeNodes;
+using apertura::kTreeWeighted;
+
+constexpr int64_t kCurves[kTreeCurves] = {5, 9, 14, 20};  // degrees of smooth curves over a leaf
+constexpr int64_t kTreeMore = 4;                          // pulses that it takes beyond the degree
 
 constexpr int64_t kSeen = 16;  // places at which a tile is looked at: 4 x 4, corners included
 
@@ -19,6 +24,7 @@ constexpr int64_t kSeen = 16;  // places at which a tile is looked at: 4 x 4, co
 struct Seen {
   alignas(64) float at[4][kSeen], by_xi[3][kSeen], by_eta[3][kSeen];
   alignas(64) float axis_at[4][kSeen], by_axis[3][kSeen];
+  double radius;  // of the tile
   double bend;  // square of half the distance between neighbours: how far the path may dip between them, times 1/R
 };
 
@@ -54,7 +60,7 @@ inline Seen seen_of(const TreeTile& tile) {
   double xi2 = 0, eta2 = 0;
   for (int64_t axis = 0; axis < 3; axis++)
     xi2 += seen.by_xi[axis][5] * seen.by_xi[axis][5], eta2 += seen.by_eta[axis][5] * seen.by_eta[axis][5];
-  seen.bend = (xi2 + eta2) / 9;
+  seen.bend = (xi2 + eta2) / 9, seen.radius = std::sqrt(xi2 + eta2);
   return seen;
 }
 
@@ -85,47 +91,96 @@ inline Slopes slopes_at(const Legs& legs, const Seen& seen) {
   return out;
 }
 
-// Shortest and longest path of one pulse over a tile.
-inline void reach(const TreeJob& job, const TreeTile& tile, const Seen& seen, int64_t pulse, double* low, double* high) {
-  const Legs legs = legs_of(job, tile.centre, pulse);
+// Paths of one pulse to the places of a tile, more than to its centre.
+struct Reach {
+  alignas(64) float further[kSeen];
+  double low, high;  // of any place, on top of the centre's
+};
+
+inline Reach reach_of(const Legs& legs, const Seen& seen) {
+  Reach out;
+  for (int64_t n = 0; n < kSeen; n += kLanes)
+    store(out.further + n,
+          path(legs, load(seen.at[0] + n), load(seen.at[1] + n), load(seen.at[2] + n), load(seen.at[3] + n)));
   float least = 0, most = 0;
-  for (int64_t n = 0; n < kSeen; n += kLanes) {
-    const Lanes r = path(legs, load(seen.at[0] + n), load(seen.at[1] + n), load(seen.at[2] + n), load(seen.at[3] + n));
-    for (int64_t lane = 0; lane < kLanes; lane++)  // no number stays
-      least = r[lane] >= least ? least : r[lane], most = r[lane] <= most ? most : r[lane];
-  }
+  for (const float r : out.further) least = r >= least ? least : r, most = r <= most ? most : r;  // no number stays
   // Paths are convex over a plane: none is longer than at a corner, and none much shorter than at the nearest place.
-  const double dip = 0.5 * seen.bend * (1 / legs.ranges[0] + 1 / legs.ranges[1]) + 1e-3;
-  *low = legs.range + least - dip, *high = legs.range + most + 1e-3;
+  const double dip = 0.5 * seen.bend * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
+  out.low = least - dip - 1e-3, out.high = most + 1e-3;
+  return out;
 }
 
-// Marks groups of pulses whose profiles end inside the tile, or do not reach it, and notes what is to be expanded.
-inline void mark_groups(const TreeJob& job, TreeTile& tile, const Seen& seen, std::vector<int64_t>& last) {
-  const double margin = apertura::kTreeMargin + 8;  // samples: half the taps of a table see beyond a path
-  for (int64_t begin = 0; begin < job.pulses; begin += kTreeGroup) {
-    uint8_t& way = tile.way[begin / kTreeGroup];
-    if (way != apertura::kByTree) continue;
-    const int64_t count = std::min(kTreeGroup, job.pulses - begin);
-    double low[kTreeGroup], high[kTreeGroup];
-    bool inside = true, outside = true;
-    for (int64_t q = 0; q < count; q++) {
-      reach(job, tile, seen, begin + q, &low[q], &high[q]);
-      low[q] = (low[q] - job.start[begin + q]) / job.step, high[q] = (high[q] - job.start[begin + q]) / job.step;
-      inside &= low[q] >= margin && high[q] <= double(job.length) - 1 - margin;
-      outside &= high[q] <= -margin || low[q] >= double(job.length) - 1 + margin;
-    }
-    way = inside ? apertura::kByTree : outside ? kSilently : kDirectly;
-    for (int64_t q = 0; inside && q < count; q++) {
-      job.first[begin + q] = std::min(job.first[begin + q], int64_t(std::floor(low[q])) - apertura::kTreeMargin);
-      last[begin + q] = std::max(last[begin + q], int64_t(std::ceil(high[q])) + apertura::kTreeMargin);
-    }
+// What is known of a leaf before its nodes: how its pulses see the tile.
+struct Sight {
+  Reach reach[3];    // of its first, middle and last pulse
+  double low, high;  // of all of them
+  bool inside = true, outside = true;
+};
+
+// Pulses between those looked at may reach as much further as neighbours of them differ.
+inline Sight sight_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, int64_t begin, int64_t end) {
+  Sight sight;
+  const double margin = double(apertura::kTreeMargin + (job.taps_count + apertura::kTreeDelays) / 2);  // of filters
+  const double length = double(job.length - 1);
+  const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
+  double slack = 0;
+  Reach last;
+  for (int64_t n = begin; n < end; n += n + 8 < end || n == end - 1 ? 8 : end - 1 - n) {
+    const Legs legs = legs_of(job, tile.centre, n);
+    const Reach reach = reach_of(legs, seen);
+    if (n > begin) slack = std::max(slack, 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high)));
+    sight.low = n == begin ? reach.low : std::min(sight.low, reach.low);
+    sight.high = n == begin ? reach.high : std::max(sight.high, reach.high);
+    last = reach;
+    const double centre = legs.range - job.start[n];
+    const double low = (centre + reach.low - slack) / job.step, high = (centre + reach.high + slack) / job.step;
+    sight.inside &= low >= margin && high <= length - margin;
+    sight.outside &= high <= -margin || low >= length + margin;
   }
+  sight.low -= slack, sight.high += slack;
+  for (int64_t n = 0; n < 3; n++) sight.reach[n] = reach_of(legs_of(job, tile.centre, three[n]), seen);
+  return sight;
 }
 
 // The least number of nodes that holds a band, rad per half tile; more than kTreeNodes where none does.
 inline int64_t nodes_for(const TreeJob& job, double band) {
   if (!(band <= job.supports[kTreeNodes])) return kTreeNodes + 1;
   return std::max<int64_t>(2, std::lower_bound(job.supports, job.supports + kTreeNodes + 1, band) - job.supports);
+}
+
+// How many pulses stand for those of a leaf: what holds the turn of the carrier at any place against the centre.
+inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, const Sight& sight, int64_t leaf) {
+  const int64_t begin = leaf * kTreeGroup;
+  if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;
+  const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
+  const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * seen.radius;
+  int64_t terms = 0;
+  while (terms < kTreeCurves && !(job.rough[leaf * kTreeCurves + terms] * turns <= job.smooth)) terms++;
+  if (terms == kTreeCurves) return 0;
+  double most = 0;
+  for (int64_t n = 0; n < kSeen; n++) {
+    const double first = sight.reach[0].further[n], middle = sight.reach[1].further[n], last = sight.reach[2].further[n];
+    most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
+  }
+  const double band = (job.wavenumber + job.band) * most + job.stray[leaf] * turns + (tile.weight ? kTreeWeighted : 0);
+  const int64_t count = std::max(kCurves[terms] + kTreeMore, nodes_for(job, band));
+  return count <= apertura::kTreeFewer ? uint8_t(count) : 0;
+}
+
+// Looks at each leaf: whether it goes by tree, over which samples, and as how many pulses.
+inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
+  double low = 0, high = 0;
+  for (int64_t leaf = 0; leaf * kTreeGroup < job.pulses; leaf++) {
+    if (tile.way[leaf] != apertura::kByTree) continue;
+    const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
+    const Sight sight = sight_of(job, tile, seen, begin, end);
+    tile.way[leaf] = sight.inside ? apertura::kByTree : sight.outside ? kSilently : kDirectly;
+    if (!sight.inside) continue;
+    tile.fewer[leaf] = fewer_of(job, tile, seen, sight, leaf);
+    low = std::min(low, sight.low), high = std::max(high, sight.high);
+  }
+  tile.first_path = (std::floor(low / job.step) - double(apertura::kTreeMargin)) * job.step;
+  tile.samples = int64_t(std::ceil((high - tile.first_path) / job.step)) + apertura::kTreeMargin + 1;
 }
 
 // (4): the band left on a tile by one pulse against the reference of its subaperture.
@@ -198,7 +253,7 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
       for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, mixed);
       stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
     }
-    const double more = tile.weight ? apertura::kTreeWeighted : 0;
+    const double more = tile.weight ? kTreeWeighted : 0;
     const int64_t xi = nodes_for(job, Band::most(band.xi) + stray_xi + more);
     const int64_t eta = nodes_for(job, Band::most(band.eta) + stray_eta + more);
     holds &= !taken || (xi <= kTreeNodes && eta <= kTreeNodes);
@@ -207,27 +262,15 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
   return holds;
 }
 
-inline void plan_tile(const TreeJob& job, TreeTile& tile, std::vector<int64_t>& last) {
+inline void plan_tile(const TreeJob& job, TreeTile& tile) {
   const Seen seen = seen_of(tile);
-  mark_groups(job, tile, seen, last);
+  plan_leaves(job, tile, seen);
   Slopes mixed = slopes_at(shared_legs(job, tile), seen);
   for (int64_t n = 0; n < kSeen; n++) mixed.xi[n] -= mixed.axis[n % 4], mixed.eta[n] -= mixed.axis[4 + n / 4];
   const Leaves leaves = leaves_of(job, tile, seen);
   tile.top = -1;
   for (int64_t level = 0; level < job.levels && tile.top == level - 1; level++)
     if (plan_level(job, tile, seen, leaves, mixed, level)) tile.top = level;
-}
-
-// Plans all tiles, and which samples of each pulse are expanded.
-inline void plan_tree(TreeJob& job) {
-  std::vector<int64_t> last(size_t(job.pulses), INT64_MIN);
-  std::fill(job.first, job.first + job.pulses, INT64_MAX);
-  for (int64_t n = 0; n < job.count; n++) plan_tile(job, job.tiles[n], last);
-  job.expanded = 0;
-  for (int64_t p = 0; p < job.pulses; p++) {
-    if (job.first[p] > last[p]) job.first[p] = 0, last[p] = 0;  // no tile takes it by tree
-    job.expanded = std::max(job.expanded, last[p] - job.first[p] + 1);
-  }
 }
 
 }  // namespace

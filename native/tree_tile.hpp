@@ -32,6 +32,9 @@ struct TileState {
   std::unique_ptr<Points> lines[2][kTreeSlots];  // along xi through eta = 0, and along eta through xi = 0
   std::vector<std::unique_ptr<LeafNodes>> leaves;
   std::vector<Floats> sums;  // of the subaperture being added up at each level
+  Floats cosines, sines;     // the carrier at its cells
+  Floats re, im;             // sums at the nodes of the leaf in work
+  const LeafNodes* leaf = nullptr;
   explicit TileState(const TreeTile& tile) : tile(tile), sums(apertura::kTreeLevels) {}
 };
 

@@ -6,8 +6,9 @@ _pointer = ctypes.c_void_p
 _int64 = ctypes.c_int64
 _double = ctypes.c_double
 
-TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE = 128, 136, 4, 64, 256
-"""As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses; pixels along a tile."""
+TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
+"""As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
+a leaf; pixels along a tile; taps that align a pulse; pulses that stand for those of a leaf, at most."""
 
 
 class BeamJob(ctypes.Structure):
@@ -69,9 +70,10 @@ class TreeTile(ctypes.Structure):
     """native/tree_job.hpp, TreeTile."""
 
     _fields_ = [
-        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes")),
+        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
         ("centre", _double * 3),
-        *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "top")),
+        ("first_path", _double),
+        *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "samples", "top")),
     ]
 
 
@@ -79,12 +81,12 @@ class TreeJob(ctypes.Structure):
     """native/tree_job.hpp, TreeJob."""
 
     _fields_ = [
-        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "taps", "supports")),
-        *((name, _pointer) for name in ("places", "spread", "mix", "tiles", "first")),
+        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "rough", "taps")),
+        *((name, _pointer) for name in ("delay", "presum", "supports", "places", "spread", "mix", "tiles")),
         *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
-        *((name, _int64) for name in ("phase_polynomial", "expanded")),
+        *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
         ("sizes", _int64 * TREE_LEVELS),
-        *((name, _double) for name in ("step", "wavenumber", "band")),
+        *((name, _double) for name in ("step", "wavenumber", "band", "smooth")),
         ("phase_coefficients", ctypes.c_float * 9),
     ]
 

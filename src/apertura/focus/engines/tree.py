@@ -29,6 +29,10 @@ __all__ = ["READS", "available", "form", "instruction_set", "prepare"]
 READS: Literal["profiles"] = "profiles"
 
 
+SECOND = 256
+"""Pulses of a subaperture of leaves."""
+
+
 class Options(EngineOptions):
     """What may be asked of the engine."""
 
@@ -98,7 +102,7 @@ def form(
     image = np.zeros(pixels.shape[:2], np.complex64)
     tally = np.zeros(3, np.int64)
     tiles = [_tile(trees, pixels, window, nodes_db) for window in windows(image.shape, side_px)]
-    sizes = (LEAF, *(size for size in (8 * LEAF,) if size < chunk), chunk)
+    sizes = (LEAF, *(size for size in (SECOND,) if size < chunk), chunk)
     for pulses in trees.chunks(chunk):
         some, weighing = trees[pulses], beams and beams[pulses]
         ways = Chunk(some, weighing, nodes_db, sizes, pixels, image).add(tiles)

@@ -11,6 +11,7 @@ from apertura.antenna.beam import Beams
 from apertura.contracts import Window
 from apertura.focus.engines.native_binding import call
 from apertura.focus.engines.native_structs import (
+    TREE_FEWER,
     TREE_GROUP,
     TREE_NODES,
     TREE_SLOTS,
@@ -18,10 +19,12 @@ from apertura.focus.engines.native_structs import (
     TreeTile,
 )
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.tree_inputs import LEAF, Trees
+from apertura.focus.engines.tree_inputs import LEAF, Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, weights_over
+
+_SMOOTH = 2.0  # of what an interpolation may err by: how far pulses may leave a smooth curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,7 @@ class Chunk:
     image: NDArray[np.complex64]
     _held: list[NDArray[np.generic]] = field(default_factory=list)  # what the structs point into
     _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
+    _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that stand for those of a leaf
 
     def add(self, tiles: list[Tile]) -> list[NDArray[np.uint8]]:
         """Add what goes by tree; return how groups of 64 pulses are taken over each tile."""
@@ -92,7 +96,9 @@ class Chunk:
         rows, columns = tile.window
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
         counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
+        fewer = np.zeros(len(way), np.uint8)
         self._counts.append(counts)
+        self._fewer.append(fewer)
         struct = TreeTile(
             surface=self._hold(np.ascontiguousarray(surface.coefficients)),
             pixels=self.pixels.ctypes.data + 24 * at,
@@ -100,6 +106,7 @@ class Chunk:
             weight=None if weight is None else self._hold(weight),
             way=self._hold(way),
             nodes=self._hold(counts),
+            fewer=self._hold(fewer),
             degree=len(surface.coefficients) - 1,
             rows=rows.stop - rows.start,
             columns=columns.stop - columns.start,
@@ -112,6 +119,7 @@ class Chunk:
         profiles, design = self.trees.profiles, self.trees.design
         wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in profiles.aperture.legs)
+        delay = delay_filter(profiles.oversampling)
         taps = np.repeat(design.taps.transpose(2, 0, 1)[..., None], 2, axis=-1)
         job = TreeJob(
             samples=self._hold(np.ascontiguousarray(profiles.samples)),
@@ -119,10 +127,11 @@ class Chunk:
             transmitter=self._hold(tx),
             receiver=self._hold(rx),
             stray=self._hold(self.trees.stray_m),
+            rough=self._hold(self.trees.rough_m),
+            delay=self._hold(delay),
             taps=self._hold(np.ascontiguousarray(taps, np.float32)),
             supports=self._hold(supports(self.nodes_db)),
             tiles=ctypes.addressof(tiles),
-            first=self._hold(np.zeros(len(profiles), np.int64)),
             pulses=len(profiles),
             length=profiles.samples.shape[1],
             up=design.up,
@@ -132,9 +141,12 @@ class Chunk:
             levels=len(self.sizes),
             mono=int(tx is rx or np.array_equal(tx, rx)),
             phase_polynomial=design.phase_polynomial,
+            taps_count=design.taps.shape[2],
+            delay_terms=len(delay),
             step=profiles.step_m,
             wavenumber=wavenumber,
             band=self.trees.band_rad_m,
+            smooth=_SMOOTH * 10 ** (self.nodes_db / 20),
         )
         job.sizes[: len(self.sizes)] = self.sizes
         job.phase_coefficients[:] = design.phase_coefficients.tolist()
@@ -163,7 +175,11 @@ class Chunk:
         for slot in {slot for step in steps for slot in step}:
             at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
             places[slot] = self._hold(np.ascontiguousarray(at))
-        job.places, job.spread, job.mix = map(self._hold, (places, spread, mix))
+        presum = np.zeros(TREE_FEWER + 1, np.uintp)
+        for fewer in {int(n) for counts in self._fewer for n in counts if n}:
+            presum[fewer] = self._hold(np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T))
+            places[fewer] = self._hold(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
+        job.places, job.spread, job.mix, job.presum = map(self._hold, (places, spread, mix, presum))
 
     @property
     def _ratios(self) -> list[int]:

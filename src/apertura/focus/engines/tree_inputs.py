@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from threading import Lock
 from typing import NamedTuple
 
@@ -10,17 +11,20 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines import native
-from apertura.focus.engines.native_tables import TableDesign, Tables, design_table
+from apertura.focus.engines.native_structs import TREE_DELAYS, TREE_GROUP
+from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.inputs import Profiles
 
-LEAF = 16
-"""Pulses that a leaf sums at its nodes one by one."""
+LEAF = TREE_GROUP
+"""Pulses that a leaf makes fewer, and sums at its nodes."""
 
 CELLS_AT_ONCE = 4
 """Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
 
 _SAMPLED = 64  # pulses at which a rough tile is looked at
+_DEGREES = (5, 9, 14, 20)  # of curves over a leaf that fewer pulses follow: native/tree_plan.hpp, kCurves
+_DELAY_DEGREE = 9
 
 
 class Directly(NamedTuple):
@@ -68,6 +72,8 @@ class Trees:
         Of the cells: which filters make them.
     stray_m
         (leaf,) float32, metres by which pulses of a leaf leave the parabola through its first, middle and last one.
+    rough_m
+        (leaf, 4) float32, metres by which they leave curves of growing degree, RMS.
     first
         Number of the first pulse among those prepared.
     tables
@@ -77,6 +83,7 @@ class Trees:
     profiles: Profiles
     design: TableDesign
     stray_m: NDArray[np.float32]
+    rough_m: NDArray[np.float32]
     first: int
     tables: _DirectTables
 
@@ -91,6 +98,7 @@ class Trees:
             self,
             profiles=self.profiles[first:last],
             stray_m=self.stray_m[first // LEAF : -(-last // LEAF)],
+            rough_m=self.rough_m[first // LEAF : -(-last // LEAF)],
             first=self.first + first,
         )
 
@@ -137,15 +145,45 @@ def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
     return CELLS_AT_ONCE * int(np.ceil(oversampling / profile_oversampling / CELLS_AT_ONCE - 1e-9))
 
 
-def design(profiles_oversampling: float, carrier_rad_per_sample: float, oversampling: float) -> TableDesign:
-    """Return the filters that expand profiles: straight lines in each cell."""
-    cells = cells_per_sample(profiles_oversampling, oversampling)
+def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampling: float, taps: int) -> TableDesign:
+    """Return the filters that expand profiles to cells: straight lines in each, of so many taps."""
+    count = cells_per_sample(profile_oversampling, oversampling)
     return design_table(
-        profiles_oversampling, carrier_rad_per_sample, oversampling=cells * profiles_oversampling, degree=1
+        profile_oversampling, carrier_rad_per_sample, oversampling=count * profile_oversampling, degree=1, taps=taps
     )
 
 
-def prepare(profiles: Profiles, *, oversampling: int = 24) -> Trees:
+@lru_cache
+def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
+    """Return the filter that gives a profile between two samples, as polynomials of where between them.
+
+    Returns
+    -------
+    ndarray
+        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one behind. The first tap
+        is that of the sample `tap / 2 - 1` before.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 7: least squares over the band.
+
+    Examples
+    --------
+    >>> weights = 0.3 ** np.arange(10) @ delay_filter(2.0)
+    >>> tone = np.exp(0.5j * np.pi * 0.9 * (np.arange(12) - 5))
+    >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 0.3)) < 1e-4)
+    True
+    """
+    omega = np.pi / profile_oversampling * BAND
+    basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
+    u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
+    wanted = np.exp(1j * omega[:, None] * u)
+    both = [np.concatenate([part.real, part.imag]) for part in (basis, wanted)]
+    taps = np.linalg.lstsq(*both, rcond=1e-9)[0].T
+    return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
     """Return what trees of all tiles share; pulses are expanded to cells later, tile by tile.
 
     Parameters
@@ -154,6 +192,8 @@ def prepare(profiles: Profiles, *, oversampling: int = 24) -> Trees:
         Band-limited profiles.
     oversampling
         Table cells per Nyquist cell c/B of total path, at least.
+    taps
+        Of the filters that make cells, 8 or 16.
 
     Raises
     ------
@@ -176,19 +216,30 @@ def prepare(profiles: Profiles, *, oversampling: int = 24) -> Trees:
         start_m=np.ascontiguousarray(profiles.start_m, np.float64),
     )
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
-    stray = sum(_stray(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs)
-    found = design(profiles.oversampling, turn, oversampling)
-    return Trees(held, found, np.asarray(stray, np.float32), 0, _DirectTables(held))
+    legs = [_leaves(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
+    stray, rough = (sum(measure(leg) for leg in legs) for measure in (_stray, _roughness))
+    found = cells(profiles.oversampling, turn, oversampling, taps)
+    return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
 
 
-def _stray(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf,) how far pulses of each leaf lie from the parabola through its first, middle and last, metres."""
+def _leaves(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
     count = -(-len(places_m) // LEAF)
-    padded = np.concatenate([places_m, np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)])
-    leaves = padded.reshape(count, LEAF, 3)
-    x = np.linspace(-1, 1, LEAF)
-    middle = (LEAF - 1) // 2
-    three = np.array([0, middle, LEAF - 1])
+    filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
+    return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
+
+
+def _stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf,) how far pulses lie from the parabola through the first, middle and last one, metres."""
+    x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
     to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
-    rest = leaves - np.einsum("pt,ntc->npc", to_all, leaves[:, three])
+    rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
     return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
+
+
+def _roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, curve) RMS distance of pulses from curves of growing degree through them, metres."""
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), _DEGREES[-1]))[0]
+    terms = np.einsum("pt,npc->ntc", basis, leaves_m - leaves_m[:, :1])
+    power = ((leaves_m - leaves_m[:, :1]) ** 2).sum((1, 2))[:, None] - np.cumsum((terms**2).sum(-1), axis=1)
+    return np.asarray(np.sqrt(np.maximum(power[:, _DEGREES], 0) / LEAF))
