@@ -154,8 +154,10 @@ inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& se
   if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;
   const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
   const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * seen.radius;
+  // What a place off the centre sees of a pulse off its curve, RMS over the tile: 1/sqrt 3 of what its corner sees.
+  const double nearest = 1 / std::min(legs.ranges[0], legs.ranges[1]), seldom = 0.577;
   int64_t terms = 0;
-  while (terms < kTreeCurves && !(job.rough[leaf * kTreeCurves + terms] * turns <= job.smooth)) terms++;
+  while (terms < kTreeCurves && !(job.rough[leaf * kTreeCurves + terms] * nearest * seldom * (job.wavenumber + job.band) * seen.radius <= job.smooth)) terms++;
   if (terms == kTreeCurves) return 0;
   double most = 0;
   for (int64_t n = 0; n < kSeen; n++) {

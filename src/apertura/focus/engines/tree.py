@@ -117,7 +117,9 @@ def form(
             tally += image[tile.window].size * np.bincount(way, pulses_of, 3).astype(np.int64)
     if counts is not None:
         counts += tally
-    image[~np.isfinite(pixels).all(axis=2)] = complex(np.nan, np.nan)
+    for tile in tiles:
+        if not np.isfinite(tile.surface.rough_m):
+            image[tile.window][~np.isfinite(pixels[tile.window]).all(axis=2)] = complex(np.nan, np.nan)
     return image
 
 

@@ -217,7 +217,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     )
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     legs = [_leaves(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
-    stray, rough = (sum(measure(leg) for leg in legs) for measure in (_stray, _roughness))
+    stray, rough = sum(map(_stray, legs)), np.sqrt(sum(_roughness(leg) ** 2 for leg in legs))
     found = cells(profiles.oversampling, turn, oversampling, taps)
     return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
 

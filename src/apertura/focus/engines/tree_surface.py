@@ -75,20 +75,20 @@ def surface_of(pixels: NDArray[np.float64]) -> Surface:
     >>> surface_of(np.stack([x, y, 0.001 * x * x], -1)).rough_m < 1e-9
     True
     """
-    if not np.isfinite(pixels).all():
-        return Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     offsets = pixels - middle  # places may be those of the Earth's centre
     for degree in (1, DEGREE):
         (rows, fit_rows, all_rows), (columns, fit_columns, all_columns) = (
             _fitting(size, degree) for size in pixels.shape[:2]
         )
-        some = offsets[np.ix_(rows, columns)]
-        found = np.einsum("ai,ijk,bj->abk", fit_rows, some, fit_columns, optimize=True)
-        rest = offsets - np.einsum("ia,abk,jb->ijk", all_rows, found, all_columns, optimize=True)
-        rough_m = float(np.sqrt((rest**2).sum(-1).mean()))
-        if rough_m <= _PLANE_M:
+        some = fit_columns @ offsets[np.ix_(rows, columns)]
+        found = np.tensordot(fit_rows, some, 1)
+        rest = (offsets - all_columns @ np.tensordot(all_rows, found, 1)).ravel()
+        rough_m = float(np.sqrt(rest @ rest * 3 / rest.size))
+        if not rough_m > _PLANE_M:
             break
+    if not np.isfinite(rough_m):
+        return Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)
     found[0, 0] += middle
     return Surface(found, _value(found, 0.0), _across(found), rough_m)
 
