@@ -93,6 +93,7 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeTile, nodes),
     APERTURA_FIELD(TreeTile, fewer),
     APERTURA_FIELD(TreeTile, centre),
+    APERTURA_FIELD(TreeTile, rest),
     APERTURA_FIELD(TreeTile, first_path),
     APERTURA_FIELD(TreeTile, degree),
     APERTURA_FIELD(TreeTile, rows),

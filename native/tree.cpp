@@ -93,6 +93,11 @@ extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) plan_tile(*job, job->tiles[n]);
 }
 
+// Fills `rest` of the tiles.
+extern "C" void APERTURA_JOIN(apertura_rest_tree_, APERTURA_ISA)(TreeJob* job) {
+  for (int64_t n = 0; n < job->count; n++) job->tiles[n].rest = rest_of(*job, job->tiles[n]);
+}
+
 // Adds the pulses that go by tree to the image.
 extern "C" void APERTURA_JOIN(apertura_form_tree_, APERTURA_ISA)(TreeJob* job) {
   switch (job->phase_polynomial) {

@@ -32,6 +32,7 @@ struct TreeTile {
   uint8_t* nodes;         // (subaperture of each level in turn, 2): nodes along ξ and η
   uint8_t* fewer;         // (leaf): how many pulses stand for those of a leaf; 0: each for itself; on entry 1: must
   double centre[3];
+  double rest;            // mean square of the pixels' distances from the surface; set by apertura_rest_tree
   double first_path;      // of the first sample, more than that of the centre; set by the plan
   int64_t degree, rows, columns, row_slot, column_slot;
   int64_t samples;        // of each pulse over the tile; set by the plan

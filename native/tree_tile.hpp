@@ -48,6 +48,35 @@ inline void offset_at(const TreeTile& tile, const double* along_xi, const double
         offset[axis] += along_eta[a] * along_xi[e] * tile.surface[(a * m + e) * 3 + axis];
 }
 
+// Mean square of the distances of all pixels from the surface; no number if a pixel has no place.
+inline double rest_of(const TreeJob& job, const TreeTile& tile) {
+  const int64_t m = tile.degree + 1;
+  std::vector<double> basis(size_t(m * tile.columns));
+  double value[kTreeDegree + 2], total = 0;
+  for (int64_t n = 0; n < tile.columns; n++) {
+    legendre(tile.columns > 1 ? 2.0 * double(n) / double(tile.columns - 1) - 1 : 0, tile.degree, value);
+    for (int64_t e = 0; e < m; e++) basis[e * tile.columns + n] = value[e];
+  }
+  for (int64_t row = 0; row < tile.rows; row++) {
+    double line[(kTreeDegree + 1) * 3] = {}, sum = 0;
+    legendre(tile.rows > 1 ? 2.0 * double(row) / double(tile.rows - 1) - 1 : 0, tile.degree, value);
+    for (int64_t a = 0; a < m; a++)
+      for (int64_t e = 0; e < 3 * m; e++) line[e] += value[a] * tile.surface[a * 3 * m + e];
+    const double* pixels = tile.pixels + 3 * row * job.stride;
+    alignas(64) double rest[apertura::kTreeSide];
+    for (int64_t axis = 0; axis < 3; axis++) {
+      for (int64_t n = 0; n < tile.columns; n++) rest[n] = pixels[3 * n + axis] - line[axis];
+      for (int64_t e = 1; e < m; e++)
+        for (int64_t n = 0; n < tile.columns; n++) rest[n] -= line[3 * e + axis] * basis[e * tile.columns + n];
+      double part[8] = {};
+      for (int64_t n = 0; n < tile.columns; n++) part[n % 8] += rest[n] * rest[n];
+      for (const double one : part) sum += one;
+    }
+    total += sum;
+  }
+  return total / double(tile.rows * tile.columns);
+}
+
 inline int64_t points_of(const TileState& state, int64_t slot) {
   if (slot <= apertura::kTreeNodes) return slot;
   return slot == state.tile.column_slot ? state.tile.columns : state.tile.rows;

@@ -93,6 +93,9 @@ class Engine(Protocol):
         some pulses.
     instruction_set
         Which instructions its sums run with here; an engine may leave it out.
+    pieces
+        (shape of a block of pixels, form_options) → windows of it that get the same bits when formed alone; an engine
+        whose pixels are formed in patches of `PATCH_PX` leaves it out.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.

@@ -72,6 +72,7 @@ class TreeTile(ctypes.Structure):
     _fields_ = [
         *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
         ("centre", _double * 3),
+        ("rest", _double),
         ("first_path", _double),
         *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "samples", "top")),
     ]

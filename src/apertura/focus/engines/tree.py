@@ -1,13 +1,13 @@
-"""Backprojection by subaperture trees on Cartesian tiles: the cost of a pixel grows with the logarithm of the pulses.
+"""Backprojection by subaperture trees on Cartesian tiles: faster by the order of things for large images.
 
-A tile's tree sums few pulses at few nodes, and merges subapertures on ever more nodes until the pixels themselves are the
-nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot take
+A tile's tree sums few pulses at few nodes, and merges subapertures on ever more nodes until the pixels themselves are
+the nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot take
 go through the direct kernel.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +20,18 @@ from apertura.focus.engines.engine import EngineOptions
 from apertura.focus.engines.native_binding import available, instruction_set
 from apertura.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
 from apertura.focus.engines.tree_chunk import Chunk, Tile
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAF, Trees, prepare
-from apertura.focus.engines.tree_surface import surface_of, windows
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, Trees, prepare, subaperture_sizes
+from apertura.focus.engines.tree_prediction import candidates
+from apertura.focus.engines.tree_surface import surfaces_of, windows
 from apertura.focus.engines.tree_weights import DIRECTLY
 
-__all__ = ["READS", "available", "form", "instruction_set", "prepare"]
+__all__ = ["READS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
 
 
-SECOND = 256
-"""Pulses of a subaperture of leaves."""
+LEAST_PIXELS = 32**2
+"""Of a tile: fewer go directly."""
 
 
 class Options(EngineOptions):
@@ -45,7 +46,7 @@ class Options(EngineOptions):
     side_px: Annotated[int, Field(ge=16, le=TREE_SIDE)] | None = Field(
         None, description="largest side of a tree's tile, pixels"
     )
-    chunk: Literal[128, 1024] | None = Field(None, description="pulses of the largest subaperture")
+    chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
 
 
 def form(
@@ -101,8 +102,8 @@ def form(
     pixels = np.ascontiguousarray(pixels, np.float64)
     image = np.zeros(pixels.shape[:2], np.complex64)
     tally = np.zeros(3, np.int64)
-    tiles = [_tile(trees, pixels, window, nodes_db) for window in windows(image.shape, side_px)]
-    sizes = (LEAF, *(size for size in (SECOND,) if size < chunk), chunk)
+    tiles = _tiles(trees, pixels, side_px, nodes_db)
+    sizes = subaperture_sizes(chunk)
     for pulses in trees.chunks(chunk):
         some, weighing = trees[pulses], beams and beams[pulses]
         ways = Chunk(some, weighing, nodes_db, sizes, pixels, image).add(tiles)
@@ -110,9 +111,7 @@ def form(
             for run in _direct_runs(way, len(some)):
                 part, weights = some.direct(nodes_db)[run], weighing and weighing[run]
                 tolerance_rad = DIRECTLY_AT[nodes_db].tolerance_rad
-                image[tile.window] += native.form(
-                    part, pixels[tile.window], beams=weights, tolerance_rad=tolerance_rad
-                )
+                image[tile.window] += native.form(part, pixels[tile.window], beams=weights, tolerance_rad=tolerance_rad)
             pulses_of = np.minimum(TREE_GROUP, len(some) - TREE_GROUP * np.arange(len(way)))
             tally += image[tile.window].size * np.bincount(way, pulses_of, 3).astype(np.int64)
     if counts is not None:
@@ -123,9 +122,19 @@ def form(
     return image
 
 
-def _tile(trees: Trees, pixels: NDArray[np.float64], window: Window, nodes_db: int) -> Tile:
-    surface = surface_of(pixels[window])
-    return Tile(window, surface, trees.roughness(surface) <= 2 * 10 ** (nodes_db / 10))
+def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
+    """Yield the windows of a block of pixels that get the same bits when they are formed alone: its tiles."""
+    return windows(shape, form_options["side_px"])
+
+
+def _tiles(trees: Trees, pixels: NDArray[np.float64], side_px: int, nodes_db: int) -> list[Tile]:
+    """Return the tiles of a block; those that are small or rough do not go by tree."""
+    parts = list(windows(pixels.shape[:2], side_px))
+    limit = 2 * 10 ** (nodes_db / 10)
+    return [
+        Tile(part, surface, pixels[part].size >= 3 * LEAST_PIXELS and trees.roughness(surface) <= limit)
+        for part, surface in zip(parts, surfaces_of(pixels, parts), strict=True)
+    ]
 
 
 def _direct_runs(way: NDArray[np.uint8], pulses: int) -> Iterator[slice]:

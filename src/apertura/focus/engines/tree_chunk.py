@@ -18,7 +18,6 @@ from apertura.focus.engines.native_structs import (
     TreeJob,
     TreeTile,
 )
-from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines.tree_inputs import LEAF, Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
@@ -117,7 +116,6 @@ class Chunk:
 
     def _job(self, tiles: "ctypes.Array[TreeTile]") -> TreeJob:
         profiles, design = self.trees.profiles, self.trees.design
-        wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in profiles.aperture.legs)
         delay = delay_filter(profiles.oversampling)
         taps = np.repeat(design.taps.transpose(2, 0, 1)[..., None], 2, axis=-1)
@@ -144,7 +142,7 @@ class Chunk:
             taps_count=design.taps.shape[2],
             delay_terms=len(delay),
             step=profiles.step_m,
-            wavenumber=wavenumber,
+            wavenumber=self.trees.wavenumber_rad_m,
             band=self.trees.band_rad_m,
             smooth=_SMOOTH * 10 ** (self.nodes_db / 20),
         )
@@ -164,7 +162,7 @@ class Chunk:
             levels = self._levels(counts)[: tile.top + 1]
             for (below, above), ratio in zip(pairwise(levels), self._ratios, strict=False):
                 parents = above[np.arange(len(below)) // ratio]
-                steps.update(map(tuple, np.stack([below, parents], -1).reshape(-1, 2).tolist()))
+                steps.update(zip(below.ravel().tolist(), parents.ravel().tolist(), strict=True))
             for top in levels[-1:]:
                 for axis, slot in enumerate((tile.column_slot, tile.row_slot)):
                     steps.update((count, slot) for count in set(top[:, axis].tolist()))

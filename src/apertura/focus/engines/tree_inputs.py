@@ -15,15 +15,19 @@ from apertura.focus.engines.native_structs import TREE_DELAYS, TREE_GROUP
 from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
 
 LEAF = TREE_GROUP
 """Pulses that a leaf makes fewer, and sums at its nodes."""
 
+DEGREES = (5, 9, 14, 20)
+"""Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
+
 CELLS_AT_ONCE = 4
 """Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
 
+_SECOND = 256  # pulses of a subaperture of leaves
 _SAMPLED = 64  # pulses at which a rough tile is looked at
-_DEGREES = (5, 9, 14, 20)  # of curves over a leaf that fewer pulses follow: native/tree_plan.hpp, kCurves
 _DELAY_DEGREE = 9
 
 
@@ -115,23 +119,54 @@ class Trees:
         return self.tables[DIRECTLY_AT[nodes_db].oversampling][self.first : self.first + len(self)]
 
     def roughness(self, surface: Surface) -> float:
-        """Return the mean squared error of pixels that do not lie on the surface of their tile, relative.
+        """Return the error that pixels off the surface of a tile make, as the function of that name."""
+        aperture = self.profiles.aperture
+        some = aperture[aperture.sample(_SAMPLED)]
+        return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
 
-        Notes
-        -----
-        Source: docs/theory/tree.md, eq. 9.
-        """
-        if surface.rough_m == 0 or not np.isfinite(surface.rough_m):
-            return 0.0 if surface.rough_m == 0 else np.inf
-        aperture = self.profiles.aperture[self.profiles.aperture.sample(_SAMPLED)]
-        rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-        k = 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        return float(surface.rough_m**2 * (k**2 * rate.var() + self.band_rad_m**2 / 3 * (rate**2).mean()))
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/c."""
+        return 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
 
     @property
     def band_rad_m(self) -> float:
         """Half the band as a wavenumber, πB/c."""
         return float(np.pi / (self.profiles.step_m * self.profiles.oversampling))
+
+
+def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
+    """Return the mean squared error by pixels that do not lie on the surface of their tile, relative.
+
+    Parameters
+    ----------
+    aperture
+        Some of the pulses, evenly spread.
+    surface
+        Of the tile.
+    wavenumber_rad_m, band_rad_m
+        2πf_mid/c and πB/c.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 9.
+    """
+    if not np.isfinite(surface.rough_m):
+        return np.inf
+    rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
+    of_phase, of_delay = wavenumber_rad_m**2 * rate.var(), band_rad_m**2 / 3 * (rate**2).mean()
+    return float(surface.rough_m**2 * (of_phase + of_delay))
+
+
+def subaperture_sizes(chunk: int) -> tuple[int, ...]:
+    """Return the pulses of the subapertures of each level, the largest last.
+
+    Examples
+    --------
+    >>> subaperture_sizes(1024), subaperture_sizes(256), subaperture_sizes(64)
+    ((64, 256, 1024), (64, 256), (64,))
+    """
+    return tuple(sorted({size for size in (LEAF, _SECOND, chunk) if size <= chunk}))
 
 
 def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
@@ -178,8 +213,8 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
     basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
     u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
     wanted = np.exp(1j * omega[:, None] * u)
-    both = [np.concatenate([part.real, part.imag]) for part in (basis, wanted)]
-    taps = np.linalg.lstsq(*both, rcond=1e-9)[0].T
+    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, wanted))
+    taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
     return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
 
 
@@ -215,14 +250,14 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
         samples=np.ascontiguousarray(profiles.samples, np.complex64),
         start_m=np.ascontiguousarray(profiles.start_m, np.float64),
     )
+    legs = [leaves_of(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
+    stray, rough = sum(map(_stray, legs)), np.sqrt(sum(leaf_roughness(leg) ** 2 for leg in legs))
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
-    legs = [_leaves(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
-    stray, rough = sum(map(_stray, legs)), np.sqrt(sum(_roughness(leg) ** 2 for leg in legs))
-    found = cells(profiles.oversampling, turn, oversampling, taps)
+    found = cells(profiles.oversampling, turn, float(oversampling), taps)
     return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
 
 
-def _leaves(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
     count = -(-len(places_m) // LEAF)
     filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
@@ -237,9 +272,9 @@ def _stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
 
 
-def _roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def leaf_roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf, curve) RMS distance of pulses from curves of growing degree through them, metres."""
-    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), _DEGREES[-1]))[0]
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), DEGREES[-1]))[0]
     terms = np.einsum("pt,npc->ntc", basis, leaves_m - leaves_m[:, :1])
     power = ((leaves_m - leaves_m[:, :1]) ** 2).sum((1, 2))[:, None] - np.cumsum((terms**2).sum(-1), axis=1)
-    return np.asarray(np.sqrt(np.maximum(power[:, _DEGREES], 0) / LEAF))
+    return np.asarray(np.sqrt(np.maximum(power[:, DEGREES], 0) / LEAF))

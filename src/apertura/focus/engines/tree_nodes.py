@@ -1,4 +1,4 @@
-"""Nodes along an axis of a tile: where they lie, how wide a band they hold, and the weights that interpolate between them.
+"""Nodes along an axis of a tile: where they lie, how wide a band they hold, and weights that interpolate between them.
 
 docs/theory/tree.md, "Nodes".
 """
@@ -124,7 +124,9 @@ def widest_band(count: int, error_db: int) -> float:
 
 
 @lru_cache(maxsize=4096)
-def matrices(count: int, target: int, error_db: int, *, pixels: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def matrices(
+    count: int, target: int, error_db: int, *, pixels: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the weights of nodes at others or at pixels, as the compiled tree reads them.
 
     Parameters

@@ -73,4 +73,4 @@ def _matrices() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.fl
     """Return places along an axis, those between them, values → terms, and terms → values between."""
     powers, between = (np.vander(at, _TERMS, increasing=True) for at in (_PLACES, _BETWEEN))
     inverse = np.linalg.inv(powers)
-    return _PLACES, _BETWEEN, np.kron(inverse, inverse), np.kron(between, between)
+    return _PLACES, _BETWEEN, np.asarray(np.kron(inverse, inverse)), np.asarray(np.kron(between, between))
