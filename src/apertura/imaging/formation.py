@@ -77,7 +77,7 @@ class Formation:
         return tiles if whole is None else [whole, *(tile for tile in seen if tile is not whole)]
 
     @cached_property
-    def _pieces_of(self) -> dict[tuple[int, int], list[Window]]:
+    def _pieces_of(self) -> dict[tuple[int, ...], list[Window]]:
         return {}
 
     @property
@@ -132,7 +132,7 @@ class Formation:
                 return top + rows.start, top + rows.stop, left + columns.start, left + columns.stop
         raise IndexError(f"pixel {row}, {column} of {self.grid.shape}")
 
-    def _pieces(self, shape: tuple[int, int]) -> list[Window]:
+    def _pieces(self, shape: tuple[int, ...]) -> list[Window]:
         if shape not in self._pieces_of:
             self._pieces_of[shape] = pieces(self.plan.setting.engine, shape, self.plan.setting.form_options)
         return self._pieces_of[shape]

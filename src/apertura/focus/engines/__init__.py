@@ -37,7 +37,7 @@ def load_engine(name: str) -> "Engine":
     return cast("Engine", import_module(ENGINES[name]))
 
 
-def pieces(name: str, shape: tuple[int, int], form_options: Mapping[str, Any]) -> list[Window]:
+def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> list[Window]:
     """Return windows of a tile that an engine gives the same bits when it forms them alone.
 
     Parameters

@@ -40,6 +40,7 @@ _DIRECT_S = 2.8e-10  # a pixel and pulse that go directly
 _WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
 _PLAIN = 2.0  # times as long where each pulse goes for itself: its cells are many
 _FORM_S = 4e-4  # a block of pixels
+_START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +144,7 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
         {"nodes_db": nodes_db, "side_px": options.side_px, "chunk": options.chunk},
         error_db,
         seconds,
+        table_seconds=_START_S,
         table_bytes=tables,
         reasons={
             "oversampling": f"table errs by {table_db:.1f} dB",
