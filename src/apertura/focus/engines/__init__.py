@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 ENGINES: dict[str, str] = {
     "native": "apertura.focus.engines.native",
     "numba": "apertura.focus.engines.numba",
+    "cuda": "apertura.focus.engines.cuda",
     "reference": "apertura.focus.engines.reference",
 }
 """Name → module that is an `Engine`; a module is imported when its engine is asked for."""
