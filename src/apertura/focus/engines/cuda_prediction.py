@@ -29,7 +29,7 @@ _PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact
 _CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pulse and sample
 _PLACE_S = 3.2e-9  # per pixel: position there, sum back
 _START_S = 3.0
-_SIMULATED_S = 1e-3  # per pixel and pulse, in Python
+_SIMULATED_S = 1e-4  # per pixel and pulse, in Python: this one is measured
 
 
 def simulated() -> bool:
