@@ -17,6 +17,8 @@ from apertura.errors import CampaignError
 from apertura.focus.engines import cuda, load_engine
 from apertura.focus.engines.cuda_constants import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM
 from apertura.focus.engines.cuda_prediction import candidates
+from apertura.focus.engines.engine import Setting
+from apertura.planning.search import Search
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +96,18 @@ def test_a_device_is_taken_for_large_images_and_not_for_small_ones(monkeypatch):
     assert any("seconds are not measured" in decision.reason for decision in large.decisions)
 
 
-def test_the_simulator_is_said_to_be_slower_than_the_double_sum(monkeypatch):
+def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
+    """Nor where it alone would come near an accuracy: what costs more than the double sum is worth nothing."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
+    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr(cuda, "available", lambda: True)
     job = planning_job()
     (double_sum,) = load_engine("reference").candidates(job, pulses=300, asked={})
-    assert min(setting.seconds for setting in candidates(job, pulses=300, asked={})) > 10 * double_sum.seconds
+    settings = list(candidates(job, pulses=300, asked={}))
+    assert min(setting.seconds for setting in settings) > 10 * double_sum.seconds
+    assert min(setting.error_db for setting in settings) < -100
+    last = Search(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))
+    assert [setting.engine for setting in last] == ["reference"]
 
 
 @pytest.mark.skipif(cuda.available(), reason="there is a device")

@@ -20,7 +20,7 @@ from apertura.focus.engines.native_prediction import OVERSAMPLINGS, TOLERANCES_R
 from apertura.focus.engines.native_tables import design_table, ratio
 from apertura.focus.job import Job
 
-_WORST_TO_RMS = 1 / 3
+_WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
 _FLOAT32_RAD = 2e-6  # tables and their look-ups, as native
 
 # Seconds, not measured: a tenth of the rate that torchbp publishes for a card of 2022 (docs/theory/engine.md, "A GPU"),
