@@ -1,7 +1,7 @@
 """Backprojection on an NVIDIA GPU: range tables, a block of threads per patch of pixels; the extra ``cuda``.
 
-What runs on the device is in `cuda_kernels`, how it gets there in `cuda_device`, what it is predicted to do in
-`cuda_prediction`. Nothing of numba.cuda is imported before a device is asked for.
+What runs on the device is in `cuda_cells` and `cuda_kernels`, how it gets there in `cuda_device`, what it is predicted
+to do in `cuda_prediction`. Nothing of numba.cuda is imported before a device is asked for.
 """
 
 from dataclasses import dataclass, replace

@@ -105,7 +105,7 @@ def sum_there(tables: "Tables", pixels: NDArray[np.float64], tolerance_rad: floa
 
 def _tables_there(cuda: Any, tables: "Tables") -> tuple[Any, ...]:
     """Return phase centres, starts and cells of all pulses on the device."""
-    from apertura.focus.engines.cuda_kernels import expand
+    from apertura.focus.engines.cuda_cells import expand
 
     design, k = tables.design, tables.wavenumber_rad_m
     pulses, length = tables.samples.shape
@@ -125,12 +125,11 @@ def _device() -> Iterator[Any]:
         raise _unfit("no device can be used")
     from numba import cuda
     from numba.cuda.cudadrv.driver import CudaAPIError, LinkerError
-    from numba.cuda.cudadrv.error import CudaSupportError
 
     with _LOCK:
         try:
             yield cuda
-        except (CudaAPIError, CudaSupportError, LinkerError) as error:
+        except (CudaAPIError, LinkerError, ImportError) as error:  # the last: driver or compiler is not to be found
             raise _unfit(f"the device failed: {' '.join(str(error).split())}") from error
 
 

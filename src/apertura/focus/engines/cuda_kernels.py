@@ -1,4 +1,4 @@
-"""What runs on a GPU: tables from profiles, and their sum over patches; imported only where that is done.
+"""What sums tables over patches on a GPU; imported only where that is done.
 
 numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1). Literals
 are float64 to numba: float32 constants stand in names, or one literal would slow every pixel down. Equations are those
@@ -6,6 +6,7 @@ of docs/theory/engine.md, "A GPU".
 """
 
 import math
+import warnings
 
 import numpy as np
 from numba import cuda
@@ -18,8 +19,9 @@ from apertura.focus.engines.cuda_constants import (
     LAST_ORDER,
     LAST_TERM,
     SIDE,
-    TAPS,
 )
+
+warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # the certificate's patches: no news to anybody
 
 ROWS = 4
 """Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads what they share but once."""
@@ -32,31 +34,6 @@ _ONE, _NONE = np.float32(1), np.float32(0)
 _B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of (8)
 _LEG, _MIDDLE, _WORDS = 5, 10, 11  # what a pulse has in shared memory: five numbers of each leg, and the origin's place
 _PER_CELL, _WAVENUMBER, _TOLERANCE, _CELLS, _TURN = range(5)  # places in `numbers`
-
-
-@cuda.jit
-def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-untyped-def]  # noqa: PLR0917
-    """Fill cells (pulse, 6, cell) from samples (pulse, range): one thread a cell, (2)."""
-    used, length, up = cells.shape[2], samples.shape[1], len(lead)
-    number = cuda.grid(1)
-    if number >= len(samples) * used:
-        return
-    p, i = number // used, number % used
-    position = i % up
-    first = i // up * down + lead[position]
-    phase = carrier[i] * turn[p]
-    level, slope, curvature = np.complex64(0), np.complex64(0), np.complex64(0)
-    for tap in range(TAPS):
-        n = first + tap
-        if 0 <= n < length:
-            sample = samples[p, n]
-            level += sample * taps[position, 0, tap]
-            slope += sample * taps[position, 1, tap]
-            curvature += sample * taps[position, 2, tap]
-    level, slope, curvature = level * phase, slope * phase, curvature * phase
-    cells[p, 0, i], cells[p, 1, i] = level.real, level.imag
-    cells[p, 2, i], cells[p, 3, i] = slope.real, slope.imag
-    cells[p, 4, i], cells[p, 5, i] = curvature.real, curvature.imag
 
 
 @cuda.jit
