@@ -13,6 +13,7 @@ ENGINES: dict[str, str] = {
     "tree": "apertura.focus.engines.tree",
     "native": "apertura.focus.engines.native",
     "numba": "apertura.focus.engines.numba",
+    "cuda": "apertura.focus.engines.cuda",
     "reference": "apertura.focus.engines.reference",
 }
 """Name → module that is an `Engine`; a module is imported when its engine is asked for."""

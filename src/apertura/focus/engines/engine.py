@@ -85,6 +85,8 @@ class Engine(Protocol):
         What it is given: a `PhaseHistory` or `Profiles`.
     available
         Whether it can run here.
+    NEEDS
+        What it needs to run, in a few words; an engine that runs everywhere leaves it out.
     candidates
         (job, pulses=, asked=) → settings with predicted error and cost; `pulses` may be fewer than the job's, `asked`
         holds options that a person asks for.
