@@ -23,7 +23,6 @@ enum Variant {
   kVariants
 };
 constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four blocks
-constexpr bool kAhead = kLanes == 16;    // 32 registers also hold the pixels' places for the next pulse
 
 // What the pixel loop reads: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block. What
 // flat ground needs lies together.
@@ -172,6 +171,7 @@ template <class Phase, int64_t kDegree, bool kTerrain, Variant kVariant>
 inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
   constexpr bool kWide = kVariant != kSharedCurvature && kVariant != kLinearHeights;
   constexpr int64_t kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
+  constexpr bool kAhead = kGrouped && !kWide;  // 32 registers also hold the pixels' places for the next pulse
   const int64_t count = batch.count[kVariant], width = job.width, *order = batch.order[kVariant];
   if (count == 0) return;
   const Phase phase(job.phase_coefficients);
