@@ -65,7 +65,7 @@ const Isa* find(const char* name) {
 }
 
 constexpr int64_t kPulses = 64;   // in one pass: with kRegion, what the second-level cache holds
-constexpr int64_t kRegion = 128;  // pixels on a side of what is finished before going on
+constexpr int64_t kRegion = 256;  // pixels on a side of what is finished before going on
 constexpr int64_t kSum = 2 * kPixels;
 
 // Writes the sums of one patch to its pixels.
