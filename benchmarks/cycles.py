@@ -27,6 +27,7 @@ import numpy as np
 from job import CENTRE_HZ, Job, build, echoes, error_db
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.errors import CampaignError
 from apertura.focus.engines import native, native_binding
 from apertura.focus.engines.native_tables import Tables
 
@@ -68,6 +69,17 @@ def engine(job: Job, tables: Tables, kernel: str, isa: str) -> Callable[[], np.n
         return native.form(tables, job.pixels)
 
     return run
+
+
+def fits(path: Path) -> bool:
+    """Return whether a build of the engine takes what this one takes; if not, say why."""
+    os.environ["APERTURA_KERNEL"] = str(path.resolve())
+    try:
+        native_binding.library()
+    except (CampaignError, RuntimeError, OSError) as reason:
+        print(f"without {path.name}: {reason}")
+        return False
+    return True
 
 
 def other(path: Path, job: Job, tables: Tables) -> Callable[[], np.ndarray]:
@@ -139,6 +151,7 @@ def main() -> None:
         parser.error("sizes must be multiples of 16, pulses of 8")
     if asked.other is None:
         print("no other kernel: --other names none")
+    asked.kernel = [path for path in asked.kernel if fits(path)]
     chain(1, 1)
     for size in asked.sizes:
         compare(size, asked)
