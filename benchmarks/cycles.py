@@ -111,6 +111,7 @@ def other(path: Path, job: Job, tables: Tables) -> Callable[[], np.ndarray]:
 
 def compare(size: int, asked: argparse.Namespace) -> None:
     """Print one row per contestant for an image of size × size."""
+    os.environ["APERTURA_KERNEL"] = ""  # tables are of the build that is installed
     job = of_one_start(build(size, asked.pulses))
     tables = native.prepare(job.profiles, oversampling=asked.oversampling)
     ways = {"native": engine(job, tables, "", asked.isa)}
