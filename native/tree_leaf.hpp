@@ -35,14 +35,13 @@ struct Cells {
 };
 
 // exp(j k r) at so many cells from number `first` on, number 0 at r = `from`, as factors for pairs.
-inline void put_carrier(const TreeJob& job, double from, int64_t first, int64_t width, Floats& cosines,
-                        Floats& sines) {
+inline void put_carrier(const TreeJob& job, double from, int64_t first, int64_t width, Floats& cosines, Floats& sines) {
   cosines.resize(size_t(kRecord * width)), sines.resize(size_t(kRecord * width));
   for (int64_t cell = 0; cell < width; cell++) {
-    const double turn = std::fmod(job.wavenumber * (from + double(first + cell) * job.step / double(job.up)), 6.283185307179586);
+    const double turn =
+        std::fmod(job.wavenumber * (from + double(first + cell) * job.step / double(job.up)), 6.283185307179586);
     const float c = float(std::cos(turn)), s = float(std::sin(turn));
-    for (int64_t n = 0; n < kRecord; n++)
-      cosines[kRecord * cell + n] = c, sines[kRecord * cell + n] = n % 2 ? s : -s;
+    for (int64_t n = 0; n < kRecord; n++) cosines[kRecord * cell + n] = c, sines[kRecord * cell + n] = n % 2 ? s : -s;
   }
 }
 
@@ -55,7 +54,8 @@ inline int64_t line_length(const TreeJob& job, const TreeTile& tile) {
 inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float* taken, float* line) {
   const Legs legs = legs_of(job, tile.centre, pulse);
   const int64_t length = line_length(job, tile), count = length + kTreeDelays;
-  const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead), whole = std::floor(at);
+  const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead),
+               whole = std::floor(at);
   // Samples from `whole - kTreeDelays / 2 + 1` on, zeros beyond the profile.
   const int64_t before = int64_t(whole) - kTreeDelays / 2 + 1;
   const int64_t low = std::min(count, std::max<int64_t>(0, -before));
