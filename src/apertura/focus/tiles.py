@@ -177,8 +177,7 @@ def _form(  # noqa: PLR0917
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
     some = beams and beams[block.start + part.start : block.start + part.stop]
-    pixels = forming.terrain.positions(grid)
-    engine = load_engine(setting.engine)
+    engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
     ways: tuple[str, ...] = getattr(engine, "WAYS", ())
     counted = {"counts": np.zeros(len(ways), np.int64)} if ways else {}
     image = engine.form(tables, pixels, beams=some, **setting.form_options, **counted)
