@@ -18,12 +18,10 @@ from apertura.focus.engines.native_structs import (
     TreeJob,
     TreeTile,
 )
-from apertura.focus.engines.tree_inputs import LEAF, Trees, delay_filter
+from apertura.focus.engines.tree_inputs import LEAF, SMOOTH, Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, weights_over
-
-_SMOOTH = 2.0  # of what an interpolation may err by: how far pulses may leave a smooth curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +142,7 @@ class Chunk:
             step=profiles.step_m,
             wavenumber=self.trees.wavenumber_rad_m,
             band=self.trees.band_rad_m,
-            smooth=_SMOOTH * 10 ** (self.nodes_db / 20),
+            smooth=SMOOTH * 10 ** (self.nodes_db / 20),
         )
         job.sizes[: len(self.sizes)] = self.sizes
         job.phase_coefficients[:] = design.phase_coefficients.tolist()

@@ -23,6 +23,10 @@ LEAF = TREE_GROUP
 DEGREES = (5, 9, 14, 20)
 """Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
 
+SMOOTH = 1.0
+"""Of what an interpolation may err by: how far pulses may leave such a curve, RMS. What they leave it by errs more than
+itself: fewer pulses neither show it nor leave it out."""
+
 CELLS_AT_ONCE = 4
 """Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
 
@@ -251,7 +255,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
         start_m=np.ascontiguousarray(profiles.start_m, np.float64),
     )
     legs = [leaves_of(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
-    stray, rough = sum(map(_stray, legs)), np.sqrt(sum(leaf_roughness(leg) ** 2 for leg in legs))
+    stray, rough = (sum(map(off, legs)) for off in (_stray, leaf_roughness))  # legs may share a platform
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     found = cells(profiles.oversampling, turn, float(oversampling), taps)
     return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))

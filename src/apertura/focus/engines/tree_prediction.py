@@ -12,7 +12,15 @@ from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.native_structs import TREE_DELAYS
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAF, cells, cells_per_sample, roughness, subaperture_sizes
+from apertura.focus.engines.tree_inputs import (
+    DIRECTLY_AT,
+    LEAF,
+    SMOOTH,
+    cells,
+    cells_per_sample,
+    roughness,
+    subaperture_sizes,
+)
 from apertura.focus.engines.tree_surface import Surface, surfaces_of
 from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
 from apertura.focus.job import Job, Signal
@@ -152,7 +160,7 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
         "tree",
         {"oversampling": options.oversampling, "taps": options.taps},
         {"nodes_db": nodes_db, "side_px": options.side_px, "chunk": options.chunk},
-        error_db,
+        float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
         seconds,
         table_seconds=_START_S + (direct.table_seconds if directly else 0.0),
         table_bytes=8 * pulses * signal.samples + (direct.table_bytes if directly else 0),
@@ -181,7 +189,7 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: fl
             directly.append(1.0)
             continue
         for one in here:
-            counts = counts_of(one, options.nodes_db, smooth_rad=2 * limit, weighted=job.beams is not None)
+            counts = counts_of(one, options.nodes_db, smooth_rad=SMOOTH * limit, weighted=job.beams is not None)
             directly.append(float(not counts.nodes))
             if not counts.nodes:
                 spent.append(pulses * side**2 * direct_s)

@@ -134,7 +134,7 @@ def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tup
         three = leaf[np.array([0, (len(leaf) - 1) // 2, len(leaf) - 1])]
         first, middle, last = three.path(slopes.places_m) - three.path(slopes.centre_m[None])
         turn = max(turn, float((0.5 * np.abs(last - first) + np.abs(first + last - 2 * middle)).max()))
-        off_m = np.sqrt(sum(leaf_roughness(leaves_of(leg))[0] ** 2 for leg in leaf.legs))
+        off_m = sum(leaf_roughness(leaves_of(leg))[0] for leg in leaf.legs)
         nearest = min(float(np.linalg.norm(leg[len(leaf) // 2] - slopes.centre_m)) for leg in leaf.legs)
         rough = np.maximum(rough, off_m * slopes.radius_m / nearest / np.sqrt(3))
     return wavenumber_rad_m * turn, wavenumber_rad_m * rough
