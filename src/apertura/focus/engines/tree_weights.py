@@ -16,12 +16,13 @@ BY_TREE, DIRECTLY, SILENTLY = range(3)
 _TERMS = 4  # of ξ and of η
 _PLACES = np.cos(np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
 _BETWEEN = np.array([-1.0, -0.65, 0.0, 0.65, 1.0])
+_DEGREE = 5  # of the curve that weights follow from pulse to pulse where fewer may stand for those of a leaf
 _CHECKED = 8  # pulses of which one is looked at between the places
 
 
 def weights_over(
     beams: Beams, aperture: Aperture, surface: Surface, error_db: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the weight of each pulse over a tile, and how groups of pulses are taken.
 
     Parameters
@@ -39,6 +40,8 @@ def weights_over(
         (pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
     way
         (group of 64 pulses,) uint8: by tree where polynomials hold, silently where no pulse weighs anything.
+    each
+        (group,) uint8: 1 where weights jump from pulse to pulse, so that each goes for itself.
 
     Notes
     -----
@@ -60,7 +63,18 @@ def weights_over(
             way[group] = DIRECTLY if checked[here].any() else SILENTLY
         elif not (error[here] <= limit * values[pulses].max()).all():
             way[group] = DIRECTLY
-    return np.ascontiguousarray(terms, np.float32), way
+    return np.ascontiguousarray(terms, np.float32), way, _jumps(values, 10 ** (error_db / 20))
+
+
+def _jumps(values: NDArray[np.float64], limit: float) -> NDArray[np.uint8]:
+    """Return (group,) whether weights (pulse, place) leave smooth curves over their group, relative to the largest."""
+    jumps = np.zeros(-(-len(values) // TREE_GROUP), np.uint8)
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, TREE_GROUP), _DEGREE))[0]
+    for group in range(len(values) // TREE_GROUP):
+        here = values[group * TREE_GROUP : (group + 1) * TREE_GROUP]
+        rest = here - basis @ (basis.T @ here)
+        jumps[group] = np.sqrt((rest**2).mean()) > limit * here.max()
+    return jumps
 
 
 def _positions(surface: Surface, places: NDArray[np.float64]) -> NDArray[np.float64]:
