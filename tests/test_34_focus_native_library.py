@@ -106,7 +106,10 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
         "no:cacheprovider",
         "-m",
         "not slow",
-        *(f"tests/test_34_focus_{name}.py" for name in ("native", "beams", "envelope", "contributions", "gradient")),
+        *(
+            f"tests/test_34_focus_{name}.py"
+            for name in ("native", "beams", "envelope", "contributions", "gradient", "tree")
+        ),
     ]
     done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -16,7 +16,7 @@ from apertura.geometry.aperture import Aperture
 
 _FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
 _NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
-_AIRY = 2.0  # units of eq. 4b
+_AIRY = 3.0  # units of eq. 4b
 _SPREAD = 4  # pulses that a curve takes beyond its degree: native/tree_plan.hpp, kTreeMore
 _WEIGHTED = 1.5  # rad that weights add to a band: native/tree_job.hpp
 _LOOKED_AT = 3  # subapertures of a level, at most
@@ -101,7 +101,7 @@ def highest(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     --------
     >>> flat = np.tile([1.0, 5.0, 5.0, 1.0], (4, 1))
     >>> highest(np.stack([flat, flat])).round(2)
-    array([8.8, 5.5])
+    array([10.45,  5.5 ])
     """
     most = band_rad.copy()
     units = (band_rad.shape[-1] - 1) ** 2 / 8

@@ -1,0 +1,296 @@
+"""The tree against the double sum: what goes by it, what goes directly, and the same bits however a block is cut."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import BANDWIDTH_HZ, SUBCARRIERS, compiled, decibels, ecef, error_db, fly, pixel_grid, scatter, swaying_beam
+
+from apertura.antenna.beam import Beam, Beams
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.focus.engines import native, pieces, reference, tree
+from apertura.focus.engines.engine import Setting
+from apertura.focus.engines.tree_inputs import SMOOTH, roughness, subaperture_sizes
+from apertura.focus.engines.tree_nodes import nodes, supports, weights, widest_band
+from apertura.focus.engines.tree_surface import surfaces_of
+from apertura.focus.engines.tree_view import counts_of, highest, look, nodes_for
+from apertura.focus.job import Job, Signal
+from apertura.geometry.aperture import Aperture
+from apertura.geometry.sector import Sector
+
+pytestmark = compiled
+
+STEP_M = C / BANDWIDTH_HZ / 2
+WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * BANDWIDTH_HZ / C}
+
+
+def seen(scene, pixels):
+    """A flight and profiles that hold what lies around its pixels, too: filters of trees are long."""
+    around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
+    wide = scene.profiles(ecef(np.concatenate(around)))
+    return SimpleNamespace(scene=scene, pixels=pixels, profiles=wide, aperture=Aperture(scene.tx, scene.rx))
+
+
+def flown(pixels, **options):
+    """A flight over pixels on which scatterers stand."""
+    return seen(fly(scatter(pixels), **options), pixels)
+
+
+def setting(flight, **asked) -> Setting:
+    """What the tree predicts of a flight with these options."""
+    places, shape = ecef(flight.pixels), flight.pixels.shape[:2]
+    corners = places[np.ix_(*(np.linspace(0, size - 1, 3).astype(int) for size in shape))]
+    signal = Signal(flight.scene.carrier_hz, 2.0, STEP_M, flight.profiles.samples.shape[1])
+    job = Job(flight.aperture, corners, shape, 0.05, flight.scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal)
+    asked = {"side_px": 64, "chunk": 256} | asked
+    return next(iter(tree.candidates(job, pulses=len(flight.aperture), asked=asked)))
+
+
+def formed(flight, pixels=None, *, beams=None, **asked):
+    """The image, and which part of it went by tree, directly and silently."""
+    chosen, counts = setting(flight, **{"nodes_db": -74} | asked), np.zeros(3, np.int64)
+    places = ecef(flight.pixels if pixels is None else pixels)
+    trees = tree.prepare(flight.profiles, **chosen.options)
+    image = tree.form(trees, places, beams=beams, counts=counts, **chosen.form_options)
+    assert counts.sum() == image.size * len(flight.aperture)
+    return image, counts / counts.sum()
+
+
+def counted(aperture, pixels, nodes_db=-74, *, carrier_hz=1.2e9):
+    """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
+    (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
+    seen = look(
+        aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
+    )
+    return counts_of(seen, nodes_db, smooth_rad=SMOOTH * 10 ** (nodes_db / 20), weighted=False)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["bistatic", "monostatic"])
+def flights(request):
+    return flown(pixel_grid(70, 90), pulses=300, bistatic=request.param)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return flown(pixel_grid(70, 90), pulses=300)
+
+
+@pytest.mark.parametrize("nodes_db", [-50, -74, -92])
+def test_every_instruction_set_errs_as_predicted(isa, flights, nodes_db):
+    image, share = formed(flights, nodes_db=nodes_db)
+    assert tree.instruction_set() == isa
+    assert share.tolist() == [1, 0, 0]
+    predicted_db = setting(flights, nodes_db=nodes_db).error_db
+    assert error_db(flights.scene, flights.pixels, image) <= predicted_db + 3
+    assert nodes_db + 3 < predicted_db < nodes_db + 13
+
+
+def test_tiles_change_nothing_to_the_bit(isa, plain):
+    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+    trees = tree.prepare(plain.profiles, **chosen.options)
+    whole = tree.form(trees, places, **chosen.form_options)
+    windows = pieces("tree", whole.shape, chosen.form_options)
+    assert len(windows) == 4
+    for window in windows:
+        alone = tree.form(trees, places[window], **chosen.form_options)
+        np.testing.assert_array_equal(alone.view(np.uint32), whole[window].view(np.uint32))
+
+
+def test_threads_give_the_same_bits(plain):
+    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+    trees = tree.prepare(plain.profiles, **chosen.options)
+    with ThreadPoolExecutor(2) as pool:
+        images = list(pool.map(lambda _: tree.form(trees, places, **chosen.form_options), range(4)))
+    assert all(np.array_equal(image, images[0]) for image in images)
+
+
+def test_pixels_without_a_place_are_nan_and_their_neighbours_unharmed(plain):
+    pixels, (whole, _) = plain.pixels.copy(), formed(plain)
+    pixels[3, 5] = np.nan
+    image, share = formed(plain, pixels)
+    assert np.argwhere(np.isnan(image)).tolist() == [[3, 5]]
+    tile = pieces("tree", image.shape, {"side_px": 64})[0]
+    assert share[1] == pytest.approx(image[tile].size / image.size)  # its tile goes directly, all others by tree
+    elsewhere = np.ones(image.shape, bool)
+    elsewhere[tile] = False
+    assert np.array_equal(image[elsewhere], whole[elsewhere])
+    image[3, 5] = whole[3, 5]
+    assert decibels(image - whole, whole) <= -65
+
+
+def test_tiles_at_the_end_of_profiles_go_directly():
+    """Profiles end in the middle of the scene: their edge has no band, and is the direct kernel's."""
+    flight = flown(pixel_grid(130, 200, spacing_m=0.15), pulses=128)
+    whole, _ = formed(flight)
+    flight.profiles = replace(flight.profiles, samples=flight.profiles.samples[:, :100])
+    image, share = formed(flight)
+    direct = native.form(native.prepare(flight.profiles, oversampling=6), ecef(flight.pixels))
+    assert 0.2 < share[0] < 0.8
+    assert share[1] > 0.2
+    assert decibels(image - direct, direct) <= -62
+    assert decibels(whole - direct, direct) > -20  # the end matters
+
+
+def test_tiles_beyond_all_profiles_cost_nothing(plain):
+    far = pixel_grid(40, 40, range_m=60.0)
+    image, share = formed(plain, far)
+    assert share.tolist() == [0, 0, 1]
+    assert not image.any()
+
+
+@pytest.mark.parametrize("jitter_m", [0.0, 1e-3, 1e-2])
+def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
+    """A smooth track's 64 pulses become few; white noise of a millimetre on it is not smooth at 12 m, and is kept."""
+    white = jitter_m * np.random.default_rng(8).standard_normal((2, 300, 3))
+    scene = replace(plain.scene, tx=plain.scene.tx + white[0], rx=plain.scene.rx + white[1])
+    delay = (scene.path_m(ecef(scatter(plain.pixels)))) / C
+    waves = np.exp(-2j * np.pi * delay[..., None] * (scene.carrier_hz + scene.offset_hz))
+    scene = replace(scene, transfer=np.einsum("ptn,t->pn", waves, np.exp(2j * np.pi * np.arange(25) * 0.618)))
+    shaken = seen(scene, plain.pixels)
+    fewer = counted(shaken.aperture[:256], ecef(plain.pixels[:35, :45])).fewer
+    assert 5 <= fewer <= 28 if not jitter_m else fewer == 0
+    image, share = formed(shaken)
+    assert share[0] == 1
+    assert error_db(scene, plain.pixels, image) <= -64
+
+
+def test_rough_ground_goes_directly():
+    rough = pixel_grid(70, 90)
+    rough[..., 2] += 0.02 * np.random.default_rng(6).standard_normal(rough.shape[:2])
+    flight = flown(rough, pulses=300)
+    image, share = formed(flight)
+    assert share.tolist() == [0, 1, 0]
+    assert error_db(flight.scene, rough, image) <= -70
+
+
+def test_rolling_ground_goes_by_tree():
+    rolling = pixel_grid(70, 90)
+    rolling[..., 2] = 0.15 * np.sin(rolling[..., 0]) * np.cos(1.3 * rolling[..., 1])
+    flight = flown(rolling, pulses=300)
+    image, share = formed(flight)
+    assert share.tolist() == [1, 0, 0]
+    assert error_db(flight.scene, rolling, image) <= setting(flight, nodes_db=-74).error_db + 3
+
+
+def test_pixels_off_their_surface_err_as_predicted():
+    """Eq. 9: six tenths of a millimetre of noise on the ground, which the tree takes at -50 dB."""
+    pixels = pixel_grid(60, 60)
+    rough, flight = pixels.copy(), flown(pixels, pulses=256)
+    rough[..., 2] += 6e-4 * np.random.default_rng(6).standard_normal((60, 60))
+    (surface,) = surfaces_of(ecef(rough), [(slice(0, 60), slice(0, 60))])
+    powers = []
+    for places in (rough, pixels):
+        image, share = formed(flight, places, nodes_db=-50)
+        assert share[0] == 1
+        powers.append(10 ** (error_db(flight.scene, places, image, 600) / 10))
+    more_db = 10 * np.log10(powers[0] - powers[1])
+    assert more_db == pytest.approx(10 * np.log10(roughness(flight.aperture, surface, **WAVENUMBERS)), abs=1)
+
+
+@pytest.mark.parametrize(("range_m", "spacing_m", "levels"), [(12.0, 0.05, 2), (5.0, 0.08, 1), (3.0, 0.15, 0)])
+def test_a_near_tile_takes_smaller_subapertures_or_goes_directly(range_m, spacing_m, levels):
+    """The nearer a tile, the more nodes a subaperture takes: beyond 128 of them there are fewer levels, or no tree."""
+    pixels = pixel_grid(100, 100, spacing_m=spacing_m, range_m=range_m)
+    flight = flown(pixels, pulses=256, carrier_hz=4e9, range_m=range_m)
+    image, share = formed(flight, side_px=128)
+    assert len(counted(flight.aperture, ecef(pixels), carrier_hz=4e9).nodes) == levels
+    assert share.tolist() == [levels > 0, levels == 0, 0]
+    assert error_db(flight.scene, pixels, image) <= -62
+
+
+def weighed_error_db(flight, image, beams):
+    pick = np.random.default_rng(3).integers(0, image.size, 100)
+    truth = reference.form(flight.scene.history(), ecef(flight.pixels).reshape(-1, 3)[pick][None], beams=beams)[0]
+    return decibels(image.ravel()[pick] - truth, truth)
+
+
+@pytest.mark.parametrize("sway_deg", [0.0, 3.0])
+def test_smooth_weights_are_applied_at_the_leaves(isa, plain, sway_deg):
+    """Also where they jump from pulse to pulse: those go each for itself."""
+    beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=sway_deg))
+    image, share = formed(plain, beams=beams)
+    assert share.tolist() == [1, 0, 0]
+    assert weighed_error_db(plain, image, beams) <= -64
+    assert decibels(image - formed(plain)[0], image) > -30  # the weight matters
+
+
+def test_the_edges_of_a_sector_go_directly(plain):
+    beams = Beams(None, None, Sector.of(plain.aperture, chord_m=1.2, centre=0.02, half=0.25))
+    image, share = formed(plain, beams=beams)
+    assert (share[:2] > 0.2).all()  # inside, at the edge
+    assert weighed_error_db(plain, image, beams) <= -62
+
+
+def test_the_edge_of_a_beam_goes_directly(plain):
+    soft, angle = swaying_beam(plain.scene.tx, (12, 0, 0), sway_deg=1), np.radians([-5.0, 0, 5.0])
+    beams = Beams(Beam(soft.axes, angle, np.ones(3), angle, np.ones(3)))
+    image, share = formed(plain, beams=beams)
+    assert share.tolist() == [0, 1, 0]
+    assert weighed_error_db(plain, image, beams) <= -62
+
+
+@pytest.mark.parametrize("edges", [(0, 64, 192, 300), (0, 256, 300)])
+def test_prepared_pulses_add_up(plain, edges):
+    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+    trees = tree.prepare(plain.profiles, **chosen.options)
+    parts = [trees[first:last] for first, last in pairwise(edges)]
+    assert [len(part) for part in parts] == np.diff(edges).tolist()
+    total = sum(tree.form(part, places, **chosen.form_options) for part in parts)
+    whole = tree.form(trees, places, **chosen.form_options)
+    assert decibels(total - whole, whole) <= -65
+
+
+@pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -92)])
+def test_the_table_of_supports_is_what_nodes_hold(count, nodes_db):
+    assert supports(nodes_db)[count] == pytest.approx(widest_band(count, nodes_db), abs=0.02)
+
+
+def test_a_slope_that_peaks_in_a_tile_takes_the_nodes_of_its_airy_tail():
+    """Eq. 4b: the highest slope of the phase is no end of its spectrum where the slope is highest inside the tile."""
+    at, error_db = np.linspace(-1, 1, 4001), -74
+    seen = np.linspace(-1, 1, 8)
+    highest_rad, bend_rad = 60.0, 40.0
+
+    def left_db(band_rad):
+        count = int(nodes_for(np.array([band_rad]), error_db)[0])
+        wave = np.exp(1j * (highest_rad * at - bend_rad * at**3 / 6))
+        here = np.exp(1j * (highest_rad * nodes(count, error_db) - bend_rad * nodes(count, error_db) ** 3 / 6))
+        found = weights(count, at, error_db, float(supports(error_db)[count])) @ here
+        return decibels(found - wave, wave)
+
+    slopes = np.tile(highest_rad - bend_rad * seen**2 / 2, (8, 1))
+    band_rad = highest(np.stack([slopes, slopes.T]))[0]
+    assert left_db(band_rad) < -70
+    assert left_db(highest_rad) > -30
+    assert band_rad < highest_rad + 10
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"oversampling": 1.2}, "must be at least 1.5"),
+        (
+            {
+                "samples": np.zeros((0, 5), np.complex64),
+                "start_m": np.zeros(0),
+                "aperture": Aperture(*np.zeros((2, 0, 3))),
+            },
+            "holds no pulse",
+        ),
+        ({"start_m": np.full(300, np.nan)}, "must be finite"),
+    ],
+)
+def test_profiles_that_no_tree_can_take_are_refused(plain, changes, message):
+    with pytest.raises(ValueError, match=message):
+        tree.prepare(replace(plain.profiles, **changes))
+
+
+def test_pixels_and_beams_of_other_shapes_are_refused(plain):
+    trees = tree.prepare(plain.profiles)
+    with pytest.raises(ValueError, match=r"must be \(y, x, 3\)"):
+        tree.form(trees, np.zeros((4, 3)))
+    with pytest.raises(ValueError, match="beams must be of 300 pulses"):
+        tree.form(trees, ecef(plain.pixels), beams=Beams(swaying_beam(plain.scene.tx[:9], (12, 0, 0))))
