@@ -175,7 +175,7 @@ class Chunk:
             at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
             places[slot] = self._hold(np.ascontiguousarray(at))
         presum = np.zeros(TREE_FEWER + 1, np.uintp)
-        for fewer in {int(n) for counts in self._fewer for n in counts if n}:
+        for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
             presum[fewer] = self._hold(np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T))
             places[fewer] = self._hold(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
         job.places, job.spread, job.mix, job.presum = map(self._hold, (places, spread, mix, presum))
