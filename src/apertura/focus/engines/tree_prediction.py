@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ _APART = 1.1  # times as long as in one go for pixels and pulses that go directl
 _WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
 _PLAIN = 2.0  # times as long where each pulse goes for itself: its cells are many
 _FORM_S = 4e-4  # a block of pixels
+_SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
 
@@ -75,20 +77,20 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     -----
     Source: docs/theory/tree.md, "Error" and "Cost".
     """
-    for side_px in asked_or(asked, "side_px", SIDES_PX):
-        for chunk in asked_or(asked, "chunk", CHUNKS):
-            if (side_px, chunk) != (SIDES_PX[0], CHUNKS[0]) and _larger_than_job(job, pulses, side_px, chunk):
-                continue
-            seen = _seen(job, pulses, side_px, chunk)
-            for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
-                oversampling, taps = SETTINGS[nodes_db]
-                oversampling = asked.get("oversampling") or oversampling
-                yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
+    for side_px, chunk in _cuts(job, pulses, asked):
+        seen = _seen(job, pulses, side_px, chunk)
+        for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
+            oversampling, taps = SETTINGS[nodes_db]
+            oversampling = asked.get("oversampling") or oversampling
+            yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
 
 
-def _larger_than_job(job: Job, pulses: int, side_px: int, chunk: int) -> bool:
-    """Return whether a smaller side or chunk already takes all there is."""
-    return side_px >= 2 * min(job.tile_px, max(job.shape)) or chunk >= 8 * max(pulses, LEAF)
+def _cuts(job: Job, pulses: int, asked: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """Return sides of tiles and pulses of chunks to look at; one where the job is not worth a look at more."""
+    cuts = list(product(asked_or(asked, "side_px", SIDES_PX), asked_or(asked, "chunk", CHUNKS)))
+    most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
+    fitting = [(side, chunk) for side, chunk in cuts if side < most_px and chunk < most_pulses] or cuts[:1]
+    return fitting if job.pixels * pulses > _SMALL else fitting[-1:]
 
 
 @dataclass(frozen=True)
