@@ -22,7 +22,7 @@ def test_an_engine_meets_its_aim_at_the_pixels_compared(small):
     assert one.error_db < -60
     row = one.row(house.compressions[0])
     assert (row["size"], row["pulses"], row["aim_db"], row["scaled"], row["rounds"]) == (256, 64, -60.0, False, 1)
-    assert row["seconds_from_echoes"] > row["seconds"] > row["seconds_shared"] > 0
+    assert row["seconds_from_echoes"] > row["seconds"] > row["seconds_shared"] > 0 < row["planning_seconds"]
 
 
 def test_a_part_of_the_tiles_gives_the_same_pixels_and_counts_for_all(monkeypatch):
