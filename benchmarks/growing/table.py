@@ -43,10 +43,10 @@ def exponents(rows: list[Row]) -> str:
 
 
 def markdown(rows: list[Row]) -> str:
-    """Return all rows as a table, ratios against native at −60 dB of the same scene."""
+    """Return all rows as a table, ratios against native at −60 dB of the same scene: from profiles and from echoes."""
     lines = [
         "| image × pulses | geometry, ground | contestant | setting | seconds | from echoes | least … most "
-        "| × native −60 | 10⁹ pixel·pulses/s | error dB | share, rounds, load |",
+        "| × native −60, from echoes | 10⁹ pixel·pulses/s | error dB | share, rounds, load |",
         "|---" * 11 + "|",
     ]
     scenes: dict[tuple[Any, ...], list[Row]] = {}
@@ -54,9 +54,10 @@ def markdown(rows: list[Row]) -> str:
         scenes.setdefault((row["geometry"], row["surface"], row["size"], row["pulses"]), []).append(row)
     for scene in sorted(scenes):
         some = scenes[scene]
-        base = next((row["seconds_from_echoes"] for row in some if label(row) == "native −60 dB"), None)
+        base = next((row for row in some if label(row) == "native −60 dB"), None)
         for row in some:
-            ratio = f"{base / row['seconds_from_echoes']:.2f}" if base else ""
+            ratios = [base[key] / row[key] if base and row[key] else None for key in ("seconds", "seconds_from_echoes")]
+            ratio = ", ".join("–" if one is None else f"{one:.3g}" for one in ratios)
             seconds = "" if row["seconds"] is None else f"{row['seconds']:.3g}"
             cells = (
                 f"{row['size']}² × {row['pulses']}", f"{row['geometry']}, {row['surface']}", label(row),
