@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "patch.hpp"
+#include "tree_job.hpp"
 
 using apertura::kPatchSide;
 using apertura::kPixels;
@@ -15,7 +16,10 @@ using apertura::Patch;
   extern "C" void apertura_add_##isa(const ApertureJob*, const Patch*, int64_t, int64_t, float*); \
   extern "C" void apertura_expand_##isa(const TableJob*, float*);                                 \
   extern "C" void apertura_contribute_##isa(const EchoJob*);                                      \
-  extern "C" void apertura_differentiate_##isa(const EchoJob*);
+  extern "C" void apertura_differentiate_##isa(const EchoJob*);                                   \
+  extern "C" void apertura_rest_tree_##isa(TreeJob*);                                             \
+  extern "C" void apertura_plan_tree_##isa(TreeJob*);                                             \
+  extern "C" void apertura_form_tree_##isa(TreeJob*);
 
 APERTURA_DECLARE(portable)
 #ifdef APERTURA_X86
@@ -33,6 +37,9 @@ struct Isa {
   void (*expand)(const TableJob*, float*);
   void (*contribute)(const EchoJob*);
   void (*differentiate)(const EchoJob*);
+  void (*rest_tree)(TreeJob*);
+  void (*plan_tree)(TreeJob*);
+  void (*form_tree)(TreeJob*);
 };
 
 // Fastest first.
@@ -45,12 +52,12 @@ const Isa* find(const char* name) {
   static const Isa isas[] = {
 #ifdef APERTURA_X86
       {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
-       apertura_differentiate_avx512},
+       apertura_differentiate_avx512, apertura_rest_tree_avx512, apertura_plan_tree_avx512, apertura_form_tree_avx512},
       {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2,
-       apertura_differentiate_avx2},
+       apertura_differentiate_avx2, apertura_rest_tree_avx2, apertura_plan_tree_avx2, apertura_form_tree_avx2},
 #endif
       {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable,
-       apertura_differentiate_portable},
+       apertura_differentiate_portable, apertura_rest_tree_portable, apertura_plan_tree_portable, apertura_form_tree_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
@@ -58,7 +65,7 @@ const Isa* find(const char* name) {
 }
 
 constexpr int64_t kPulses = 64;   // in one pass: with kRegion, what the second-level cache holds
-constexpr int64_t kRegion = 128;  // pixels on a side of what is finished before going on
+constexpr int64_t kRegion = 256;  // pixels on a side of what is finished before going on
 constexpr int64_t kSum = 2 * kPixels;
 
 // Writes the sums of one patch to its pixels.
@@ -149,6 +156,18 @@ __attribute__((visibility("default"))) int apertura_contribute(const char* name,
 
 __attribute__((visibility("default"))) int apertura_differentiate(const char* name, const EchoJob* job) {
   return run(name, [job](const Isa& isa) { isa.differentiate(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_rest_tree(const char* name, TreeJob* job) {
+  return run(name, [job](const Isa& isa) { isa.rest_tree(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_plan_tree(const char* name, TreeJob* job) {
+  return run(name, [job](const Isa& isa) { isa.plan_tree(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_form_tree(const char* name, TreeJob* job) {
+  return run(name, [job](const Isa& isa) { isa.form_tree(job); });
 }
 
 }  // extern "C"

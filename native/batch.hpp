@@ -24,25 +24,27 @@ enum Variant {
 };
 constexpr bool kGrouped = kLanes == 16;  // narrow windows serve groups of four blocks
 
-// What the pixel loop reads: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block.
+// What the pixel loop reads: pulses sorted by variant, and the path's polynomial (5b) of each pulse and block. What
+// flat ground needs lies together.
 struct Batch {
   alignas(64) float path[kBatch][kBlocks];  // at the block's centre, in cells from the window's first cell
-  alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks], h[kBatch][kBlocks];  // its derivatives
+  alignas(64) float x[kBatch][kBlocks], y[kBatch][kBlocks];  // its derivatives
+  alignas(64) int32_t window[kBatch][kBlocks];               // first cell, from `row`
+  alignas(64) float shared_curvature[kBatch][16];            // x'^2 xx + x'y' xy + y'^2 yy at the pixels of any block
+  const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
+  int64_t order[kVariants][kBatch];  // the pulses of each variant
+  int64_t count[kVariants];
+  alignas(64) float h[kBatch][kBlocks];          // derivative along the height
+  alignas(64) float shared_slope_h[kBatch][16];  // x' xh + y' yh at the pixels of any block
+  float shared_hh[kBatch];
   // Own curvature: its second-order coefficients, (5a).
   alignas(64) float xx[kBatch][kBlocks], xy[kBatch][kBlocks], yy[kBatch][kBlocks];
   alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
-  alignas(64) int32_t window[kBatch][kBlocks];     // first cell, from `row`
-  alignas(64) float shared_curvature[kBatch][16];  // x'^2 xx + x'y' xy + y'^2 yy at the pixels of any block
-  alignas(64) float shared_slope_h[kBatch][16];    // x' xh + y' yh at them
-  float shared_hh[kBatch];
   alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // (7)
   float weight_h[kBatch];
   // Depth inside the sector, in widths of its edge: integration.md, (4).
   alignas(64) float depth[kBatch][kBlocks], depth_x[kBatch][kBlocks], depth_y[kBatch][kBlocks];
   float depth_h[kBatch], depth_xx[kBatch], depth_xy[kBatch], depth_yy[kBatch];  // second order at the origin
-  const float* row[kBatch];          // of the table: the cell of the pulse's path to the patch's origin
-  int64_t order[kVariants][kBatch];  // the pulses of each variant
-  int64_t count[kVariants];
 };
 
 // x' and y': pixels of a block from its centre.
@@ -157,44 +159,61 @@ inline Lanes pixel_paths(const Patch& patch, const Batch& batch, int64_t q, int6
   return t;
 }
 
+// The first group of blocks from `group` on that holds pixels, or kBlocks.
+template <int64_t kBundle>
+inline int64_t next_present(const Patch& patch, int64_t group) {
+  while (group < kBlocks && !patch.present[group]) group += kBundle;
+  return group;
+}
+
 // The pixel loop: for the blocks of each window, all pulses of one variant. `sum` is re then im, block by block.
 template <class Phase, int64_t kDegree, bool kTerrain, Variant kVariant>
 inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& batch, float* sum) {
   constexpr bool kWide = kVariant != kSharedCurvature && kVariant != kLinearHeights;
   constexpr int64_t kParts = 16 / kLanes, kBundle = kGrouped && !kWide ? 4 : 1, kVectors = kBundle * kParts;
-  const int64_t count = batch.count[kVariant];
+  constexpr bool kAhead = kGrouped && !kWide;  // 32 registers also hold the pixels' places for the next pulse
+  const int64_t count = batch.count[kVariant], width = job.width, *order = batch.order[kVariant];
   if (count == 0) return;
   const Phase phase(job.phase_coefficients);
-  const int64_t width = job.width;
-  for (int64_t group = 0; group < kBlocks; group += kBundle) {
-    if (!patch.present[group]) continue;
+  // Path t of each pixel by (5b); its cell i = round(t) lies in the low bits of t + 1.5 2^23, and u = t - i is the
+  // place in the cell. They are found before they are needed, so that no vector waits for its own: with registers for
+  // it a pulse ahead, else all of a pulse before its first look-up.
+  Lanes place[kVectors];
+  IntLanes index[kVectors];
+  const auto find_place = [&](int64_t q, int64_t group, int64_t v) {
+    const Lanes t = pixel_paths<kTerrain, kVariant>(patch, batch, q, group + v / kParts, v % kParts * kLanes);
+    const Lanes rounded = t + kRounder;
+    place[v] = t - (rounded - kRounder), index[v] = (IntLanes)rounded;
+  };
+  int64_t group = next_present<kBundle>(patch, 0);
+  for (int64_t v = 0; kAhead && group < kBlocks && v < kVectors; v++) find_place(order[0], group, v);
+  for (int64_t after; group < kBlocks; group = after) {
+    after = next_present<kBundle>(patch, group + kBundle);
     // The image of these blocks stays in registers over all pulses.
     Lanes re[kVectors], im[kVectors];
     float* here = sum + group * 16;
     for (int64_t v = 0; v < kVectors; v++) re[v] = load(here + v * kLanes), im[v] = load(here + kPixels + v * kLanes);
     for (int64_t n = 0; n < count; n++) {
       // The window of this pulse: a_0, a_1, a_2 of (2) at up to 16 cells, each part of each coefficient in a register.
-      const int64_t q = batch.order[kVariant][n];
+      const int64_t q = order[n];
       const float* window = batch.row[q] + batch.window[q][group];
       const WindowCells<kWide> re0(window), im0(window + width), re1(window + 2 * width), im1(window + 3 * width);
       const WindowCells<kWide> re2(kDegree == 2 ? window + 4 * width : window);
       const WindowCells<kWide> im2(kDegree == 2 ? window + 5 * width : window);
-      // Path t of each pixel by (5b); its cell i = round(t) lies in the low bits of t + 1.5 2^23, and u = t - i is the
-      // place in the cell. All paths come before the first look-up, so that no vector waits for its own.
-      Lanes u[kVectors];
-      IntLanes index[kVectors];
+      // After the last pulse comes the first, in the next group.
+      const bool last = n + 1 == count;
+      const int64_t next = order[last ? 0 : n + 1], next_group = last && after < kBlocks ? after : group;
+#pragma GCC unroll 4
+      for (int64_t v = 0; !kAhead && v < kVectors; v++) find_place(q, group, v);
 #pragma GCC unroll 4
       for (int64_t v = 0; v < kVectors; v++) {
-        const Lanes t = pixel_paths<kTerrain, kVariant>(patch, batch, q, group + v / kParts, v % kParts * kLanes);
-        const Lanes rounded = t + kRounder;
-        u[v] = t - (rounded - kRounder), index[v] = (IntLanes)rounded;
-      }
-#pragma GCC unroll 4
-      for (int64_t v = 0; v < kVectors; v++) {
+        const Lanes u = place[v];
+        const IntLanes cell = index[v];
+        if constexpr (kAhead) find_place(next, next_group, v);
         // (2): the echo at the pixel's path, a_0 + a_1 u + a_2 u^2, with the carrier of the cell's middle folded in.
-        Lanes vr = re1[index[v]], vi = im1[index[v]], cosine, sine;
-        if constexpr (kDegree == 2) vr += u[v] * re2[index[v]], vi += u[v] * im2[index[v]];
-        vr = re0[index[v]] + u[v] * vr, vi = im0[index[v]] + u[v] * vi;
+        Lanes vr = re1[cell], vi = im1[cell], cosine, sine;
+        if constexpr (kDegree == 2) vr += u * re2[cell], vi += u * im2[cell];
+        vr = re0[cell] + u * vr, vi = im0[cell] + u * vi;
         if constexpr (kVariant == kAtEdge || kVariant == kWeightedAtEdge) {
           // integration.md, (3): the sector's weight at the pixel.
           const int64_t b = group + v / kParts, part = v % kParts * kLanes;
@@ -215,7 +234,7 @@ inline void add_pulses(const ApertureJob& job, const Patch& patch, const Batch& 
           vr *= weight, vi *= weight;
         }
         // What is left of the carrier inside the cell, exp(j omega u), and the sum over pulses, (1).
-        phase(u[v], cosine, sine);
+        phase(u, cosine, sine);
         re[v] += vr * cosine, im[v] += vr * sine;
         re[v] -= vi * sine, im[v] += vi * cosine;
       }

@@ -124,4 +124,108 @@ struct WindowCells {
 #endif
 };
 
+inline Lanes larger(Lanes a, Lanes b) { return a > b ? a : b; }   // b where a is no number
+inline Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }  // the same
+inline Lanes nearest(Lanes value) { return (value + kRounder) - kRounder; }
+
+// 1 / value, to a few units of the last place.
+inline Lanes reciprocal(Lanes value) {
+#if defined(__AVX512F__)
+  const Lanes y = (Lanes)_mm512_rcp14_ps((__m512)value);
+#elif defined(__AVX2__)
+  const Lanes y = (Lanes)_mm256_rcp_ps((__m256)value);
+#else
+  return 1.0f / value;
+#endif
+#if defined(__AVX2__)
+  return y + y * (1.0f - value * y);
+#endif
+}
+
+// Square root, to a few units of the last place.
+inline Lanes root(Lanes value) {
+#if defined(__AVX512F__)
+  const Lanes y = (Lanes)_mm512_rsqrt14_ps((__m512)value);
+#elif defined(__AVX2__)
+  const Lanes y = (Lanes)_mm256_rsqrt_ps((__m256)value);
+#else
+  for (int64_t lane = 0; lane < kLanes; lane++) value[lane] = __builtin_sqrtf(value[lane]);
+  return value;
+#endif
+#if defined(__AVX2__)
+  const Lanes near = value * y;
+  return near + (0.5f * near) * (1.0f - near * y);
+#endif
+}
+
+// Two floats, in all pairs of lanes.
+inline Lanes splat_pair(const float* from) {
+  double both;
+  __builtin_memcpy(&both, from, sizeof both);
+#if defined(__AVX512F__)
+  return (Lanes)_mm512_set1_pd(both);
+#elif defined(__AVX2__)
+  return (Lanes)_mm256_set1_pd(both);
+#else
+  return Lanes{from[0], from[1], from[0], from[1]};
+#endif
+}
+
+// The two floats of each pair exchanged.
+inline Lanes swap_pairs(Lanes a) {
+#if defined(__AVX512F__)
+  return (Lanes)_mm512_permute_ps((__m512)a, 0xb1);
+#elif defined(__AVX2__)
+  return (Lanes)_mm256_permute_ps((__m256)a, 0xb1);
+#else
+  return Lanes{a[1], a[0], a[3], a[2]};
+#endif
+}
+
+// a0 b0 a1 b1 …: 2 kLanes floats.
+inline void store_pairs(float* to, Lanes a, Lanes b) {
+#if defined(__AVX512F__)
+  const __m512i low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+  const __m512i high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+  _mm512_storeu_ps(to, _mm512_permutex2var_ps((__m512)a, low, (__m512)b));
+  _mm512_storeu_ps(to + 16, _mm512_permutex2var_ps((__m512)a, high, (__m512)b));
+#elif defined(__AVX2__)
+  const __m256 low = _mm256_unpacklo_ps((__m256)a, (__m256)b), high = _mm256_unpackhi_ps((__m256)a, (__m256)b);
+  _mm256_storeu_ps(to, _mm256_permute2f128_ps(low, high, 0x20));
+  _mm256_storeu_ps(to + 8, _mm256_permute2f128_ps(low, high, 0x31));
+#else
+  store(to, Lanes{a[0], b[0], a[1], b[1]}), store(to + 4, Lanes{a[2], b[2], a[3], b[3]});
+#endif
+}
+
+// Four floats from each of kLanes places: `fields[n]` holds the n-th of all of them.
+inline void load_records(const float* base, const int32_t* at, Lanes fields[4]) {
+#if defined(__AVX512F__)
+  __m512 q[4];
+  for (int64_t n = 0; n < 4; n++) {
+    q[n] = _mm512_castps128_ps512(_mm_loadu_ps(base + at[n]));
+    q[n] = _mm512_insertf32x4(q[n], _mm_loadu_ps(base + at[n + 4]), 1);
+    q[n] = _mm512_insertf32x4(q[n], _mm_loadu_ps(base + at[n + 8]), 2);
+    q[n] = _mm512_insertf32x4(q[n], _mm_loadu_ps(base + at[n + 12]), 3);
+  }
+  const __m512d a = (__m512d)_mm512_unpacklo_ps(q[0], q[1]), b = (__m512d)_mm512_unpackhi_ps(q[0], q[1]);
+  const __m512d c = (__m512d)_mm512_unpacklo_ps(q[2], q[3]), d = (__m512d)_mm512_unpackhi_ps(q[2], q[3]);
+  fields[0] = (Lanes)_mm512_unpacklo_pd(a, c), fields[1] = (Lanes)_mm512_unpackhi_pd(a, c);
+  fields[2] = (Lanes)_mm512_unpacklo_pd(b, d), fields[3] = (Lanes)_mm512_unpackhi_pd(b, d);
+#elif defined(__AVX2__)
+  __m256 q[4];
+  for (int64_t n = 0; n < 4; n++) {
+    q[n] = _mm256_castps128_ps256(_mm_loadu_ps(base + at[n]));
+    q[n] = _mm256_insertf128_ps(q[n], _mm_loadu_ps(base + at[n + 4]), 1);
+  }
+  const __m256d a = (__m256d)_mm256_unpacklo_ps(q[0], q[1]), b = (__m256d)_mm256_unpackhi_ps(q[0], q[1]);
+  const __m256d c = (__m256d)_mm256_unpacklo_ps(q[2], q[3]), d = (__m256d)_mm256_unpackhi_ps(q[2], q[3]);
+  fields[0] = (Lanes)_mm256_unpacklo_pd(a, c), fields[1] = (Lanes)_mm256_unpackhi_pd(a, c);
+  fields[2] = (Lanes)_mm256_unpacklo_pd(b, d), fields[3] = (Lanes)_mm256_unpackhi_pd(b, d);
+#else
+  const Lanes q[4] = {load(base + at[0]), load(base + at[1]), load(base + at[2]), load(base + at[3])};
+  for (int64_t n = 0; n < 4; n++) fields[n] = Lanes{q[0][n], q[1][n], q[2][n], q[3][n]};
+#endif
+}
+
 }  // namespace

@@ -131,6 +131,11 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_c
     patch.pixel_reach = std::fmax(patch.pixel_reach, float(std::sqrt(dot(corner, corner))));
   }
   patch.pixel_reach += patch.rise_max;
+  const float reach = patch.block_reach, inner = patch.pixel_reach;
+  patch.fifth = reach * reach * reach * reach * (kFifthOrder * reach + inner);
+  patch.third = kThirdOrder * inner * inner * inner;
+  patch.shared = kSharedCurvatureError * reach * inner * inner;
+  patch.own = kOwnCurvatureError * reach * reach * inner * inner;
   // A block without pixels stands where one with pixels is, so that it never decides about its group.
   for (int64_t block = 0; block < kBlocks; block++)
     if (!patch.present[block]) {

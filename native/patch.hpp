@@ -28,14 +28,15 @@ struct alignas(64) Patch {
   float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];       // d . step_x, d . step_y and d . up
   float rise[kPixels];                                        // h': height of each pixel above its block's
   double origin[3], step_x[3], step_y[3], up[3];
-  float xx, xy, yy, xh, yh;        // products of step_x, step_y and up
-  float block_reach, pixel_reach;  // D and delta: largest |d|, largest distance of a pixel from its block's centre
-  float rise_max, height_max;      // largest |rise|, and largest height above or below the plane
-  int64_t row, column;             // of the first pixel
-  int64_t rows, columns;           // pixels present
-  bool present[kBlocks];           // which blocks hold any
-  bool terrain;                    // heights matter
-  bool irregular;                  // no plane with heights describes it: exact paths only
+  float xx, xy, yy, xh, yh;         // products of step_x, step_y and up
+  float block_reach, pixel_reach;   // D and delta: largest |d|, largest distance of a pixel from its block's centre
+  float fifth, third, shared, own;  // errors of a leg's series (engine.md, "Neglected per leg"), without powers of 1/R
+  float rise_max, height_max;       // largest |rise|, and largest height above or below the plane
+  int64_t row, column;              // of the first pixel
+  int64_t rows, columns;            // pixels present
+  bool present[kBlocks];            // which blocks hold any
+  bool terrain;                     // heights matter
+  bool irregular;                   // no plane with heights describes it: exact paths only
 };
 
 // Whether a pixel that is stored block by block is one of the patch.

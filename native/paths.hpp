@@ -35,9 +35,10 @@ struct OriginPaths {
 };
 
 // Adds one leg to the path and second-order coefficients at the origin, and to the errors of the series about it.
+// `leg` is one of `out`, which reaches it in no other way.
 template <bool kTerrain>
-inline void add_origin_leg(const double* antenna, const ApertureJob& job, const Patch& patch, Leg& leg,
-                           OriginPaths& out) {
+inline void add_origin_leg(const double* antenna, const ApertureJob& job, const Patch& patch, Leg& __restrict leg,
+                           OriginPaths& __restrict out) {
   const double scale = job.cells_per_metre;
   const double *ax = antenna, *ay = antenna + job.padded, *az = antenna + 2 * job.padded;
   const Patch& p = patch;
@@ -53,12 +54,7 @@ inline void add_origin_leg(const double* antenna, const ApertureJob& job, const 
     leg.inverse[q] = float(inverse);
     out.path[q] += distance;
   }
-  // Errors of the series (engine.md, "Neglected per leg"), without their powers of 1/R.
-  const float reach = p.block_reach, inner = p.pixel_reach;
-  const float fifth = reach * reach * reach * reach * (apertura::kFifthOrder * reach + inner);
-  const float third = apertura::kThirdOrder * inner * inner * inner;
-  const float shared = apertura::kSharedCurvatureError * reach * inner * inner;
-  const float own = apertura::kOwnCurvatureError * reach * reach * inner * inner;
+  const float fifth = p.fifth, third = p.third, shared = p.shared, own = p.own;
   for (int64_t q = 0; q < kBatch; q++) {
     const float inverse = leg.inverse[q], half = 0.5f * inverse, x = leg.x[q], y = leg.y[q];
     const float squared = inverse * inverse;

@@ -98,7 +98,7 @@ def test_every_command_that_a_document_gives_exists(document):
 def test_every_key_of_the_config_that_a_document_names_exists(document):
     schema = json.loads((ROOT / "config/schema.json").read_text(encoding="utf-8"))
     parts = [schema, *schema["$defs"].values()]
-    keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "reference"}
+    keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
     named = {word for key in _KEY.findall(text_of(document)) for word in key.split(".") if not word.startswith("<")}
     assert sorted(named - keys) == []
 

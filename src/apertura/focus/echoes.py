@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.native_binding import EchoJob
 from apertura.focus.engines.native_constants import KERNEL
+from apertura.focus.engines.native_structs import EchoJob
 from apertura.focus.inputs import Profiles
 
 TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree

@@ -160,6 +160,24 @@ class Profiles:
             aperture=self.aperture[pulses],
         )
 
+    def for_tables(self) -> tuple[NDArray[np.complex64], NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Return samples, starts and phase centres of both legs as arrays that tables of polynomials can be made from.
+
+        Raises
+        ------
+        ValueError
+            If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+        """
+        if not self.oversampling >= 1.5:
+            raise ValueError(f"{self.oversampling=}: must be at least 1.5")
+        if not len(self):
+            raise ValueError(f"{self.samples.shape=}: holds no pulse")
+        start_m = np.ascontiguousarray(self.start_m, np.float64)
+        places = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
+        if not all(np.isfinite(values).all() for values in (start_m, *places)):
+            raise ValueError("phase centres and starts of the profiles must be finite")
+        return np.ascontiguousarray(self.samples, np.complex64), start_m, places
+
     def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "Profiles":
         """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
 

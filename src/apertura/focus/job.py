@@ -1,6 +1,6 @@
 """An imaging job as numbers: what the planner and the engines' predictions look at before anything is formed."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.sector import Sector
 from apertura.scene.ground_models import GroundModels
+from apertura.scene.terrain import Terrain
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +112,10 @@ class Job:
         Over how much of the flight; None: all of it.
     recorded
         Whether the phase history is there, which the double sum reads.
+    patches_on
+        Ground → places of the pixels of some windows of the scene, each (y, x, 3) float64, metres; None: unknown.
+    patches_m
+        The same on the ground that is imaged on, once that is decided; none: a plane about points of `ground_m`.
     """
 
     aperture: Aperture
@@ -132,6 +137,8 @@ class Job:
     illumination: Illumination | None = None
     integration: Integration | None = None
     recorded: bool = True
+    patches_on: Callable[[Terrain], tuple[NDArray[np.float64], ...]] | None = None
+    patches_m: tuple[NDArray[np.float64], ...] = ()
 
     @property
     def pixels(self) -> int:

@@ -12,7 +12,7 @@ from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import reached
 from apertura.contracts import Window
 from apertura.focus.band_limited import band_limited_image
-from apertura.focus.engines import PATCH_PX, load_engine, reference
+from apertura.focus.engines import load_engine, pieces, reference
 from apertura.focus.engines.engine import Setting
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.reach import PULSES, Reach, pulse_blocks_of
@@ -76,6 +76,10 @@ class Formation:
         whole = next((tile for tile in seen if tuple(part.stop - part.start for part in tile) == side), None)
         return tiles if whole is None else [whole, *(tile for tile in seen if tile is not whole)]
 
+    @cached_property
+    def _pieces_of(self) -> dict[tuple[int, ...], list[Window]]:
+        return {}
+
     @property
     def image(self) -> "Array":
         """The image as planned: a dask array, (row, column) complex64, whose chunks are the tiles."""
@@ -104,16 +108,34 @@ class Formation:
         return np.asarray(total / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return the planned image at (pixel, 2) rows and columns, forming just the patch of each.
+        """Return the planned image at (pixel, 2) rows and columns, forming just what the engine needs for each.
 
-        (pixel,) complex64, and mean |I|² over those patches, (pixel,) float64.
+        (pixel,) complex64, and mean |I|² over the pieces formed, (pixel,) float64.
         """
-        first = pixels // PATCH_PX * PATCH_PX
-        windows = [(slice(row, row + PATCH_PX), slice(column, column + PATCH_PX)) for row, column in first.tolist()]
-        image = self.image_of(windows)
-        inside = pixels - first
-        values = np.array([patch[tuple(at)] for patch, at in zip(image, inside, strict=True)], np.complex64)
-        return values, np.array([(np.abs(patch) ** 2).mean() for patch in image])
+        windows = list(dict.fromkeys(self._piece(*pixel) for pixel in pixels.tolist()))
+        image = dict(zip(windows, self.image_of([_slices(window) for window in windows]), strict=True))
+        values, power = np.zeros(len(pixels), np.complex64), np.zeros(len(pixels))
+        for number, (row, column) in enumerate(pixels.tolist()):
+            top, _, left, _ = window = self._piece(row, column)
+            values[number], power[number] = image[window][row - top, column - left], (np.abs(image[window]) ** 2).mean()
+        return values, power
+
+    def _piece(self, row: int, column: int) -> tuple[int, int, int, int]:
+        """Return first and last row, first and last column of what the planned engine forms a pixel with."""
+        tile = [
+            (at // self.side_px * self.side_px, size) for at, size in zip((row, column), self.grid.shape, strict=True)
+        ]
+        shape = tuple(min(self.side_px, size - first) for first, size in tile)
+        (top, _), (left, _) = tile
+        for rows, columns in self._pieces(shape):
+            if rows.start <= row - top < rows.stop and columns.start <= column - left < columns.stop:
+                return top + rows.start, top + rows.stop, left + columns.start, left + columns.stop
+        raise IndexError(f"pixel {row}, {column} of {self.grid.shape}")
+
+    def _pieces(self, shape: tuple[int, ...]) -> list[Window]:
+        if shape not in self._pieces_of:
+            self._pieces_of[shape] = pieces(self.plan.setting.engine, shape, self.plan.setting.form_options)
+        return self._pieces_of[shape]
 
     def image_of(self, windows: Sequence[Window]) -> list[NDArray[np.complex64]]:
         """Return the planned image in windows that begin at patches of an engine, block of pulses by block."""
@@ -193,6 +215,10 @@ class Formation:
             side_px=self.side_px,
             weighing=Weighing(self.beams, summed, self.plan.count),
         )
+
+
+def _slices(window: tuple[int, int, int, int]) -> Window:
+    return slice(*window[:2]), slice(*window[2:])
 
 
 def _exact_sum(

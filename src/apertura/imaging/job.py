@@ -1,5 +1,6 @@
 """From what is known of a pair and a scene to the planner's job."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from apertura.scene.ground_models import GroundModels
 from apertura.scene.terrain import FlatGround, Terrain
 
 _POINTS = 9
+_PATCH_PX = 256
 _CONTENT_PIXELS = 128
 _CONTENT_PULSES = 16384  # of which the terms of so many pixels take 32 MB
 
@@ -98,6 +100,7 @@ def imaging_job(
         signal=Signal(centre, window.unambiguous / count, window.step_m, window.samples, weight),
         frame=grid.frame,
         terrain=ground,
+        patches_on=partial(_patches, grid),
         content_db=None if history is None else _content_db(history, grid, ground.full, beams),
         beams=beams,
         integration=settled,
@@ -131,10 +134,22 @@ def profiles_job(
         signal=Signal(centre, profiles.oversampling, profiles.step_m, samples),
         frame=grid.frame,
         terrain=ground,
+        patches_on=partial(_patches, grid),
         beams=Beams.within(settled.sector, beams),
         integration=settled,
         recorded=False,
     )
+
+
+def _patches(grid: SceneGrid, ground: Terrain) -> tuple[NDArray[np.float64], ...]:
+    """Return the places of the pixels of some windows: in the corners of a scene and in its middle."""
+    sides = [min(_PATCH_PX, size) for size in grid.shape]
+    ends = [(0, (size - side) // 2, size - side) for size, side in zip(grid.shape, sides, strict=True)]
+    corners = {(ends[0][row], ends[1][column]) for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))}
+    windows = [
+        tuple(slice(at, at + side) for at, side in zip(corner, sides, strict=True)) for corner in sorted(corners)
+    ]
+    return tuple(ground.positions(grid[rows, columns]) for rows, columns in windows)
 
 
 def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams: Beams | None) -> float | None:

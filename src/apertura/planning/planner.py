@@ -50,10 +50,12 @@ def make_plan(
     """
     asked = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
     flags = check_geometry(job)
+    terrain = decide_terrain(job, asked=asked.get("terrain"), where=where)
+    if job.patches_on is not None:
+        job = replace(job, patches_m=job.patches_on(job.terrain.called(str(terrain.value))))
     search = Search(job, asked.get("engine"), asked.get("engine_options", {}), asked.get("pulse_blocks"), where)
     every_pulse = search.cheapest(len(job.aperture), accuracy_db - MARGIN_DB)
     presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, asked.get("presum"))
-    terrain = decide_terrain(job, asked=asked.get("terrain"), where=where)
     antennas, missed = decide_antennas(job.beams, job.illumination)
     chosen = search.fitted(chosen, presum)
     expected_db = power_sum_db(chosen.error_db, *([] if presumming.error_db is None else [presumming.error_db]))

@@ -88,13 +88,17 @@ class Search:
         Raises
         ------
         CampaignError
-            If the engine asked for cannot run here.
+            If the engine asked for cannot run here, or cannot form this image.
         """
         options = [
             replace(setting, form_seconds=setting.form_seconds + self.tile_seconds)
             for name in self._engines()
             for setting in load_engine(name).candidates(self.job, pulses=pulses, asked=self.options.get(name, {}))
         ]
+        if not options:
+            able = sorted({setting.engine for setting in replace(self, engine=None, options={}).settings(pulses)})
+            weighed = ", whose pulses are weighed by antennas or a sector of the flight" if self.job.weights else ""
+            raise self._unfit(f"cannot form this image{weighed}", able)
         return sorted(options, key=lambda setting: (setting.seconds, setting.error_db))
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
@@ -103,6 +107,7 @@ class Search:
             return ()
         options = replace(self, engine=None, options={}).settings(len(self.job.aperture))
         last = [setting for setting in options if setting.engine == "reference"]
+        options = [setting for setting in options if not last or setting.seconds < last[0].seconds]
         better: list[Setting] = []
         error_db = chosen.error_db
         while error_db > -130:
@@ -135,13 +140,21 @@ class Search:
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
         if self.engine is not None and self.engine not in runnable:
-            raise CampaignError(
-                f"engine {self.engine} was not built when apertura was installed, or reads what is not there",
-                where=f"{self.where}.engine",
-                expected=f"an engine that can run here: {', '.join(runnable)}",
-                remedy="Install with a C++ compiler, or choose another engine.",
+            engine = load_engine(self.engine)
+            what = (
+                "cannot run here" if engine.READS in reads else f"reads the {engine.READS.replace('_', ' ')}: none here"
             )
+            needs = getattr(engine, "NEEDS", None)
+            raise self._unfit(what, runnable, f"It needs {needs}. " if needs and engine.READS in reads else "")
         if self.engine is not None:
             return [self.engine]
         stated = [name for name in runnable if any(v is not None for v in self.options.get(name, {}).values())]
         return stated or runnable
+
+    def _unfit(self, what: str, others: list[str], remedy: str = "") -> CampaignError:
+        return CampaignError(
+            f"engine {self.engine or ', '.join(self._engines())} {what}",
+            where=f"{self.where}.engine",
+            expected=f"an engine that can: {', '.join(others)}",
+            remedy=f"{remedy}Choose one of these, or auto.",
+        )

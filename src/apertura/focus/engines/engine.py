@@ -85,6 +85,8 @@ class Engine(Protocol):
         What it is given: a `PhaseHistory` or `Profiles`.
     available
         Whether it can run here.
+    NEEDS
+        What it needs to run, in a few words; an engine that runs everywhere leaves it out.
     candidates
         (job, pulses=, asked=) → settings with predicted error and cost; `pulses` may be fewer than the job's, `asked`
         holds options that a person asks for.
@@ -93,6 +95,9 @@ class Engine(Protocol):
         some pulses.
     instruction_set
         Which instructions its sums run with here; an engine may leave it out.
+    pieces
+        (shape of a block of pixels, form_options) → windows of it that get the same bits when formed alone; an engine
+        whose pixels are formed in patches of `PATCH_PX` leaves it out.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.

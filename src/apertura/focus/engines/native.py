@@ -15,22 +15,17 @@ from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines.engine import EngineOptions
 from apertura.focus.engines.native_beams import weights_of
-from apertura.focus.engines.native_binding import (
-    INSTRUCTION_SETS,
-    ApertureJob,
-    TableJob,
-    available,
-    call,
-    instruction_set,
-)
+from apertura.focus.engines.native_binding import INSTRUCTION_SETS, available, call, instruction_set
 from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.engines.native_prediction import candidates
+from apertura.focus.engines.native_structs import ApertureJob, TableJob
 from apertura.focus.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table
 from apertura.focus.inputs import Profiles
 
-__all__ = ["INSTRUCTION_SETS", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
+__all__ = ["INSTRUCTION_SETS", "NEEDS", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
+NEEDS = "a C++ compiler when apertura is installed"
 
 
 class Options(EngineOptions):
@@ -76,15 +71,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
     """
     if degree not in (1, 2):
         raise ValueError(f"{degree=}: must be 1 or 2")
-    if not profiles.oversampling >= 1.5:
-        raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
-    samples = np.ascontiguousarray(profiles.samples, np.complex64)
-    start_m = np.ascontiguousarray(profiles.start_m, np.float64)
-    places = [np.asarray(p, np.float64) for p in profiles.aperture.legs]
-    if not len(samples):
-        raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
-    if not all(np.isfinite(values).all() for values in (start_m, *places)):
-        raise ValueError("phase centres and starts of the profiles must be finite")
+    samples, start_m, places = profiles.for_tables()
     wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
     design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=degree)
     cell_m = profiles.step_m * design.down / design.up

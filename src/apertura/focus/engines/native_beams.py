@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.antenna.beam import Beam, Beams
-from apertura.focus.engines.native_binding import BeamJob, SectorJob
+from apertura.focus.engines.native_structs import BeamJob, SectorJob
 from apertura.geometry.sector import Sector
 
 Held = list[NDArray[np.generic]]

@@ -12,67 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from apertura.errors import CampaignError
+from apertura.focus.engines.native_structs import STRUCTS
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
-
-_pointer = ctypes.c_void_p
-_int64 = ctypes.c_int64
-_double = ctypes.c_double
-
-
-class BeamJob(ctypes.Structure):
-    """native/job.hpp, BeamJob."""
-
-    _fields_ = [
-        ("axes", _pointer),
-        ("gain", _pointer * 2),
-        ("count", _int64 * 2),
-        ("first_rad", _double * 2),
-        ("samples_per_rad", _double * 2),
-        ("peak", _double),
-    ]
-
-
-class SectorJob(ctypes.Structure):
-    """native/job.hpp, SectorJob."""
-
-    _fields_ = [("axis", _pointer * 2), *((name, _double) for name in ("centre", "inner", "outer"))]
-
-
-class ApertureJob(ctypes.Structure):
-    """native/job.hpp, ApertureJob."""
-
-    _fields_ = [
-        *((name, _pointer) for name in ("cells", "transmitter", "receiver", "first_path", "pixels")),
-        *((name, _pointer) for name in ("image", "counts")),
-        *((name, _int64) for name in ("pulses", "padded", "width", "rows", "columns")),
-        *((name, _double) for name in ("cells_per_metre", "radians_per_cell", "tolerance_rad")),
-        *((name, ctypes.c_int32) for name in ("degree", "phase_polynomial", "wide_sum")),
-        ("phase_coefficients", ctypes.c_float * 9),
-        ("beam", ctypes.POINTER(BeamJob) * 2),
-        ("sector", ctypes.POINTER(SectorJob)),
-    ]
-
-
-class TableJob(ctypes.Structure):
-    """native/job.hpp, TableJob."""
-
-    _fields_ = [
-        *((name, _pointer) for name in ("samples", "taps", "lead", "carrier", "turn", "cells")),
-        *((name, _int64) for name in ("pulses", "length", "width", "up", "down", "steps", "margin", "used")),
-        ("degree", ctypes.c_int32),
-    ]
-
-
-class EchoJob(ctypes.Structure):
-    """native/job.hpp, EchoJob."""
-
-    _fields_ = [
-        *((name, _pointer) for name in ("samples", "taps", "transmitter", "receiver", "start", "weight", "pixels")),
-        *((name, _pointer) for name in ("edges", "columns", "sums", "objective", "slopes")),
-        *((name, _int64) for name in ("pulses", "length", "count", "blocks", "width", "weight_step")),
-        *((name, _double) for name in ("samples_per_metre", "turns_per_metre")),
-    ]
 
 
 def layout() -> dict[str, str]:
@@ -84,7 +26,7 @@ def layout() -> dict[str, str]:
     'byte 8, 8 bytes'
     """
     lines: dict[str, str] = {}
-    for struct in (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob):
+    for struct in STRUCTS:
         for name, *_ in struct._fields_:
             field = getattr(struct, name)
             lines[f"{struct.__name__}.{name}"] = _place(field.offset, field.size)
@@ -117,7 +59,7 @@ def check_layout(theirs: dict[str, str], path: Path) -> None:
             raise CampaignError(
                 f"{name} at {theirs.get(name, 'no place')}",
                 where=str(path),
-                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_binding.py",
+                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_structs.py",
                 remedy="Reinstall apertura, so that the library and Python are of one version; unset APERTURA_KERNEL.",
             )
 

@@ -71,7 +71,7 @@ def view_of(job: Job) -> View:
     """Return how a job's scene is seen."""
     some = job.aperture.sample(_PULSES if job.sector is None else _PULSES_OF_SECTOR)
     aperture, points = job.aperture[some], job.points_m
-    right, down = (_pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
+    right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
     range_m = np.stack([np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs])
     gradient = aperture.path_gradient(points)
     slope = np.stack([(gradient * step).sum(-1) for step in (right, down)])
@@ -83,7 +83,7 @@ def view_of(job: Job) -> View:
     return View(range_m, slope, job.spacing_m, seen)
 
 
-def _pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[np.float64]:
+def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[np.float64]:
     """Return the vectors from pixel to pixel along an axis of points (row, column, 3), metres."""
     if ground_m.shape[axis] < 2:
         return np.zeros_like(ground_m)

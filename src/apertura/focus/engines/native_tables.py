@@ -20,8 +20,6 @@ PHASE_POLYNOMIALS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
 """Where errors over the band are looked at, its edges at ±1: Chebyshev nodes, dense at the edges."""
 
-_LEAD = TAPS // 2 - 1  # taps before the sample at or before the cell's middle
-
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _WITHIN = _NODES / 2  # places inside a cell, in cells
 _WITHIN_WEIGHTS = _WEIGHTS / 2
@@ -85,7 +83,7 @@ class TableDesign:
     up, down
         `up` cells cover `down` samples.
     taps
-        (up, degree + 1, 16) float32, filters giving each coefficient at each position of the cell.
+        (up, degree + 1, tap) float32, filters giving each coefficient at each position of the cell.
     lead
         (up,) int32, sample of the first tap relative to the first of the `down` samples.
     phase_polynomial, phase_coefficients
@@ -138,7 +136,7 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
     return float(10 * np.log10((squared_error * power).sum() / power.sum()))
 
 
-def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
+def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
     """Return (cells, samples) that cover the same path, with at least `oversampling` cells per Nyquist cell.
 
     Examples
@@ -152,7 +150,7 @@ def ratio(profile_oversampling: float, oversampling: int) -> tuple[int, int]:
 
 @lru_cache(maxsize=64)
 def design_table(
-    profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: int, degree: int
+    profile_oversampling: float, carrier_rad_per_sample: float, *, oversampling: float, degree: int, taps: int = TAPS
 ) -> TableDesign:
     """Design the filters and the phase polynomials of a table, and predict its error.
 
@@ -166,6 +164,8 @@ def design_table(
         Cells per Nyquist cell of the table.
     degree
         Of the polynomials, 1 or 2.
+    taps
+        Of the filters.
 
     Notes
     -----
@@ -183,10 +183,11 @@ def design_table(
     whole = np.floor(starts)
     omega = np.pi / profile_oversampling * BAND
     ideal = np.exp(1j * omega * (starts - whole)[:, None])[:, None] * _coefficients(omega * down / up, degree)
-    basis = np.exp(1j * omega[:, None] * (np.arange(TAPS) - _LEAD))
+    before = taps // 2 - 1
+    basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
     wanted = ideal.reshape(-1, omega.size).T
-    taps = np.linalg.lstsq(_stacked(basis), _stacked(wanted), rcond=1e-9)[0].T.reshape(up, degree + 1, TAPS)
-    given = np.einsum("pkt,wt->pkw", taps, basis)
+    filters = np.linalg.lstsq(_stacked(basis), _stacked(wanted), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
+    given = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)
     error = _squared_error(
@@ -198,8 +199,8 @@ def design_table(
         polynomial=polynomial,
         phase=phase,
     )
-    lead = whole.astype(np.int32) - _LEAD
-    return TableDesign(up, down, np.ascontiguousarray(taps, np.float32), lead, polynomial, phase, error)
+    lead = whole.astype(np.int32) - before
+    return TableDesign(up, down, np.ascontiguousarray(filters, np.float32), lead, polynomial, phase, error)
 
 
 def _stacked(values: NDArray[np.complex128]) -> NDArray[np.float64]:

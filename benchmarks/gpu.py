@@ -1,0 +1,99 @@
+"""The engine `cuda` where there is a device: `python benchmarks/gpu.py [--size 4096] [--pulses 4096] [--rounds 5]`.
+
+Wall clock, host to host: pixels go there, the image comes back; medians of rounds that visit all rows in turn, without
+the first, in which kernels are compiled. Errors are those of random pixels against the exact image of job.py. Beside
+the rates stand what others publish of theirs, on their devices and jobs. Without a device it says so and ends with 1.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from job import Job, build, error_db
+
+from apertura.focus.engines import cuda
+
+PUBLISHED = (
+    (
+        225e9,
+        "torchbp, RTX 3090 Ti, polar grid; Readme.md of github.com/Ttl/torchbp",
+    ),
+    (68e9, "fastsar, L4, exact, cubic, -67 dB; docs/performance.md of github.com/saulpingerman/FastSAR"),
+)
+"""Pixel·pulses per second as published, and where."""
+
+
+@dataclass
+class Row:
+    """What to run, on which job, and how long it took."""
+
+    name: str
+    job: Job
+    run: Callable[[], Any]
+    seconds: list[float] = field(default_factory=list)
+    image: Any = None
+
+    def go(self) -> None:
+        """Run once and note the time."""
+        begin = time.perf_counter()
+        self.image = self.run()
+        self.seconds.append(time.perf_counter() - begin)
+
+    @property
+    def kept(self) -> list[float]:
+        """Seconds without those of the first round, where there are others."""
+        return self.seconds[min(1, len(self.seconds) - 1) :]
+
+
+def rows(size: int, pulses: int) -> list[Row]:
+    """Return what is timed: geometries and surfaces by the series, one by exact paths alone, and tables alone."""
+    flat = build(size, pulses)
+    mono, rough = build(size, pulses, bistatic=False), build(size, pulses, surface="natural")
+    found = []
+    for name, job, options in (
+        ("bistatic", flat, {}),
+        ("monostatic", mono, {}),
+        ("bistatic, DEM", rough, {}),
+        ("bistatic, float64 paths", flat, {"tolerance_rad": 1e-12}),
+    ):
+        found.append(Row(name, job, partial(cuda.form, cuda.prepare(job.profiles), job.pixels, **options)))
+    patch = flat.pixels[:16, :16]
+    found.append(Row("tables and a patch", flat, lambda: cuda.form(cuda.prepare(flat.profiles), patch)))
+    return found
+
+
+def main() -> int:
+    """Time and print; return 1 where there is no device."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in (("size", 4096), ("pulses", 4096), ("rounds", 5)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    asked = parser.parse_args()
+    if not cuda.available():
+        print("no device: not measured (docs/howto/gpu.md)")
+        return 1
+    print(f"{cuda.instruction_set()}; {asked.size}² pixels, {asked.pulses} pulses, {asked.rounds} rounds")
+    timed = rows(asked.size, asked.pulses)
+    for _ in range(asked.rounds):
+        for row in timed:
+            row.go()
+    for row in timed:
+        seconds, spread = statistics.median(row.kept), max(row.kept) / min(row.kept)
+        line = f"{row.name:<26}{seconds:>9.3f} s  first {row.seconds[0]:.2f} s  spread {spread:.2f}"
+        if row.image.shape == row.job.pixels.shape[:2]:
+            rate = np.prod(row.image.shape) * asked.pulses / seconds
+            ratios = ", ".join(f"{rate / theirs:.2f} of {who.split(',')[0]}" for theirs, who in PUBLISHED)
+            line += f"{rate:>11.3g} pixel·pulses/s{error_db(row.job, row.image):>7.1f} dB  {ratios}"
+        print(line)
+    for rate, who in PUBLISHED:
+        print(f"published: {rate:.3g}/s, {who}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

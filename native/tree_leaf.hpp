@@ -1,0 +1,239 @@
+// The leaves of a tree: neighbouring pulses made fewer for one tile, and summed at its nodes. docs/theory/tree.md,
+// "Leaves"; equation numbers in brackets are its.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "phase.hpp"
+#include "tree_merge.hpp"
+
+namespace {
+
+using apertura::kTreeDelays;
+using apertura::kTreeWeights;
+
+constexpr int64_t kRecord = 4;                // floats of a cell: level and slope, re and im each
+constexpr int64_t kCells = kLanes / kRecord;  // that a vector holds
+
+// What leaves are computed in. Lines are rows of pairs: samples of the pulses over one tile, aligned to its centre.
+struct LeafScratch {
+  Floats taken, lines, fewer, cells, pairs, along_xi[2], along_eta[2];
+};
+
+// Cells of a pulse about a tile: that at the path of its centre, how far the path lies beyond it, and where they end.
+struct Cells {
+  const float* middle;
+  float offset, low, high;
+  Cells(const float* first, int64_t width, double place) {
+    const double whole = std::floor(place);
+    middle = first + kRecord * int64_t(whole), offset = float(place - whole);
+    low = float(-whole), high = float(double(width - 1) - whole);
+  }
+};
+
+// exp(j k r) at so many cells, the first at r = `from`, as factors for pairs.
+inline void put_carrier(const TreeJob& job, double from, int64_t width, Floats& cosines, Floats& sines) {
+  cosines.resize(size_t(kRecord * width)), sines.resize(size_t(kRecord * width));
+  for (int64_t cell = 0; cell < width; cell++) {
+    const double turn = std::fmod(job.wavenumber * (from + double(cell) * job.step / double(job.up)), 6.283185307179586);
+    const float c = float(std::cos(turn)), s = float(std::sin(turn));
+    for (int64_t n = 0; n < kRecord; n++)
+      cosines[kRecord * cell + n] = c, sines[kRecord * cell + n] = n % 2 ? s : -s;
+  }
+}
+
+// Pairs in a line: the samples of a tile, and those around them that filters of cells see.
+inline int64_t line_length(const TreeJob& job, const TreeTile& tile) {
+  return padded(tile.samples + job.taps_count, 8);
+}
+
+// (7): one pulse at the samples of a tile, whatever the fraction of a sample it starts at; exp(j k |w|) put on.
+inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float* taken, float* line) {
+  const Legs legs = legs_of(job, tile.centre, pulse);
+  const int64_t length = line_length(job, tile), count = length + kTreeDelays;
+  const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead), whole = std::floor(at);
+  // Samples from `whole - kTreeDelays / 2 + 1` on, zeros beyond the profile.
+  const int64_t before = int64_t(whole) - kTreeDelays / 2 + 1;
+  const int64_t low = std::min(count, std::max<int64_t>(0, -before));
+  const int64_t high = std::max(low, std::min(count, job.length - before));
+  std::fill(taken, taken + 2 * low, 0.0f), std::fill(taken + 2 * high, taken + 2 * count, 0.0f);
+  std::memcpy(taken + 2 * low, job.samples + 2 * (pulse * job.length + before + low), size_t(8 * (high - low)));
+  // The filter of this fraction: polynomials of it.
+  alignas(64) float filter[kTreeDelays] = {};
+  const float u = float(at - whole);
+  for (int64_t term = job.delay_terms - 1; term >= 0; term--)
+    for (int64_t tap = 0; tap < kTreeDelays; tap++) filter[tap] = filter[tap] * u + job.delay[term * kTreeDelays + tap];
+  const double turn = std::fmod(job.wavenumber * legs.range, 6.283185307179586);
+  const float c = float(std::cos(turn)), s = float(std::sin(turn)), both[2] = {-s, s};
+  const Lanes cosine = splat(c), sine = splat_pair(both);
+  for (int64_t n = 0; n < 2 * length; n += kLanes) {
+    Lanes even{}, odd{};
+    for (int64_t tap = 0; tap < kTreeDelays; tap += 2) {
+      even += load(taken + n + 2 * tap) * filter[tap];
+      odd += load(taken + n + 2 * tap + 2) * filter[tap + 1];
+    }
+    store(line + n, turned(even + odd, cosine, sine));
+  }
+}
+
+// `samples` samples of a line to cells: level and slope of the profile in each, by the filters of its place between
+// samples, times a carrier.
+inline void expand(const TreeJob& job, const float* line, int64_t samples, const Floats& cosines, const Floats& sines,
+                   float* cells) {
+  const int64_t along = job.up / kCells;  // vectors that the cells of one sample fill
+  for (int64_t sample = 0; sample < samples; sample++)
+    for (int64_t v = 0; v < along; v++) {
+      const float *from = line + 2 * sample, *tap = job.taps + v * kLanes;
+      Lanes even{}, odd{};
+      for (int64_t n = 0; n < job.taps_count; n += 2) {
+        even += load(tap + n * kRecord * job.up) * splat_pair(from + 2 * n);
+        odd += load(tap + (n + 1) * kRecord * job.up) * splat_pair(from + 2 * n + 2);
+      }
+      const int64_t at = kRecord * sample * job.up + v * kLanes;
+      store(cells + at, turned(even + odd, load(&cosines[at]), load(&sines[at])));
+    }
+}
+
+// Gain of both antennas at a vector of nodes.
+inline Lanes weight_at(const float* w, Lanes xi, Lanes eta) {
+  Lanes along[4];
+  for (int64_t b = 0; b < 4; b++) along[b] = w[4 * b] + xi * (w[4 * b + 1] + xi * (w[4 * b + 2] + xi * w[4 * b + 3]));
+  return along[0] + eta * (along[1] + eta * (along[2] + eta * along[3]));
+}
+
+// Adds what one pulse has at the nodes of a leaf: (2) of engine.md at the path of each.
+template <class Phase, bool kMono>
+inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& legs, const float* weight,
+                      const Cells& cells, float* re, float* im) {
+  const float scale = float(double(job.up) / job.step);
+  const Lanes low = splat(cells.low), high = splat(cells.high);
+  const float* x = leaf.at.x(0);
+  const Phase phase(job.phase_coefficients);
+  const int64_t count = leaf.at.count;
+  for (int64_t n = 0; n < count; n += kLanes) {
+    const Lanes further =
+        path<kMono>(legs, load(x + n), load(x + count + n), load(x + 2 * count + n), load(x + 3 * count + n));
+    // Held inside the row, whatever the path: no look-up leaves it.
+    const Lanes t = smaller(larger(further * scale + cells.offset, low), high), rounded = t + kRounder;
+    const Lanes u = t - (rounded - kRounder);
+    alignas(64) int32_t at[kLanes];
+    *reinterpret_cast<IntLanes*>(at) = ((IntLanes)rounded - (IntLanes)splat(kRounder)) * int32_t(kRecord);
+    asm volatile("" : "+m"(at));  // through memory: taking lanes out one by one would keep the shuffle port
+    Lanes fields[4], cosine, sine;
+    load_records(cells.middle, at, fields);
+    Lanes vr = fields[0] + u * fields[2], vi = fields[1] + u * fields[3];
+    phase(u, cosine, sine);
+    if (weight) {
+      const Lanes gain = weight_at(weight, load(&leaf.xi[n]), load(&leaf.eta[n]));
+      vr *= gain, vi *= gain;
+    }
+    store(re + n, load(re + n) + vr * cosine - vi * sine);
+    store(im + n, load(im + n) + vr * sine + vi * cosine);
+  }
+}
+
+// exp(-j k R) along an axis, as planes.
+inline void axis_planes(const TreeJob& job, const Points& line, const Legs& legs, Floats* out) {
+  out[0].resize(size_t(line.count)), out[1].resize(size_t(line.count));
+  for (int64_t n = 0; n < line.count; n += kLanes) {
+    Lanes c, s;
+    turn(path(legs, line, n) * float(-job.wavenumber / 6.283185307179586), c, s);
+    store(&out[0][n], c), store(&out[1][n], s);
+  }
+}
+
+// Sums of a leaf, its reference taken off, as pairs: rows of eta, `stride` pairs apart.
+inline void take_reference_off(const TreeJob& job, TileState& state, const LeafNodes& leaf, int64_t middle,
+                               int64_t stride, LeafScratch& work) {
+  const Legs legs = legs_of(job, state.tile.centre, middle);
+  axis_planes(job, line_of(job, state, leaf.columns, true), legs, work.along_xi);
+  axis_planes(job, line_of(job, state, leaf.rows, false), legs, work.along_eta);
+  work.pairs.resize(size_t(2 * (stride * leaf.rows + 2 * kLanes)));
+  for (int64_t row = 0; row < leaf.rows; row++) {
+    const float yr = work.along_eta[0][row], yi = work.along_eta[1][row];
+    for (int64_t n = 0; n < leaf.columns; n += kLanes) {  // beyond the row's end: overwritten by the next
+      const int64_t at = row * leaf.columns + n;
+      const Lanes xr = load(&work.along_xi[0][n]), xi = load(&work.along_xi[1][n]);
+      const Lanes ar = xr * yr - xi * yi, ai = xr * yi + xi * yr;
+      const Lanes mr = load(&leaf.cosine[at]), mi = load(&leaf.sine[at]);
+      const Lanes br = ar * mr - ai * mi, bi = ar * mi + ai * mr, vr = load(&state.re[at]), vi = load(&state.im[at]);
+      store_pairs(&work.pairs[2 * (row * stride + n)], br * vr - bi * vi, br * vi + bi * vr);
+    }
+  }
+}
+
+// Where pulse number `place` of a leaf, which need not be whole, would lie: cubic between its neighbours.
+struct Between {
+  int64_t first;
+  double share[4];
+  Between(double place, int64_t count) {
+    first = std::min(std::max<int64_t>(0, int64_t(std::floor(place)) - 1), std::max<int64_t>(0, count - 4));
+    for (int64_t n = 0; n < 4; n++) {
+      share[n] = n < count ? 1 : 0;
+      for (int64_t m = 0; m < 4 && m < count; m++)
+        if (m != n) share[n] *= (place - double(first + m)) / double(n - m);
+    }
+  }
+};
+
+// The pulses that stand for those of a leaf: phase centres, and weights of the antennas, at places between them.
+struct Virtual {
+  Legs legs;
+  float weight[kTreeWeights];
+};
+
+inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count, double place) {
+  const Between between(place, count);
+  double antenna[2][3] = {};
+  Virtual out{};
+  for (int64_t n = 0; n < 4 && n < count; n++) {
+    const int64_t pulse = begin + between.first + n;
+    for (int64_t axis = 0; axis < 3; axis++) {
+      antenna[0][axis] += between.share[n] * job.transmitter[3 * pulse + axis];
+      antenna[1][axis] += between.share[n] * job.receiver[3 * pulse + axis];
+    }
+    for (int64_t term = 0; tile.weight && term < kTreeWeights; term++)
+      out.weight[term] += float(between.share[n]) * tile.weight[pulse * kTreeWeights + term];
+  }
+  out.legs = legs_between(tile.centre, antenna[0], antenna[1]);
+  return out;
+}
+
+// (8): the lines of the fewer pulses that stand for those of a leaf.
+inline const float* fewer_lines(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t fewer,
+                                LeafScratch& work) {
+  const int64_t wide = 2 * line_length(job, tile), count = apertura::kTreeGroup;
+  work.taken.resize(size_t(wide + 2 * kTreeDelays)), work.lines.resize(size_t(wide * count));
+  work.fewer.resize(size_t(wide * fewer));
+  for (int64_t p = 0; p < count; p++) align(job, tile, begin + p, work.taken.data(), &work.lines[p * wide]);
+  const float* weight = job.presum[fewer];
+  in_columns(wide, [&](auto vectors, int64_t column) {
+    in_rows(fewer, [&](auto tall, int64_t r) {
+      mix_lines<decltype(tall)::value, decltype(vectors)::value>(weight, count, work.lines.data(), wide, r, column,
+                                                                 &work.fewer[r * wide]);
+    });
+  });
+  return work.fewer.data();
+}
+
+// Sums a leaf by the fewer pulses that stand for its own.
+template <class Phase, bool kMono>
+inline void sum_fewer(const TreeJob& job, TileState& state, const LeafNodes& leaf, int64_t begin, LeafScratch& work) {
+  const TreeTile& tile = state.tile;
+  const int64_t fewer = tile.fewer[begin / apertura::kTreeGroup], wide = 2 * line_length(job, tile);
+  const int64_t width = tile.samples * job.up;
+  if (state.cosines.empty()) put_carrier(job, tile.first_path, width, state.cosines, state.sines);
+  const float* lines = fewer_lines(job, tile, begin, fewer, work);
+  work.cells.resize(size_t(kRecord * width));
+  const Cells cells(work.cells.data(), width, -tile.first_path * double(job.up) / job.step);
+  for (int64_t n = 0; n < fewer; n++) {
+    const double place = 0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]);
+    const Virtual pulse = virtual_pulse(job, tile, begin, apertura::kTreeGroup, place);
+    expand(job, lines + n * wide, tile.samples, state.cosines, state.sines, work.cells.data());
+    add_pulse<Phase, kMono>(job, leaf, pulse.legs, tile.weight ? pulse.weight : nullptr, cells, state.re.data(),
+                            state.im.data());
+  }
+}
+
+}  // namespace

@@ -1,0 +1,278 @@
+// How many nodes each subaperture of a tile needs, and which pulses its tree can take. docs/theory/tree.md, "Support".
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+#include "tree_tile.hpp"
+
+namespace {
+
+using apertura::kDirectly;
+using apertura::kSilently;
+using apertura::kTreeGroup;
+using apertura::kTreeCurves;
+using apertura::kTreeNodes;
+using apertura::kTreeWeighted;
+
+constexpr int64_t kCurves[kTreeCurves] = {5, 9, 14, 20};  // degrees of smooth curves over a leaf
+constexpr int64_t kTreeMore = 4;                          // pulses that it takes beyond the degree
+
+constexpr int64_t kSeen = 16;  // places at which a tile is looked at: 4 x 4, corners included
+
+// Places of a tile and how they move with xi and eta: over the tile, and along its two axes (4 on each; the rest repeats
+// them). Plain arrays of kSeen, which the compiler makes vectors of.
+struct Seen {
+  alignas(64) float at[4][kSeen], by_xi[3][kSeen], by_eta[3][kSeen];
+  alignas(64) float axis_at[4][kSeen], by_axis[3][kSeen];
+  double radius;  // of the tile
+  double bend;  // square of half the distance between neighbours: how far the path may dip between them, times 1/R
+};
+
+inline void put_place(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*at)[kSeen],
+                      int64_t n) {
+  double offset[3];
+  offset_at(tile, along_xi, along_eta, offset);
+  at[3][n] = 0;
+  for (int64_t axis = 0; axis < 3; axis++) at[axis][n] = float(offset[axis]), at[3][n] += at[axis][n] * at[axis][n];
+}
+
+inline void put_slope(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*by)[kSeen],
+                      int64_t n) {
+  double slope[3];
+  offset_at(tile, along_xi, along_eta, slope);
+  for (int64_t axis = 0; axis < 3; axis++) by[axis][n] = float(slope[axis] + tile.centre[axis]);
+}
+
+inline Seen seen_of(const TreeTile& tile) {
+  Seen seen;
+  double value[5][kTreeDegree + 2], slope[5][kTreeDegree + 2];
+  const double place[5] = {-1, -1. / 3, 1. / 3, 1, 0};
+  for (int64_t n = 0; n < 5; n++) legendre(place[n], tile.degree, value[n], slope[n]);
+  for (int64_t n = 0; n < kSeen; n++) {
+    const int64_t x = n % 4, y = n / 4;
+    put_place(tile, value[x], value[y], seen.at, n);
+    put_slope(tile, slope[x], value[y], seen.by_xi, n), put_slope(tile, value[x], slope[y], seen.by_eta, n);
+    // Lanes 0 … 3 lie along xi, 4 … 7 along eta.
+    const bool xi = n % 8 < 4;
+    put_place(tile, xi ? value[x] : value[4], xi ? value[4] : value[x], seen.axis_at, n);
+    put_slope(tile, xi ? slope[x] : value[4], xi ? value[4] : slope[x], seen.by_axis, n);
+  }
+  double xi2 = 0, eta2 = 0;
+  for (int64_t axis = 0; axis < 3; axis++)
+    xi2 += seen.by_xi[axis][5] * seen.by_xi[axis][5], eta2 += seen.by_eta[axis][5] * seen.by_eta[axis][5];
+  seen.bend = (xi2 + eta2) / 9, seen.radius = std::sqrt(xi2 + eta2);
+  return seen;
+}
+
+// Derivatives of the path along xi and eta over the tile, and along its axes, metres per half tile.
+struct Slopes {
+  alignas(64) float xi[kSeen], eta[kSeen], axis[kSeen];
+};
+
+inline void add_slopes(const float* w, float square, const Seen& seen, Slopes& out) {
+  for (int64_t n = 0; n < kSeen; n++) {
+    const float x = seen.at[0][n], y = seen.at[1][n], z = seen.at[2][n];
+    const float inverse = 1 / __builtin_sqrtf(seen.at[3][n] + square + x * w[0] + y * w[1] + z * w[2]);
+    const float a = (x + .5f * w[0]) * inverse, b = (y + .5f * w[1]) * inverse, c = (z + .5f * w[2]) * inverse;
+    out.xi[n] += a * seen.by_xi[0][n] + b * seen.by_xi[1][n] + c * seen.by_xi[2][n];
+    out.eta[n] += a * seen.by_eta[0][n] + b * seen.by_eta[1][n] + c * seen.by_eta[2][n];
+  }
+  for (int64_t n = 0; n < kSeen; n++) {
+    const float x = seen.axis_at[0][n], y = seen.axis_at[1][n], z = seen.axis_at[2][n];
+    const float inverse = 1 / __builtin_sqrtf(seen.axis_at[3][n] + square + x * w[0] + y * w[1] + z * w[2]);
+    out.axis[n] += inverse * ((x + .5f * w[0]) * seen.by_axis[0][n] + (y + .5f * w[1]) * seen.by_axis[1][n] +
+                              (z + .5f * w[2]) * seen.by_axis[2][n]);
+  }
+}
+
+inline Slopes slopes_at(const Legs& legs, const Seen& seen) {
+  Slopes out{};
+  add_slopes(legs.transmitter, legs.squares[0], seen, out), add_slopes(legs.receiver, legs.squares[1], seen, out);
+  return out;
+}
+
+// Paths of one pulse to the places of a tile, more than to its centre.
+struct Reach {
+  alignas(64) float further[kSeen];
+  double low, high;  // of any place, on top of the centre's
+};
+
+inline Reach reach_of(const Legs& legs, const Seen& seen) {
+  Reach out;
+  for (int64_t n = 0; n < kSeen; n += kLanes)
+    store(out.further + n,
+          path(legs, load(seen.at[0] + n), load(seen.at[1] + n), load(seen.at[2] + n), load(seen.at[3] + n)));
+  float least = 0, most = 0;
+  for (const float r : out.further) least = r >= least ? least : r, most = r <= most ? most : r;  // no number stays
+  // Paths are convex over a plane: none is longer than at a corner, and none much shorter than at the nearest place.
+  const double dip = 0.5 * seen.bend * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
+  out.low = least - dip - 1e-3, out.high = most + 1e-3;
+  return out;
+}
+
+// What is known of a leaf before its nodes: how its pulses see the tile.
+struct Sight {
+  Reach reach[3];    // of its first, middle and last pulse
+  double low, high;  // of all of them
+  bool inside = true, outside = true;
+};
+
+// Pulses between those looked at may reach as much further as neighbours of them differ.
+inline Sight sight_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, int64_t begin, int64_t end) {
+  Sight sight;
+  const double margin = double(apertura::kTreeMargin + (job.taps_count + apertura::kTreeDelays) / 2);  // of filters
+  const double length = double(job.length - 1);
+  const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
+  double slack = 0;
+  Reach last;
+  for (int64_t n = begin; n < end; n += n + 8 < end || n == end - 1 ? 8 : end - 1 - n) {
+    const Legs legs = legs_of(job, tile.centre, n);
+    const Reach reach = reach_of(legs, seen);
+    if (n > begin) slack = std::max(slack, 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high)));
+    sight.low = n == begin ? reach.low : std::min(sight.low, reach.low);
+    sight.high = n == begin ? reach.high : std::max(sight.high, reach.high);
+    last = reach;
+    const double centre = legs.range - job.start[n];
+    const double low = (centre + reach.low - slack) / job.step, high = (centre + reach.high + slack) / job.step;
+    sight.inside &= low >= margin && high <= length - margin;
+    sight.outside &= high <= -margin || low >= length + margin;
+  }
+  sight.low -= slack, sight.high += slack;
+  for (int64_t n = 0; n < 3; n++) sight.reach[n] = reach_of(legs_of(job, tile.centre, three[n]), seen);
+  return sight;
+}
+
+// The least number of nodes that holds a band, rad per half tile; more than kTreeNodes where none does.
+inline int64_t nodes_for(const TreeJob& job, double band) {
+  if (!(band <= job.supports[kTreeNodes])) return kTreeNodes + 1;
+  return std::max<int64_t>(2, std::lower_bound(job.supports, job.supports + kTreeNodes + 1, band) - job.supports);
+}
+
+// How many pulses stand for those of a leaf: what holds the turn of the carrier at any place against the centre.
+inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, const Sight& sight, int64_t leaf) {
+  const int64_t begin = leaf * kTreeGroup;
+  if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;
+  const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
+  const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * seen.radius;
+  // What a place off the centre sees of a pulse off its curve, RMS over the tile: 1/sqrt 3 of what its corner sees.
+  const double nearest = 1 / std::min(legs.ranges[0], legs.ranges[1]), seldom = 0.577;
+  int64_t terms = 0;
+  while (terms < kTreeCurves && !(job.rough[leaf * kTreeCurves + terms] * nearest * seldom * (job.wavenumber + job.band) * seen.radius <= job.smooth)) terms++;
+  if (terms == kTreeCurves) return 0;
+  double most = 0;
+  for (int64_t n = 0; n < kSeen; n++) {
+    const double first = sight.reach[0].further[n], middle = sight.reach[1].further[n], last = sight.reach[2].further[n];
+    most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
+  }
+  const double band = (job.wavenumber + job.band) * most + job.stray[leaf] * turns + (tile.weight ? kTreeWeighted : 0);
+  const int64_t count = std::max(kCurves[terms] + kTreeMore, nodes_for(job, band));
+  return count <= apertura::kTreeFewer ? uint8_t(count) : 0;
+}
+
+// Looks at each leaf: whether it goes by tree, over which samples, and as how many pulses.
+inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
+  double low = 0, high = 0;
+  for (int64_t leaf = 0; leaf * kTreeGroup < job.pulses; leaf++) {
+    if (tile.way[leaf] != apertura::kByTree) continue;
+    const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
+    const Sight sight = sight_of(job, tile, seen, begin, end);
+    tile.way[leaf] = sight.inside ? apertura::kByTree : sight.outside ? kSilently : kDirectly;
+    if (!sight.inside) continue;
+    tile.fewer[leaf] = fewer_of(job, tile, seen, sight, leaf);
+    low = std::min(low, sight.low), high = std::max(high, sight.high);
+  }
+  tile.first_path = (std::floor(low / job.step) - double(apertura::kTreeMargin)) * job.step;
+  tile.samples = int64_t(std::ceil((high - tile.first_path) / job.step)) + apertura::kTreeMargin + 1;
+}
+
+// (4): the band left on a tile by one pulse against the reference of its subaperture.
+struct Band {
+  float xi[kSeen] = {}, eta[kSeen] = {};
+  void include(const TreeJob& job, const Slopes& pulse, const Slopes& reference, const Slopes& mixed) {
+    const float k = float(job.wavenumber), b = float(job.band);
+    for (int64_t n = 0; n < kSeen; n++) {
+      const float x = reference.axis[n % 4] + mixed.xi[n], y = reference.axis[4 + n / 4] + mixed.eta[n];
+      const float cx = k * magnitude(pulse.xi[n] - x) + b * magnitude(pulse.xi[n]);
+      const float cy = k * magnitude(pulse.eta[n] - y) + b * magnitude(pulse.eta[n]);
+      xi[n] = cx <= xi[n] ? xi[n] : cx, eta[n] = cy <= eta[n] ? eta[n] : cy;  // no number stays
+    }
+  }
+  static float most(const float* values) {
+    float value = 0;
+    for (int64_t n = 0; n < kSeen; n++) value = values[n] <= value ? value : values[n];
+    return value;
+  }
+};
+
+// Slopes of the first, middle and last pulse of each leaf, and how much a stray pulse among them may add to the band.
+struct Leaves {
+  std::vector<Slopes> slopes;
+  std::vector<float> stray_xi, stray_eta;
+};
+
+inline float length_of(const float (*by)[kSeen]) {
+  float most = 0;
+  for (int64_t n = 0; n < kSeen; n++)
+    most = std::max(most, by[0][n] * by[0][n] + by[1][n] * by[1][n] + by[2][n] * by[2][n]);
+  return std::sqrt(most);
+}
+
+inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Seen& seen) {
+  const int64_t size = job.sizes[0], count = apertura::subapertures(job, 0);
+  Leaves leaves{std::vector<Slopes>(size_t(3 * count)), std::vector<float>(size_t(count)), {}};
+  leaves.stray_eta = leaves.stray_xi;
+  const float xi = length_of(seen.by_xi), eta = length_of(seen.by_eta);
+  for (int64_t n = 0; n < count; n++) {
+    const int64_t begin = n * size, end = std::min(begin + size, job.pulses) - 1;
+    const int64_t pulses[3] = {begin, (begin + end) / 2, end};
+    for (int64_t i = 0; i < 3; i++) {
+      const Legs legs = legs_of(job, tile.centre, pulses[i]);
+      leaves.slopes[3 * n + i] = slopes_at(legs, seen);
+      if (i != 1) continue;
+      const float turn = float(job.wavenumber) * job.stray[n] * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
+      leaves.stray_xi[n] = turn * xi, leaves.stray_eta[n] = turn * eta;
+    }
+  }
+  return leaves;
+}
+
+// Node counts of one level. Returns whether the nodes there are do for all subapertures that any pulse takes.
+inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, const Leaves& leaves, const Slopes& mixed,
+                       int64_t level) {
+  const int64_t size = job.sizes[level], leaf = job.sizes[0];
+  uint8_t* nodes = tile.nodes + apertura::first_of_level(job, level);
+  bool holds = true;
+  for (int64_t begin = 0; begin < job.pulses; begin += size, nodes += 2) {
+    const int64_t end = std::min(begin + size, job.pulses);
+    const Slopes reference =
+        slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
+    Band band;
+    float stray_xi = 0, stray_eta = 0;
+    bool taken = false;
+    for (int64_t n = begin / leaf; n * leaf < end; n++) {
+      if (tile.way[n * leaf / kTreeGroup] != apertura::kByTree) continue;
+      taken = true;
+      for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, mixed);
+      stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
+    }
+    const double more = tile.weight ? kTreeWeighted : 0;
+    const int64_t xi = nodes_for(job, Band::most(band.xi) + stray_xi + more);
+    const int64_t eta = nodes_for(job, Band::most(band.eta) + stray_eta + more);
+    holds &= !taken || (xi <= kTreeNodes && eta <= kTreeNodes);
+    nodes[0] = uint8_t(std::min(xi, kTreeNodes)), nodes[1] = uint8_t(std::min(eta, kTreeNodes));
+  }
+  return holds;
+}
+
+inline void plan_tile(const TreeJob& job, TreeTile& tile) {
+  const Seen seen = seen_of(tile);
+  plan_leaves(job, tile, seen);
+  Slopes mixed = slopes_at(shared_legs(job, tile), seen);
+  for (int64_t n = 0; n < kSeen; n++) mixed.xi[n] -= mixed.axis[n % 4], mixed.eta[n] -= mixed.axis[4 + n / 4];
+  const Leaves leaves = leaves_of(job, tile, seen);
+  tile.top = -1;
+  for (int64_t level = 0; level < job.levels && tile.top == level - 1; level++)
+    if (plan_level(job, tile, seen, leaves, mixed, level)) tile.top = level;
+}
+
+}  // namespace

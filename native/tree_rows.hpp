@@ -1,0 +1,72 @@
+// Pulses that go for themselves: expanded to cells once for all tiles that take them so. docs/theory/tree.md, "Leaves".
+#pragma once
+#include "tree_leaf.hpp"
+
+namespace {
+
+constexpr int64_t kRows = 16;  // pulses expanded at once: what the second-level cache holds beside a tile
+
+// Some pulses as cells: cell 0 of a row lies at sample `first` of its pulse.
+struct Rows {
+  int64_t first[kRows], samples = 0;
+  Floats held, cells, cosines, sines;
+  double carried = 0;  // samples that the carrier is there for
+};
+
+// Which samples of each pulse the tiles need.
+inline void take_samples(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t count,
+                         Rows& rows) {
+  rows.samples = 0;
+  for (int64_t p = 0; p < count; p++) {
+    int64_t first = INT64_MAX, last = INT64_MIN;
+    for (const TileState* state : tiles) {
+      const double centre = legs_of(job, state->tile.centre, begin + p).range + state->tile.first_path;
+      const int64_t at = int64_t(std::floor((centre - job.start[begin + p]) / job.step));
+      first = std::min(first, at), last = std::max(last, at + state->tile.samples + 1);
+    }
+    rows.first[p] = first, rows.samples = std::max(rows.samples, last - first);
+  }
+}
+
+inline void expand_row(const TreeJob& job, int64_t pulse, int64_t row, Rows& rows) {
+  const int64_t count = rows.samples + job.taps_count, before = rows.first[row] + job.lead;
+  const double turn = std::fmod(job.wavenumber * (job.start[pulse] + double(rows.first[row]) * job.step), 6.283185307179586);
+  const float c = float(std::cos(turn)), s = float(std::sin(turn));
+  float* held = rows.held.data();
+  const float* samples = job.samples + 2 * pulse * job.length;
+  const int64_t low = std::min(count, std::max<int64_t>(0, -before));  // zeros beyond the profile
+  const int64_t high = std::max(low, std::min(count, job.length - before));
+  std::fill(held, held + 2 * low, 0.0f), std::fill(held + 2 * high, held + 2 * count, 0.0f);
+  for (int64_t n = low; n < high; n++) {
+    const float re = samples[2 * (before + n)], im = samples[2 * (before + n) + 1];
+    held[2 * n] = re * c - im * s, held[2 * n + 1] = re * s + im * c;
+  }
+  expand(job, held, rows.samples, rows.cosines, rows.sines, &rows.cells[kRecord * row * rows.samples * job.up]);
+}
+
+// Adds pulses begin … end to the leaves of some tiles, each for itself.
+template <class Phase>
+inline void sum_each(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t end, Rows& rows) {
+  for (int64_t first = begin; first < end; first += kRows) {
+    const int64_t count = std::min(kRows, end - first);
+    take_samples(job, tiles, first, count, rows);
+    const int64_t width = rows.samples * job.up;
+    if (int64_t(rows.cosines.size()) < kRecord * width) put_carrier(job, 0, width, rows.cosines, rows.sines);
+    rows.cells.resize(size_t(kRecord * width * kRows)), rows.held.resize(size_t(2 * (rows.samples + job.taps_count)));
+    for (int64_t p = 0; p < count; p++) expand_row(job, first + p, p, rows);
+    for (TileState* state : tiles)
+      for (int64_t p = 0; p < count; p++) {
+        const int64_t pulse = first + p;
+        const Legs legs = legs_of(job, state->tile.centre, pulse);
+        const double path = legs.range - job.start[pulse] - double(rows.first[p]) * job.step;
+        const Cells cells(&rows.cells[kRecord * p * width], width, path * double(job.up) / job.step);
+        const float* weight = state->tile.weight ? state->tile.weight + pulse * kTreeWeights : nullptr;
+        if (job.mono)
+          add_pulse<Phase, true>(job, *state->leaf, legs, weight, cells, state->re.data(), state->im.data());
+        else
+          add_pulse<Phase, false>(job, *state->leaf, legs, weight, cells, state->re.data(), state->im.data());
+      }
+  }
+}
+
+}  // namespace

@@ -1,0 +1,280 @@
+"""What trees of all tiles share: profiles, the filters that expand them, and tables for what goes directly."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.focus.engines import native
+from apertura.focus.engines.native_structs import TREE_DELAYS, TREE_GROUP
+from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
+from apertura.focus.engines.tree_surface import Surface
+from apertura.focus.inputs import Profiles
+from apertura.geometry.aperture import Aperture
+
+LEAF = TREE_GROUP
+"""Pulses that a leaf makes fewer, and sums at its nodes."""
+
+DEGREES = (5, 9, 14, 20)
+"""Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
+
+CELLS_AT_ONCE = 4
+"""Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
+
+_SECOND = 256  # pulses of a subaperture of leaves
+_SAMPLED = 64  # pulses at which a rough tile is looked at
+_DELAY_DEGREE = 9
+
+
+class Directly(NamedTuple):
+    """How the direct kernel takes what a tree cannot."""
+
+    oversampling: int
+    tolerance_rad: float
+
+
+DIRECTLY_AT = {
+    -50: Directly(4, 1.5e-3),
+    -56: Directly(4, 1.5e-3),
+    -62: Directly(5, 1.5e-3),
+    -68: Directly(5, 1.5e-3),
+    -74: Directly(6, 1.5e-3),
+    -80: Directly(8, 7e-4),
+    -86: Directly(10, 3e-4),
+    -92: Directly(12, 1.5e-4),
+}
+"""Error of one interpolation between nodes, dB → the direct kernel's setting beside it, which errs less than a tree."""
+
+
+class _DirectTables:
+    """Tables of the direct kernel, made when a tile first asks for them and shared by all."""
+
+    def __init__(self, profiles: Profiles):
+        self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
+
+    def __getitem__(self, oversampling: int) -> Tables:
+        with self._lock:
+            if oversampling not in self._tables:
+                self._tables[oversampling] = native.prepare(self._profiles, oversampling=oversampling, degree=2)
+            return self._tables[oversampling]
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Pulses as trees read them.
+
+    Attributes
+    ----------
+    profiles
+        The pulses, contiguous.
+    design
+        Of the cells: which filters make them.
+    stray_m
+        (leaf,) float32, metres by which pulses of a leaf leave the parabola through its first, middle and last one.
+    rough_m
+        (leaf, 4) float32, metres by which they leave curves of growing degree, RMS.
+    first
+        Number of the first pulse among those prepared.
+    tables
+        Of the direct kernel, for all pulses prepared.
+    """
+
+    profiles: Profiles
+    design: TableDesign
+    stray_m: NDArray[np.float32]
+    rough_m: NDArray[np.float32]
+    first: int
+    tables: _DirectTables
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.profiles)
+
+    def __getitem__(self, pulses: slice) -> "Trees":
+        """Return those of pulses from a multiple of a leaf on."""
+        first, last, _ = pulses.indices(len(self))
+        return replace(
+            self,
+            profiles=self.profiles[first:last],
+            stray_m=self.stray_m[first // LEAF : -(-last // LEAF)],
+            rough_m=self.rough_m[first // LEAF : -(-last // LEAF)],
+            first=self.first + first,
+        )
+
+    def chunks(self, size: int) -> Iterator[slice]:
+        """Yield slices of `size` pulses; they end at the same pulses whichever tile takes them."""
+        first = 0
+        while first < len(self):
+            last = min(len(self), first + size - (self.first + first) % size)
+            yield slice(first, last)
+            first = last
+
+    def direct(self, nodes_db: int) -> Tables:
+        """Return the direct kernel's tables for these pulses."""
+        return self.tables[DIRECTLY_AT[nodes_db].oversampling][self.first : self.first + len(self)]
+
+    def roughness(self, surface: Surface) -> float:
+        """Return the error that pixels off the surface of a tile make, as the function of that name."""
+        aperture = self.profiles.aperture
+        some = aperture[aperture.sample(_SAMPLED)]
+        return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/c."""
+        return 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+
+    @property
+    def band_rad_m(self) -> float:
+        """Half the band as a wavenumber, πB/c."""
+        return float(np.pi / (self.profiles.step_m * self.profiles.oversampling))
+
+
+def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
+    """Return the mean squared error by pixels that do not lie on the surface of their tile, relative.
+
+    Parameters
+    ----------
+    aperture
+        Some of the pulses, evenly spread.
+    surface
+        Of the tile.
+    wavenumber_rad_m, band_rad_m
+        2πf_mid/c and πB/c.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 9.
+    """
+    if not np.isfinite(surface.rough_m):
+        return np.inf
+    rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
+    of_phase, of_delay = wavenumber_rad_m**2 * rate.var(), band_rad_m**2 / 3 * (rate**2).mean()
+    return float(surface.rough_m**2 * (of_phase + of_delay))
+
+
+def subaperture_sizes(chunk: int) -> tuple[int, ...]:
+    """Return the pulses of the subapertures of each level, the largest last.
+
+    Examples
+    --------
+    >>> subaperture_sizes(1024), subaperture_sizes(256), subaperture_sizes(64)
+    ((64, 256, 1024), (64, 256), (64,))
+    """
+    return tuple(sorted({size for size in (LEAF, _SECOND, chunk) if size <= chunk}))
+
+
+def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
+    """Return how many cells a sample is expanded to, for at least so many per resolution cell.
+
+    Examples
+    --------
+    >>> cells_per_sample(2.0, 24), cells_per_sample(2.5, 24)
+    (12, 12)
+    """
+    return CELLS_AT_ONCE * int(np.ceil(oversampling / profile_oversampling / CELLS_AT_ONCE - 1e-9))
+
+
+def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampling: float, taps: int) -> TableDesign:
+    """Return the filters that expand profiles to cells: straight lines in each, of so many taps."""
+    count = cells_per_sample(profile_oversampling, oversampling)
+    return design_table(
+        profile_oversampling, carrier_rad_per_sample, oversampling=count * profile_oversampling, degree=1, taps=taps
+    )
+
+
+@lru_cache
+def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
+    """Return the filter that gives a profile between two samples, as polynomials of where between them.
+
+    Returns
+    -------
+    ndarray
+        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one behind. The first tap
+        is that of the sample `tap / 2 - 1` before.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 7: least squares over the band.
+
+    Examples
+    --------
+    >>> weights = 0.3 ** np.arange(10) @ delay_filter(2.0)
+    >>> tone = np.exp(0.5j * np.pi * 0.9 * (np.arange(12) - 5))
+    >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 0.3)) < 1e-4)
+    True
+    """
+    omega = np.pi / profile_oversampling * BAND
+    basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
+    u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
+    wanted = np.exp(1j * omega[:, None] * u)
+    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, wanted))
+    taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
+    return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
+    """Return what trees of all tiles share; pulses are expanded to cells later, tile by tile.
+
+    Parameters
+    ----------
+    profiles
+        Band-limited profiles.
+    oversampling
+        Table cells per Nyquist cell c/B of total path, at least.
+    taps
+        Of the filters that make cells, 8 or 16.
+
+    Raises
+    ------
+    ValueError
+        If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
+    """
+    if not profiles.oversampling >= 1.5:
+        raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
+    if not len(profiles):
+        raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
+    if not all(np.isfinite(values).all() for values in (profiles.start_m, *profiles.aperture.legs)):
+        raise ValueError("phase centres and starts of the profiles must be finite")
+    held = replace(
+        profiles,
+        samples=np.ascontiguousarray(profiles.samples, np.complex64),
+        start_m=np.ascontiguousarray(profiles.start_m, np.float64),
+    )
+    legs = [leaves_of(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
+    stray, rough = sum(map(_stray, legs)), np.sqrt(sum(leaf_roughness(leg) ** 2 for leg in legs))
+    turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
+    found = cells(profiles.oversampling, turn, float(oversampling), taps)
+    return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
+
+
+def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
+    count = -(-len(places_m) // LEAF)
+    filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
+    return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
+
+
+def _stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf,) how far pulses lie from the parabola through the first, middle and last one, metres."""
+    x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
+    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
+    rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
+    return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
+
+
+def leaf_roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, curve) RMS distance of pulses from curves of growing degree through them, metres."""
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), DEGREES[-1]))[0]
+    terms = np.einsum("pt,npc->ntc", basis, leaves_m - leaves_m[:, :1])
+    power = ((leaves_m - leaves_m[:, :1]) ** 2).sum((1, 2))[:, None] - np.cumsum((terms**2).sum(-1), axis=1)
+    return np.asarray(np.sqrt(np.maximum(power[:, DEGREES], 0) / LEAF))

@@ -1,0 +1,214 @@
+"""What a tree is predicted to do: how exactly, which pulses and tiles it cannot take, and what that costs."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
+from apertura.focus.engines.native_prediction import pixel_steps
+from apertura.focus.engines.native_structs import TREE_DELAYS
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAF, cells, cells_per_sample, roughness, subaperture_sizes
+from apertura.focus.engines.tree_surface import Surface, surfaces_of
+from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
+from apertura.focus.job import Job, Signal
+
+SETTINGS: Mapping[int, tuple[int, int]] = {
+    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16), -86: (64, 16), -92: (64, 16),
+}  # fmt: skip
+"""Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
+
+SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
+"""Sides of tiles and pulses of the largest subaperture that are considered."""
+
+_TILES, _CHUNKS_SEEN = 5, 3  # that are looked at
+_FLOAT32_DB = -92.0
+
+# Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
+_NODE_S = 1.4e-9  # a node that looks a pulse up
+_EXPAND_S = 1.9e-9  # sixteen taps of a cell's filters
+_ALIGN_S = 2.5e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
+_MIX_S = 1.5e-11  # a complex multiply-add of merges and pixels
+_PIXEL_S = 4.4e-9  # a pixel of a subaperture's
+_LEAF_S = 1.2e-5  # a leaf over a tile: its plan
+_SURFACE_S = 1.3e-8  # a pixel's place, fitted
+_TILE_S = 6.5e-5  # a tile of a chunk
+_DIRECT_S = 2.8e-10  # a pixel and pulse that go directly
+_WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
+_PLAIN = 2.0  # times as long where each pulse goes for itself: its cells are many
+_FORM_S = 4e-4  # a block of pixels
+_START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A few tiles of one side, each seen from a few chunks."""
+
+    surfaces: tuple[Surface, ...]
+    looks: tuple[tuple[Looks, ...], ...]
+    rough: tuple[float, ...]  # mean squared error by pixels off their surface
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+    """Yield settings of trees, as `apertura.focus.engines.engine.Engine` describes.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Error" and "Cost".
+    """
+    for side_px in asked_or(asked, "side_px", SIDES_PX):
+        for chunk in asked_or(asked, "chunk", CHUNKS):
+            if (side_px, chunk) != (SIDES_PX[0], CHUNKS[0]) and _larger_than_job(job, pulses, side_px, chunk):
+                continue
+            seen = _seen(job, pulses, side_px, chunk)
+            for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
+                oversampling, taps = SETTINGS[nodes_db]
+                oversampling = asked.get("oversampling") or oversampling
+                yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
+
+
+def _larger_than_job(job: Job, pulses: int, side_px: int, chunk: int) -> bool:
+    """Return whether a smaller side or chunk already takes all there is."""
+    return side_px >= 2 * min(job.tile_px, max(job.shape)) or chunk >= 8 * max(pulses, LEAF)
+
+
+@dataclass(frozen=True)
+class _Options:
+    oversampling: int
+    taps: int
+    nodes_db: int
+    side_px: int
+    chunk: int
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One tile and one chunk: pulses, and pixels along a side."""
+
+    pulses: int
+    side: int
+
+
+@lru_cache(maxsize=64)
+def _seen(job: Job, pulses: int, side_px: int, chunk: int) -> _Seen:
+    """Return some tiles, and how they are seen from some chunks."""
+    side = min(side_px, job.tile_px, *job.shape)
+    whole = [(slice(0, side), slice(0, side))]
+    surfaces = tuple(surfaces_of(np.ascontiguousarray(patch), whole)[0] for patch in _patches(job, side))
+    places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
+    starts = np.arange(0, pulses, chunk)
+    starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS_SEEN).astype(int))]
+    k, b = job.signal.wavenumber_rad_m, np.pi / (job.signal.step_m * job.signal.oversampling)
+    chunks = [job.aperture[places[start : start + chunk]] for start in starts]
+    looks = tuple(
+        tuple(look(part, surface, subaperture_sizes(chunk), wavenumber_rad_m=k, band_rad_m=b) for part in chunks)
+        for surface in surfaces
+        if np.isfinite(surface.rough_m)
+    )
+    some = job.aperture[job.aperture.sample(64)]
+    rough = tuple(roughness(some, surface, wavenumber_rad_m=k, band_rad_m=b) for surface in surfaces)
+    return _Seen(surfaces, looks, rough)
+
+
+def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
+    """Return the pixels' places of a few tiles: those of the job, or on planes about some points of its ground."""
+    if job.patches_m:
+        return list(job.patches_m)
+    count = len(job.points_m)
+    right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
+    at = np.arange(side) - (side - 1) / 2
+    return [
+        job.points_m[n] + at[:, None, None] * down[n] + at[None, :, None] * right[n]
+        for n in np.unique(np.linspace(0, count - 1, _TILES).astype(int))
+    ]
+
+
+def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
+    signal, nodes_db = job.signal, options.nodes_db
+    design = cells(
+        signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
+    )
+    table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
+    error_db = power_sum_db(table_db, nodes_db + 10 * np.log10(2 * len(sizes) + 1), _FLOAT32_DB)
+    seconds, directly = _seconds(job, seen, pulses, options)
+    tables = 8 * pulses * signal.samples
+    if directly:
+        tables += int(24 * pulses * signal.samples * DIRECTLY_AT[nodes_db].oversampling / signal.oversampling)
+    nodes = f"interpolation between nodes errs by {nodes_db} dB at each of {len(sizes)} levels"
+    return Setting(
+        "tree",
+        {"oversampling": options.oversampling, "taps": options.taps},
+        {"nodes_db": nodes_db, "side_px": options.side_px, "chunk": options.chunk},
+        error_db,
+        seconds,
+        table_seconds=_START_S,
+        table_bytes=tables,
+        reasons={
+            "oversampling": f"table errs by {table_db:.1f} dB",
+            "taps": "of the table's filters",
+            "nodes_db": nodes,
+            "side_px": f"cheapest here; about {100 * directly:.0f} % of pixel·pulses go directly",
+            "chunk": "pulses of the largest subaperture, cheapest here",
+        },
+    )
+
+
+def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options) -> tuple[float, float]:
+    """Return the seconds of the whole image, and the part of it that goes directly."""
+    side = min(options.side_px, job.tile_px, *job.shape)
+    chunks = -(-pulses // options.chunk)
+    limit = 10 ** (options.nodes_db / 20)
+    spent: list[float] = []
+    directly: list[float] = []
+    looks = iter(seen.looks)
+    for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
+        here = next(looks) if np.isfinite(surface.rough_m) else ()
+        if not rough <= 2 * limit**2:
+            spent.append(pulses * side**2 * _DIRECT_S)
+            directly.append(1.0)
+            continue
+        for one in here:
+            counts = counts_of(one, options.nodes_db, smooth_rad=2 * limit, weighted=job.beams is not None)
+            amounts = features(one, counts, options, job.signal, _Work(min(pulses, options.chunk), side))
+            spent.append(chunks * sum(cost * amount for cost, amount in amounts))
+            directly.append(float(not counts.nodes))
+    tiles = job.pixels / side**2
+    whole = job.share * tiles * float(np.mean(spent)) + _SURFACE_S * job.pixels + _FORM_S * job.tiles
+    return whole + job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S, float(np.mean(directly))
+
+
+def features(
+    looks: Looks, counts: Counts, options: _Options, signal: Signal, work: "_Work"
+) -> list[tuple[float, float]]:
+    """Return what one tile and one chunk take: seconds each, and how many."""
+    if not counts.nodes:
+        return [(_DIRECT_S, work.pulses * work.side**2)]
+    leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
+    samples = looks.span_m / signal.step_m + 6
+    looked_up = leaves[0] * counts.fewer if counts.fewer else _PLAIN * work.pulses
+    cells_of = cells_per_sample(signal.oversampling, options.oversampling)
+    aligned = work.pulses * (samples + options.taps) * (TREE_DELAYS + counts.fewer) if counts.fewer else 0.0
+    columns, rows = counts.nodes[0]
+    return [
+        (_NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
+        (_EXPAND_S, looked_up * samples * cells_of * options.taps / 16),
+        (_ALIGN_S, aligned),
+        (_MIX_S, _mixed(counts, leaves, work.side)),
+        (_PIXEL_S, leaves[len(counts.nodes) - 1] * work.side**2),
+        (_LEAF_S, leaves[0]),
+        (_TILE_S, 1.0),
+    ]
+
+
+def _mixed(counts: Counts, leaves: list[int], side: int) -> float:
+    """Return the multiply-adds of all merges, the last one to pixels."""
+    targets = [*counts.nodes[1:], (side, side)]
+    return float(
+        sum(
+            count * (-(-wide // 8) * 8) * (rows * columns + tall * rows)
+            for count, (columns, rows), (wide, tall) in zip(leaves, counts.nodes, targets, strict=False)
+        )
+    )
