@@ -166,7 +166,7 @@ def _factorized(scene: Scene) -> Iterator[tuple[str, dict[str, int]]]:
     if scene.geometry == "spotlight":
         yield "fastsar FFBP of 16", {"T": 16}
     else:
-        yield "fastsar FFBP finer", {"finer": 2, **deep}
+        yield "fastsar FFBP finer", {"finer": 2, "T": 16, **deep}
 
 
 if __name__ == "__main__":
