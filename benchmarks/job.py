@@ -83,6 +83,15 @@ def response(path_m: NDArray) -> NDArray[np.float64]:
     return np.where(small, 1.0, np.sin(SUBCARRIERS * safe) / (SUBCARRIERS * np.sin(safe)))
 
 
+def echoes(tx: NDArray, rx: NDArray, scatterers: NDArray, amplitude: NDArray, at: NDArray) -> NDArray[np.complex64]:
+    """Return the scatterers' band-limited echoes at the paths `at`, (pulse, sample)."""
+    samples, wavenumber = np.zeros(at.shape, np.complex128), 2 * np.pi * CENTRE_HZ / C
+    for place, gain in zip(scatterers, amplitude, strict=True):
+        path = total_path(tx, rx, place[None])
+        samples += gain * np.exp(-1j * wavenumber * path) * response(at - path)
+    return samples.astype(np.complex64)
+
+
 def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface: Surface = "flat") -> Job:
     """Return the job; profiles are exact samples of the band-limited echo."""
     generator = np.random.default_rng(1)
@@ -96,13 +105,9 @@ def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface
     paths = total_path(tx, rx, np.concatenate([edge, pixels[::8, ::8]], axis=None).reshape(-1, 3))
     start = paths.min(1) - GUARD * step
     length = int(np.ceil((paths.max(1) - start).max() / step)) + GUARD
-    samples = np.zeros((pulses, length), np.complex128)
     at = start[:, None] + step * np.arange(length)
-    wavenumber = 2 * np.pi * CENTRE_HZ / C
-    for place, gain in zip(scatterers, amplitude, strict=True):
-        path = total_path(tx, rx, place[None])
-        samples += gain * np.exp(-1j * wavenumber * path) * response(at - path)
-    profiles = Profiles(samples.astype(np.complex64), start, step, CENTRE_HZ, 2.0, Aperture(tx, rx))
+    samples = echoes(tx, rx, scatterers, amplitude, at)
+    profiles = Profiles(samples, start, step, CENTRE_HZ, 2.0, Aperture(tx, rx))
     return Job(profiles, pixels, scatterers, amplitude)
 
 

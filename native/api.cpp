@@ -53,11 +53,12 @@ const Isa* find(const char* name) {
 #ifdef APERTURA_X86
       {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
        apertura_differentiate_avx512, apertura_rest_tree_avx512, apertura_plan_tree_avx512, apertura_form_tree_avx512},
-      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2,
-       apertura_differentiate_avx2, apertura_rest_tree_avx2, apertura_plan_tree_avx2, apertura_form_tree_avx2},
+      {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2, apertura_differentiate_avx2,
+       apertura_rest_tree_avx2, apertura_plan_tree_avx2, apertura_form_tree_avx2},
 #endif
       {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable,
-       apertura_differentiate_portable, apertura_rest_tree_portable, apertura_plan_tree_portable, apertura_form_tree_portable},
+       apertura_differentiate_portable, apertura_rest_tree_portable, apertura_plan_tree_portable,
+       apertura_form_tree_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;

@@ -5,18 +5,18 @@
 
 namespace apertura {
 
-constexpr int64_t kTreeNodes = 128;   // along one axis of a tile, at most
-constexpr int64_t kTreeSide = 256;    // pixels along a tile, at most
-constexpr int64_t kTreeLevels = 4;    // at most
-constexpr int64_t kTreeGroup = 64;    // pulses of a leaf, which are taken the same way
-constexpr int64_t kTreeDelays = 12;   // taps of the filter that aligns a pulse to a tile
-constexpr int64_t kTreeFewer = 28;    // that may stand for those of a leaf, at most
-constexpr int64_t kTreeCurves = 4;    // smooth curves that the pulses of a leaf may follow
-constexpr int64_t kTreeSlots = 136;   // 0 … kTreeNodes: that many nodes; above: pixels of one of the sides of tiles
-constexpr int64_t kTreeDegree = 6;    // of a tile's surface, at most
-constexpr int64_t kTreeWeights = 16;  // of a beam's polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
-constexpr int64_t kTreeMargin = 2;    // samples around those that a tile's paths reach
-constexpr double kTreeWeighted = 1.5; // rad that a beam's weight adds to the band at a tile's nodes
+constexpr int64_t kTreeNodes = 128;    // along one axis of a tile, at most
+constexpr int64_t kTreeSide = 256;     // pixels along a tile, at most
+constexpr int64_t kTreeLevels = 4;     // at most
+constexpr int64_t kTreeGroup = 64;     // pulses of a leaf, which are taken the same way
+constexpr int64_t kTreeDelays = 12;    // taps of the filter that aligns a pulse to a tile
+constexpr int64_t kTreeFewer = 28;     // that may stand for those of a leaf, at most
+constexpr int64_t kTreeCurves = 4;     // smooth curves that the pulses of a leaf may follow
+constexpr int64_t kTreeSlots = 136;    // 0 … kTreeNodes: that many nodes; above: pixels of one of the sides of tiles
+constexpr int64_t kTreeDegree = 6;     // of a tile's surface, at most
+constexpr int64_t kTreeWeights = 16;   // of a beam's polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
+constexpr int64_t kTreeMargin = 2;     // samples around those that a tile's paths reach
+constexpr double kTreeWeighted = 1.5;  // rad that a beam's weight adds to the band at a tile's nodes
 
 // How a group of pulses is taken over a tile.
 enum TreeWay : uint8_t { kByTree, kDirectly, kSilently };
@@ -32,27 +32,27 @@ struct TreeTile {
   uint8_t* nodes;         // (subaperture of each level in turn, 2): nodes along ξ and η
   uint8_t* fewer;         // (leaf): how many pulses stand for those of a leaf; 0: each for itself; on entry 1: must
   double centre[3];
-  double rest;            // mean square of the pixels' distances from the surface; set by apertura_rest_tree
-  double first_path;      // of the first sample, more than that of the centre; set by the plan
+  double rest;        // mean square of the pixels' distances from the surface; set by apertura_rest_tree
+  double first_path;  // of the first sample, more than that of the centre; set by the plan
   int64_t degree, rows, columns, row_slot, column_slot;
-  int64_t samples;        // of each pulse over the tile; set by the plan
-  int64_t top;            // level at which pixels are formed; -1: no tree holds this tile
+  int64_t samples;  // of each pulse over the tile; set by the plan
+  int64_t top;      // level at which pixels are formed; -1: no tree holds this tile
 };
 
 struct TreeJob {
-  const float* samples;        // (pulse, length, 2)
-  const double* start;         // (pulse): total path of sample 0
-  const double* transmitter;   // (pulse, 3)
-  const double* receiver;      // (pulse, 3)
-  const float* stray;          // (leaf): metres by which pulses leave the parabola through three of them
-  const float* rough;          // (leaf, kTreeCurves): and smooth curves of growing degree, RMS
-  const float* taps;           // (taps_count, up, 2, 2): of level and slope, each twice (for re, im)
-  const float* delay;          // (delay_terms, kTreeDelays): polynomials of the fraction of a sample
-  const float* const* presum;  // (kTreeFewer + 1): weights (fewer, pulse of a leaf)
-  const double* supports;      // (kTreeNodes + 1): band that so many nodes hold, rad per half tile
-  const double* const* places; // (kTreeSlots): nodes or pixels along an axis, -1 … 1
-  const float* const* spread;  // (kTreeNodes + 1, kTreeSlots): (node, 2 padded): weights, each twice
-  const float* const* mix;     // (kTreeNodes + 1, kTreeSlots): (target, node): the same weights
+  const float* samples;         // (pulse, length, 2)
+  const double* start;          // (pulse): total path of sample 0
+  const double* transmitter;    // (pulse, 3)
+  const double* receiver;       // (pulse, 3)
+  const float* stray;           // (leaf): metres by which pulses leave the parabola through three of them
+  const float* rough;           // (leaf, kTreeCurves): and smooth curves of growing degree, RMS
+  const float* taps;            // (taps_count, up, 2, 2): of level and slope, each twice (for re, im)
+  const float* delay;           // (delay_terms, kTreeDelays): polynomials of the fraction of a sample
+  const float* const* presum;   // (kTreeFewer + 1): weights (fewer, pulse of a leaf)
+  const double* supports;       // (kTreeNodes + 1): band that so many nodes hold, rad per half tile
+  const double* const* places;  // (kTreeSlots): nodes or pixels along an axis, -1 … 1
+  const float* const* spread;   // (kTreeNodes + 1, kTreeSlots): (node, 2 padded): weights, each twice
+  const float* const* mix;      // (kTreeNodes + 1, kTreeSlots): (target, node): the same weights
   TreeTile* tiles;
   int64_t pulses, length, up, lead, stride, count, levels, mono, phase_polynomial;
   int64_t taps_count, delay_terms;

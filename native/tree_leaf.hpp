@@ -25,21 +25,23 @@ struct LeafScratch {
 struct Cells {
   const float* middle;
   float offset, low, high;
-  Cells(const float* first, int64_t width, double place) {
+  // `cells` holds `width` of them, the first of number `first`; `place` is that of the centre, in cells from number 0.
+  Cells(const float* cells, int64_t first, int64_t width, double place) {
     const double whole = std::floor(place);
-    middle = first + kRecord * int64_t(whole), offset = float(place - whole);
-    low = float(-whole), high = float(double(width - 1) - whole);
+    const int64_t number = int64_t(whole) - first;
+    middle = cells + kRecord * number, offset = float(place - whole);
+    low = float(-number), high = float(width - 1 - number);
   }
 };
 
-// exp(j k r) at so many cells, the first at r = `from`, as factors for pairs.
-inline void put_carrier(const TreeJob& job, double from, int64_t width, Floats& cosines, Floats& sines) {
+// exp(j k r) at so many cells from number `first` on, number 0 at r = `from`, as factors for pairs.
+inline void put_carrier(const TreeJob& job, double from, int64_t first, int64_t width, Floats& cosines, Floats& sines) {
   cosines.resize(size_t(kRecord * width)), sines.resize(size_t(kRecord * width));
   for (int64_t cell = 0; cell < width; cell++) {
-    const double turn = std::fmod(job.wavenumber * (from + double(cell) * job.step / double(job.up)), 6.283185307179586);
+    const double turn =
+        std::fmod(job.wavenumber * (from + double(first + cell) * job.step / double(job.up)), 6.283185307179586);
     const float c = float(std::cos(turn)), s = float(std::sin(turn));
-    for (int64_t n = 0; n < kRecord; n++)
-      cosines[kRecord * cell + n] = c, sines[kRecord * cell + n] = n % 2 ? s : -s;
+    for (int64_t n = 0; n < kRecord; n++) cosines[kRecord * cell + n] = c, sines[kRecord * cell + n] = n % 2 ? s : -s;
   }
 }
 
@@ -52,7 +54,8 @@ inline int64_t line_length(const TreeJob& job, const TreeTile& tile) {
 inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float* taken, float* line) {
   const Legs legs = legs_of(job, tile.centre, pulse);
   const int64_t length = line_length(job, tile), count = length + kTreeDelays;
-  const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead), whole = std::floor(at);
+  const double at = (legs.range + tile.first_path - job.start[pulse]) / job.step + double(job.lead),
+               whole = std::floor(at);
   // Samples from `whole - kTreeDelays / 2 + 1` on, zeros beyond the profile.
   const int64_t before = int64_t(whole) - kTreeDelays / 2 + 1;
   const int64_t low = std::min(count, std::max<int64_t>(0, -before));
@@ -79,7 +82,7 @@ inline void align(const TreeJob& job, const TreeTile& tile, int64_t pulse, float
 
 // `samples` samples of a line to cells: level and slope of the profile in each, by the filters of its place between
 // samples, times a carrier.
-inline void expand(const TreeJob& job, const float* line, int64_t samples, const Floats& cosines, const Floats& sines,
+inline void expand(const TreeJob& job, const float* line, int64_t samples, const float* cosines, const float* sines,
                    float* cells) {
   const int64_t along = job.up / kCells;  // vectors that the cells of one sample fill
   for (int64_t sample = 0; sample < samples; sample++)
@@ -91,7 +94,7 @@ inline void expand(const TreeJob& job, const float* line, int64_t samples, const
         odd += load(tap + (n + 1) * kRecord * job.up) * splat_pair(from + 2 * n + 2);
       }
       const int64_t at = kRecord * sample * job.up + v * kLanes;
-      store(cells + at, turned(even + odd, load(&cosines[at]), load(&sines[at])));
+      store(cells + at, turned(even + odd, load(cosines + at), load(sines + at)));
     }
 }
 
@@ -223,14 +226,14 @@ inline void sum_fewer(const TreeJob& job, TileState& state, const LeafNodes& lea
   const TreeTile& tile = state.tile;
   const int64_t fewer = tile.fewer[begin / apertura::kTreeGroup], wide = 2 * line_length(job, tile);
   const int64_t width = tile.samples * job.up;
-  if (state.cosines.empty()) put_carrier(job, tile.first_path, width, state.cosines, state.sines);
+  if (state.cosines.empty()) put_carrier(job, tile.first_path, 0, width, state.cosines, state.sines);
   const float* lines = fewer_lines(job, tile, begin, fewer, work);
   work.cells.resize(size_t(kRecord * width));
-  const Cells cells(work.cells.data(), width, -tile.first_path * double(job.up) / job.step);
+  const Cells cells(work.cells.data(), 0, width, -tile.first_path * double(job.up) / job.step);
   for (int64_t n = 0; n < fewer; n++) {
     const double place = 0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]);
     const Virtual pulse = virtual_pulse(job, tile, begin, apertura::kTreeGroup, place);
-    expand(job, lines + n * wide, tile.samples, state.cosines, state.sines, work.cells.data());
+    expand(job, lines + n * wide, tile.samples, state.cosines.data(), state.sines.data(), work.cells.data());
     add_pulse<Phase, kMono>(job, leaf, pulse.legs, tile.weight ? pulse.weight : nullptr, cells, state.re.data(),
                             state.im.data());
   }

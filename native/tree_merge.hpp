@@ -4,9 +4,9 @@
 
 namespace {
 
-constexpr int64_t kPairs = kLanes / 2;            // complex numbers in a vector
-constexpr int64_t kWide = kLanes == 16 ? 4 : 2;   // vectors that a block of a product spans: what the registers hold
-constexpr int64_t kTall = 4;                      // and rows
+constexpr int64_t kPairs = kLanes / 2;           // complex numbers in a vector
+constexpr int64_t kWide = kLanes == 16 ? 4 : 2;  // vectors that a block of a product spans: what the registers hold
+constexpr int64_t kTall = 4;                     // and rows
 
 inline int64_t pair_stride(int64_t count) { return padded(count, 8); }
 
@@ -195,8 +195,8 @@ inline void form_pixels(const TreeJob& job, TileState& state, const Nodes& from,
     strip.assign(strip.size(), 0.0f);
     in_columns(wide, [&](auto vectors, int64_t column) {
       in_rows(rows, [&](auto tall, int64_t r) {
-        mix_eta<decltype(tall)::value, decltype(vectors)::value>(
-            weight, from.rows, work.half.data(), wide, work.along_eta, top + r, column, &strip[r * wide]);
+        mix_eta<decltype(tall)::value, decltype(vectors)::value>(weight, from.rows, work.half.data(), wide,
+                                                                 work.along_eta, top + r, column, &strip[r * wide]);
       });
     });
     for (int64_t r = 0; r < rows; r++)

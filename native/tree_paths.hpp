@@ -89,9 +89,7 @@ inline void turn(Lanes turns, Lanes& cosine, Lanes& sine) {
 struct Turns {
   Floats cosines, sines;  // c c c c …, and -s s -s s …
   void resize(int64_t count) { cosines.resize(size_t(2 * count)), sines.resize(size_t(2 * count)); }
-  void put(int64_t n, Lanes c, Lanes s) {
-    store_pairs(&cosines[2 * n], c, c), store_pairs(&sines[2 * n], -s, s);
-  }
+  void put(int64_t n, Lanes c, Lanes s) { store_pairs(&cosines[2 * n], c, c), store_pairs(&sines[2 * n], -s, s); }
 };
 inline Lanes turned(Lanes pairs, Lanes cosines, Lanes sines) { return pairs * cosines + swap_pairs(pairs) * sines; }
 

@@ -10,8 +10,18 @@ constexpr int64_t kRows = 16;  // pulses expanded at once: what the second-level
 struct Rows {
   int64_t first[kRows], samples = 0;
   Floats held, cells, cosines, sines;
-  double carried = 0;  // samples that the carrier is there for
+  int64_t low = 0, high = 0;  // samples of a profile that the carrier is there for: no cell depends on other tiles
 };
+
+// Provides the carrier, exp(j k r) from sample 0 of a profile on, at the samples of all rows.
+inline void carry(const TreeJob& job, int64_t count, Rows& rows) {
+  constexpr int64_t kMore = 64;  // samples, so that the next pulses find theirs
+  const int64_t low = *std::min_element(rows.first, rows.first + count);
+  const int64_t high = *std::max_element(rows.first, rows.first + count) + rows.samples;
+  if (rows.low <= low && high <= rows.high) return;
+  rows.low = low - kMore, rows.high = high + kMore;
+  put_carrier(job, 0, rows.low * job.up, (rows.high - rows.low) * job.up, rows.cosines, rows.sines);
+}
 
 // Which samples of each pulse the tiles need.
 inline void take_samples(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t count,
@@ -30,7 +40,7 @@ inline void take_samples(const TreeJob& job, const std::vector<TileState*>& tile
 
 inline void expand_row(const TreeJob& job, int64_t pulse, int64_t row, Rows& rows) {
   const int64_t count = rows.samples + job.taps_count, before = rows.first[row] + job.lead;
-  const double turn = std::fmod(job.wavenumber * (job.start[pulse] + double(rows.first[row]) * job.step), 6.283185307179586);
+  const double turn = std::fmod(job.wavenumber * job.start[pulse], 6.283185307179586);
   const float c = float(std::cos(turn)), s = float(std::sin(turn));
   float* held = rows.held.data();
   const float* samples = job.samples + 2 * pulse * job.length;
@@ -41,7 +51,9 @@ inline void expand_row(const TreeJob& job, int64_t pulse, int64_t row, Rows& row
     const float re = samples[2 * (before + n)], im = samples[2 * (before + n) + 1];
     held[2 * n] = re * c - im * s, held[2 * n + 1] = re * s + im * c;
   }
-  expand(job, held, rows.samples, rows.cosines, rows.sines, &rows.cells[kRecord * row * rows.samples * job.up]);
+  const int64_t carrier = kRecord * (rows.first[row] - rows.low) * job.up;
+  expand(job, held, rows.samples, &rows.cosines[carrier], &rows.sines[carrier],
+         &rows.cells[kRecord * row * rows.samples * job.up]);
 }
 
 // Adds pulses begin … end to the leaves of some tiles, each for itself.
@@ -51,15 +63,15 @@ inline void sum_each(const TreeJob& job, const std::vector<TileState*>& tiles, i
     const int64_t count = std::min(kRows, end - first);
     take_samples(job, tiles, first, count, rows);
     const int64_t width = rows.samples * job.up;
-    if (int64_t(rows.cosines.size()) < kRecord * width) put_carrier(job, 0, width, rows.cosines, rows.sines);
+    carry(job, count, rows);
     rows.cells.resize(size_t(kRecord * width * kRows)), rows.held.resize(size_t(2 * (rows.samples + job.taps_count)));
     for (int64_t p = 0; p < count; p++) expand_row(job, first + p, p, rows);
     for (TileState* state : tiles)
       for (int64_t p = 0; p < count; p++) {
         const int64_t pulse = first + p;
         const Legs legs = legs_of(job, state->tile.centre, pulse);
-        const double path = legs.range - job.start[pulse] - double(rows.first[p]) * job.step;
-        const Cells cells(&rows.cells[kRecord * p * width], width, path * double(job.up) / job.step);
+        const double place = (legs.range - job.start[pulse]) * double(job.up) / job.step;
+        const Cells cells(&rows.cells[kRecord * p * width], rows.first[p] * job.up, width, place);
         const float* weight = state->tile.weight ? state->tile.weight + pulse * kTreeWeights : nullptr;
         if (job.mono)
           add_pulse<Phase, true>(job, *state->leaf, legs, weight, cells, state->re.data(), state->im.data());

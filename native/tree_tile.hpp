@@ -129,8 +129,7 @@ inline const LeafNodes& leaf_of(const TreeJob& job, TileState& state, int64_t co
   leaf.at.resize(leaf.count);
   leaf.xi.assign(leaf.at.count, 0.0f), leaf.eta = leaf.xi;
   std::vector<double> along_xi(size_t(columns) * (kTreeDegree + 2));
-  for (int64_t n = 0; n < columns; n++)
-    legendre(job.places[columns][n], tile.degree, &along_xi[n * (kTreeDegree + 2)]);
+  for (int64_t n = 0; n < columns; n++) legendre(job.places[columns][n], tile.degree, &along_xi[n * (kTreeDegree + 2)]);
   for (int64_t row = 0; row < rows; row++) {
     double along_eta[kTreeDegree + 2], line[(kTreeDegree + 1) * 3] = {};
     legendre(job.places[rows][row], tile.degree, along_eta);

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import toy_engine
 from campaigns import draw
+from scenes import ecef, fly, pixel_grid, scatter
 
-from apertura.focus.engines import PATCH_PX, load_engine
+from apertura.focus.engines import PATCH_PX, load_engine, native
 from apertura.focus.engines.engine import Setting
 from apertura.focus.engines.native_constants import KERNEL
 from apertura.focus.tiles import compute_tiles, image_array
@@ -60,3 +61,13 @@ def test_a_tile_alone_prepares_every_block_and_forms_no_other_tile(toy, way):
 
 def test_tiles_begin_at_patches_of_the_kernel():
     assert PATCH_PX % KERNEL.patch_side == 0
+
+
+@pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
+def test_an_image_of_several_regions_is_that_of_its_parts_to_the_bit(isa):
+    pixels = pixel_grid(280, 263, spacing_m=0.02)  # the kernel finishes 256 x 256 pixels before it goes on
+    tables, places = native.prepare(fly(scatter(pixels), pulses=13).profiles(ecef(pixels))), ecef(pixels)
+    whole = native.form(tables, places)
+    parts = [[native.form(tables, places[y : y + 80, x : x + 144]) for x in (0, 144)] for y in range(0, 280, 80)]
+    assert whole.all()
+    np.testing.assert_array_equal(np.block(parts).view(np.uint32), whole.view(np.uint32))

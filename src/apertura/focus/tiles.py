@@ -1,7 +1,8 @@
 """An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
 
+from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -87,11 +88,14 @@ class Weighing:
         Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
     count
         Pulses that the sum is divided by; all of them by default.
+    ways
+        Way of the engine → pixels × pulses that went so in this process.
     """
 
     beams: Beams | None = None
     presum: tuple[Presum, NDArray[np.float64]] | None = None
     count: int | None = None
+    ways: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +177,11 @@ def _form(  # noqa: PLR0917
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
     some = beams and beams[block.start + part.start : block.start + part.stop]
-    pixels = forming.terrain.positions(grid)
-    image = load_engine(setting.engine).form(tables, pixels, beams=some, **setting.form_options)
+    engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
+    ways: tuple[str, ...] = getattr(engine, "WAYS", ())
+    counted = {"counts": np.zeros(len(ways), np.int64)} if ways else {}
+    image = engine.form(tables, pixels, beams=some, **setting.form_options, **counted)
+    forming.weighing.ways.update({way: int(counted["counts"][n]) for n, way in enumerate(ways)})
     tile = np.asarray(image / count, np.complex64)
     return tile if sum_before is None else sum_before + tile
 

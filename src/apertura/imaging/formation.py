@@ -1,5 +1,6 @@
 """What forms one image, opened once: inputs, scene, antennas and plan, handed to tiles, certificate and measures."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -75,6 +76,11 @@ class Formation:
         side = tuple(min(self.side_px, size) for size in self.grid.shape)
         whole = next((tile for tile in seen if tuple(part.stop - part.start for part in tile) == side), None)
         return tiles if whole is None else [whole, *(tile for tile in seen if tile is not whole)]
+
+    @cached_property
+    def ways(self) -> Counter[str]:
+        """Way of an engine → pixels × pulses that went so in this process; empty where an engine has one way."""
+        return Counter()
 
     @cached_property
     def _pieces_of(self) -> dict[tuple[int, ...], list[Window]]:
@@ -213,7 +219,7 @@ class Formation:
             self.grid,
             self.plan.terrain,
             side_px=self.side_px,
-            weighing=Weighing(self.beams, summed, self.plan.count),
+            weighing=Weighing(self.beams, summed, self.plan.count, self.ways),
         )
 
 

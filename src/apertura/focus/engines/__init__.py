@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
-from apertura.contracts import Window
-
 if TYPE_CHECKING:
+    from apertura.contracts import Window
     from apertura.focus.engines.engine import Engine
 
 ENGINES: dict[str, str] = {
@@ -38,7 +37,7 @@ def load_engine(name: str) -> "Engine":
     return cast("Engine", import_module(ENGINES[name]))
 
 
-def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> list[Window]:
+def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> "list[Window]":
     """Return windows of a tile that an engine gives the same bits when it forms them alone.
 
     Parameters

@@ -98,6 +98,9 @@ class Engine(Protocol):
     pieces
         (shape of a block of pixels, form_options) → windows of it that get the same bits when formed alone; an engine
         whose pixels are formed in patches of `PATCH_PX` leaves it out.
+    WAYS
+        Names of the ways that pixels × pulses may go, whose numbers `form` adds to an int64 array `counts`; an engine
+        with one way leaves it out.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.

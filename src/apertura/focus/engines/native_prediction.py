@@ -33,7 +33,7 @@ _SILENT = 1e-20
 # Seconds on one core: per pulse, cell and coefficient; per pixel and pulse by degree, for each path variant; with beams
 # per pixel and pulse that antennas weigh smoothly (on top), pixel by pixel (instead), and not at all.
 _CELL_S = 1.5e-9
-_SHARED_S, _WIDE_S, _EXACT_S = {1: 2.4e-10, 2: 2.8e-10}, {1: 2.9e-10, 2: 3.7e-10}, {1: 3.2e-9, 2: 3.8e-9}
+_SHARED_S, _WIDE_S, _EXACT_S = {1: 2.1e-10, 2: 2.6e-10}, {1: 2.9e-10, 2: 3.7e-10}, {1: 3.2e-9, 2: 3.8e-9}
 _BEAM_S, _EDGE_S, _DARK_S = 6.7e-10, 3.4e-8, 1.2e-10
 _SECTOR_S = 6.7e-10  # per pixel and pulse at the edge of a sector, on top
 

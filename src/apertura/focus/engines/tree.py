@@ -25,9 +25,11 @@ from apertura.focus.engines.tree_prediction import candidates
 from apertura.focus.engines.tree_surface import surfaces_of, windows
 from apertura.focus.engines.tree_weights import DIRECTLY
 
-__all__ = ["READS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
+__all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
+
+WAYS = ("by tree", "directly", "without an echo")
 
 
 LEAST_PIXELS = 32**2
