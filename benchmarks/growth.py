@@ -31,8 +31,13 @@ from growing.scene import Geometry, Scene, Surface, build
 from growing.table import exponents, markdown
 from latest import Row, read_rows, replace_rows
 
+from apertura.focus.engines import instruction_set
+
 CHART = Path(__file__).parents[1] / "docs" / "assets" / "growth.png"
 AIMS_DB = (-40.0, -60.0, -80.0)
+SLOW = 0.05
+"""Who forms less of an image than this has one round where it is quick."""
+
 _KEY = ("group", "name", "aim_db", "geometry", "surface", "size", "pulses")
 
 
@@ -116,13 +121,21 @@ def measured(case: Case, effort: Effort, only: list[str]) -> list[Row]:
     for turn in range(effort.rounds):
         house.compress()
         for one in contestants:
-            if turn == 0 or one.spent * (turn + 1) / turn < 3 * effort.limit_s:
+            once = effort.quick and one.share < SLOW  # of what goes pixel by pixel
+            if turn == 0 or (not once and one.spent * (turn + 1) / turn < 3 * effort.limit_s):
                 one.go()
         loads.append(os.getloadavg()[0])
     print(f"  {time.perf_counter() - begin:.0f} s, load {min(loads):.1f} to {max(loads):.1f}", flush=True)
     compression_s = median(house.compressions)
-    measures = {"load": round(max(loads), 1), "compression_s": float(f"{compression_s:.3g}")}
+    measures = {"machine": machine(), "load": round(max(loads), 1), "compression_s": float(f"{compression_s:.3g}")}
     return [one.row(compression_s) | measures for one in contestants]
+
+
+def machine() -> str:
+    """Return the processor, as Linux calls it, and what our sums run with."""
+    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+    return f"{model}, {instruction_set('native')}"
 
 
 def _contestants(house: House, effort: Effort) -> Iterator[Contestant]:
