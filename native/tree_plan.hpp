@@ -12,6 +12,7 @@ using apertura::kTreeNodes;
 using apertura::kTreeWeighted;
 
 constexpr int64_t kCurves[kTreeCurves] = {5, 9, 14, 20};  // degrees of smooth curves over a leaf
+constexpr float kAiry = 2;                                // units of (4b) beyond which nothing is left
 constexpr int64_t kTreeMore = 4;                          // pulses that it takes beyond the degree
 
 // What is known of a leaf before its nodes: how its pulses see the tile.
@@ -66,7 +67,7 @@ inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& se
   while (terms < kTreeCurves && !(rough[terms] * rest <= job.smooth)) terms++;
   if (terms == kTreeCurves) return 0;
   double most = 0;
-  for (int64_t n = 0; n < kSeen; n++) {
+  for (int64_t n = 0; n < seen.count; n++) {
     const double first = sight.reach[0].further[n], middle = sight.reach[1].further[n],
                  last = sight.reach[2].further[n];
     most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
@@ -92,22 +93,54 @@ inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
   tile.samples = int64_t(std::ceil((high - tile.first_path) / job.step)) + apertura::kTreeMargin + 1;
 }
 
-// (4): the band left on a tile by one pulse against the reference of its subaperture.
+// Slopes of the reference of a subaperture over the tile: those along the axes, and the mixed part.
+struct Reference {
+  alignas(64) float xi[kSeen], eta[kSeen];
+  Reference(const Slopes& middle, const Slopes& mixed, const Seen& seen) {
+    for (int64_t n = 0; n < seen.count; n++) {
+      xi[n] = middle.axis[n % seen.side] + mixed.xi[n];
+      eta[n] = middle.axis[seen.side + n / seen.side] + mixed.eta[n];
+    }
+  }
+};
+
+// The parabola through a value and those beside it: by how much it peaks above, and how sharply; 0 if not among them.
+struct Peak {
+  float above = 0, bend = 0;
+  Peak(const float* value, int64_t step) {
+    const float before = value[-step], behind = value[step], second = 2 * *value - before - behind;
+    const float rise = behind - before;
+    if (second > 0 && rise <= 2 * second && -rise <= 2 * second) above = rise * rise / (8 * second), bend = second;
+  }
+};
+
+// (4): the band left on a tile by pulses against the reference of their subaperture.
 struct Band {
   float xi[kSeen] = {}, eta[kSeen] = {};
-  void include(const TreeJob& job, const Slopes& pulse, const Slopes& reference, const Slopes& mixed) {
+  void include(const TreeJob& job, const Slopes& pulse, const Reference& reference, const Seen& seen) {
     const float k = float(job.wavenumber), b = float(job.band);
-    for (int64_t n = 0; n < kSeen; n++) {
-      const float x = reference.axis[n % 4] + mixed.xi[n], y = reference.axis[4 + n / 4] + mixed.eta[n];
-      const float cx = k * magnitude(pulse.xi[n] - x) + b * magnitude(pulse.xi[n]);
-      const float cy = k * magnitude(pulse.eta[n] - y) + b * magnitude(pulse.eta[n]);
+    for (int64_t n = 0; n < seen.count; n++) {
+      const float cx = k * magnitude(pulse.xi[n] - reference.xi[n]) + b * magnitude(pulse.xi[n]);
+      const float cy = k * magnitude(pulse.eta[n] - reference.eta[n]) + b * magnitude(pulse.eta[n]);
       xi[n] = cx <= xi[n] ? xi[n] : cx, eta[n] = cy <= eta[n] ? eta[n] : cy;  // no number stays
     }
   }
-  static float most(const float* values) {
-    float value = 0;
-    for (int64_t n = 0; n < kSeen; n++) value = values[n] <= value ? value : values[n];
-    return value;
+  // Of any place, `step` the axis along which it is interpolated: where it peaks between places, by parabolas, and what
+  // a phase whose slope peaks has beyond that slope (4b).
+  static float most(const float* values, const Seen& seen, int64_t step) {
+    const int64_t side = seen.side, across = step == 1 ? side : 1;
+    const float bend = float((side - 1) * (side - 1)) / 8;
+    float most = 0;
+    for (int64_t n = 0; n < seen.count; n++) {
+      float value = values[n];
+      if (n / across % side % (side - 1)) value += Peak(values + n, across).above;
+      if (n / step % side % (side - 1)) {
+        const Peak peak(values + n, step);
+        if (peak.bend > 0) value += peak.above + kAiry * __builtin_cbrtf(peak.bend * bend);
+      }
+      most = value <= most ? most : value;
+    }
+    return most;
   }
 };
 
@@ -117,9 +150,9 @@ struct Leaves {
   std::vector<float> stray_xi, stray_eta;
 };
 
-inline float length_of(const float (*by)[kSeen]) {
+inline float length_of(const float (*by)[kSeen], const Seen& seen) {
   float most = 0;
-  for (int64_t n = 0; n < kSeen; n++)
+  for (int64_t n = 0; n < seen.count; n++)
     most = std::max(most, by[0][n] * by[0][n] + by[1][n] * by[1][n] + by[2][n] * by[2][n]);
   return std::sqrt(most);
 }
@@ -128,7 +161,7 @@ inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Seen& se
   const int64_t size = job.sizes[0], count = apertura::subapertures(job, 0);
   Leaves leaves{std::vector<Slopes>(size_t(3 * count)), std::vector<float>(size_t(count)), {}};
   leaves.stray_eta = leaves.stray_xi;
-  const float xi = length_of(seen.by_xi), eta = length_of(seen.by_eta);
+  const float xi = length_of(seen.by_xi, seen), eta = length_of(seen.by_eta, seen);
   for (int64_t n = 0; n < count; n++) {
     const int64_t begin = n * size, end = std::min(begin + size, job.pulses) - 1;
     const int64_t pulses[3] = {begin, (begin + end) / 2, end};
@@ -151,19 +184,20 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
   bool holds = true;
   for (int64_t begin = 0; begin < job.pulses; begin += size, nodes += 2) {
     const int64_t end = std::min(begin + size, job.pulses);
-    const Slopes reference = slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
+    const Slopes middle = slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
+    const Reference reference(middle, mixed, seen);
     Band band;
     float stray_xi = 0, stray_eta = 0;
     bool taken = false;
     for (int64_t n = begin / leaf; n * leaf < end; n++) {
       if (tile.way[n * leaf / kTreeGroup] != apertura::kByTree) continue;
       taken = true;
-      for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, mixed);
+      for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, seen);
       stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
     }
     const double more = tile.weight ? kTreeWeighted : 0;
-    const int64_t xi = nodes_for(job, Band::most(band.xi) + stray_xi + more);
-    const int64_t eta = nodes_for(job, Band::most(band.eta) + stray_eta + more);
+    const int64_t xi = nodes_for(job, Band::most(band.xi, seen, 1) + stray_xi + more);
+    const int64_t eta = nodes_for(job, Band::most(band.eta, seen, seen.side) + stray_eta + more);
     holds &= !taken || (xi <= kTreeNodes && eta <= kTreeNodes);
     nodes[0] = uint8_t(std::min(xi, kTreeNodes)), nodes[1] = uint8_t(std::min(eta, kTreeNodes));
   }
@@ -171,10 +205,11 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
 }
 
 inline void plan_tile(const TreeJob& job, TreeTile& tile) {
-  const Seen seen = seen_of(tile);
+  const Seen seen = seen_of(job, tile);
   plan_leaves(job, tile, seen);
   Slopes mixed = slopes_at(shared_legs(job, tile), seen);
-  for (int64_t n = 0; n < kSeen; n++) mixed.xi[n] -= mixed.axis[n % 4], mixed.eta[n] -= mixed.axis[4 + n / 4];
+  for (int64_t n = 0; n < seen.count; n++)
+    mixed.xi[n] -= mixed.axis[n % seen.side], mixed.eta[n] -= mixed.axis[seen.side + n / seen.side];
   const Leaves leaves = leaves_of(job, tile, seen);
   tile.top = -1;
   for (int64_t level = 0; level < job.levels && tile.top == level - 1; level++)

@@ -1,4 +1,4 @@
-// How pulses see a tile: paths to a few places of it, and their slopes. docs/theory/tree.md, "Support".
+// How pulses see a tile: paths to places of it, and their slopes. docs/theory/tree.md, "Support".
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -7,18 +7,25 @@
 
 namespace {
 
-constexpr int64_t kSeen = 16;  // places at which a tile is looked at: 4 x 4, corners included
+constexpr int64_t kSeen = 64;  // places at which a tile is looked at, at most: 8 x 8, corners included
+constexpr int64_t kFew = 4;    // along an axis, of a tile whose band changes little in between; otherwise
+constexpr int64_t kMany = 8;
+constexpr double kNearby = 0.5;  // of the nearest antenna's distance that a plane tile's half diagonal may be for few
+constexpr int64_t kAxes = 2 * kMany;
 
-// Places of a tile and how they move with xi and eta: over the tile, and along its two axes (4 on each; the rest
-// repeats them). Plain arrays of kSeen, which the compiler makes vectors of.
+// Places of a tile and how they move with xi and eta: over the tile, and along its two axes (`side` on each; the rest
+// repeats them). Plain arrays, which the compiler makes vectors of.
 struct Seen {
   alignas(64) float at[4][kSeen], by_xi[3][kSeen], by_eta[3][kSeen];
-  alignas(64) float axis_at[4][kSeen], by_axis[3][kSeen];
-  double radius;  // of the tile
+  alignas(64) float axis_at[4][kAxes], by_axis[3][kAxes];
+  int64_t side, count;  // places along an axis, and of the tile
+  double radius;        // of the tile
   double bend;    // square of half the distance between neighbours: how far the path may dip between them, times 1/R
+  double relief;  // how far the surface leaves straight lines between them, metres of path
 };
 
-inline void put_place(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*at)[kSeen],
+template <int64_t kPlaces>
+inline void put_place(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*at)[kPlaces],
                       int64_t n) {
   double offset[3];
   offset_at(tile, along_xi, along_eta, offset);
@@ -26,48 +33,98 @@ inline void put_place(const TreeTile& tile, const double* along_xi, const double
   for (int64_t axis = 0; axis < 3; axis++) at[axis][n] = float(offset[axis]), at[3][n] += at[axis][n] * at[axis][n];
 }
 
-inline void put_slope(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*by)[kSeen],
+template <int64_t kPlaces>
+inline void put_slope(const TreeTile& tile, const double* along_xi, const double* along_eta, float (*by)[kPlaces],
                       int64_t n) {
   double slope[3];
   offset_at(tile, along_xi, along_eta, slope);
   for (int64_t axis = 0; axis < 3; axis++) by[axis][n] = float(slope[axis] + tile.centre[axis]);
 }
 
-inline Seen seen_of(const TreeTile& tile) {
+// The largest change of slope along xi or eta from place to place, of values at `side` x `side` places.
+inline float bent(const float* value, int64_t side, int64_t step) {
+  float most = 0;
+  for (int64_t n = 0; n < side * side; n++) {
+    const int64_t along = n / step % side;
+    if (along == 0 || along == side - 1) continue;
+    most = std::max(most, 2 * value[n] - value[n - step] - value[n + step]);
+  }
+  return most;
+}
+
+// How far the surface leaves the straight lines between places, both legs of a path: an eighth of its second
+// differences.
+inline double relief_of(const Seen& seen) {
+  double square = 0;
+  for (const auto& axis : {seen.at[0], seen.at[1], seen.at[2]}) {
+    float turned[kSeen];
+    for (int64_t n = 0; n < seen.count; n++) turned[n] = -axis[n];
+    for (const int64_t step : {int64_t(1), seen.side}) {
+      const double most = std::max(bent(axis, seen.side, step), bent(turned, seen.side, step)) / 4;
+      square += most * most;
+    }
+  }
+  return std::sqrt(2 * square);
+}
+
+// Distance of the nearest of a few antennas from a tile's centre.
+inline double nearest_of(const TreeJob& job, const TreeTile& tile) {
+  double nearest = 1e300;
+  for (const int64_t pulse : {int64_t(0), job.pulses / 2, job.pulses - 1}) {
+    const Legs legs = legs_of(job, tile.centre, pulse);
+    nearest = std::min({nearest, double(legs.ranges[0]), double(legs.ranges[1])});
+  }
+  return nearest;
+}
+
+inline Seen seen_by(const TreeTile& tile, int64_t side) {
   Seen seen;
-  double value[5][kTreeDegree + 2], slope[5][kTreeDegree + 2];
-  const double place[5] = {-1, -1. / 3, 1. / 3, 1, 0};
-  for (int64_t n = 0; n < 5; n++) legendre(place[n], tile.degree, value[n], slope[n]);
-  for (int64_t n = 0; n < kSeen; n++) {
-    const int64_t x = n % 4, y = n / 4;
+  seen.side = side, seen.count = side * side;
+  double value[kMany + 1][kTreeDegree + 2], slope[kMany + 1][kTreeDegree + 2];
+  for (int64_t n = 0; n <= side; n++)
+    legendre(n < side ? 2.0 * double(n) / double(side - 1) - 1 : 0, tile.degree, value[n], slope[n]);
+  for (int64_t n = 0; n < seen.count; n++) {
+    const int64_t x = n % side, y = n / side;
     put_place(tile, value[x], value[y], seen.at, n);
     put_slope(tile, slope[x], value[y], seen.by_xi, n), put_slope(tile, value[x], slope[y], seen.by_eta, n);
-    // Lanes 0 … 3 lie along xi, 4 … 7 along eta.
-    const bool xi = n % 8 < 4;
-    put_place(tile, xi ? value[x] : value[4], xi ? value[4] : value[x], seen.axis_at, n);
-    put_slope(tile, xi ? slope[x] : value[4], xi ? value[4] : slope[x], seen.by_axis, n);
+  }
+  for (int64_t n = 0; n < kAxes; n++) {  // lanes 0 ... side - 1 lie along xi, the next along eta
+    const int64_t x = n % side;
+    const bool xi = n / side % 2 == 0;
+    put_place(tile, xi ? value[x] : value[side], xi ? value[side] : value[x], seen.axis_at, n);
+    put_slope(tile, xi ? slope[x] : value[side], xi ? value[side] : slope[x], seen.by_axis, n);
   }
   double xi2 = 0, eta2 = 0;
+  const int64_t middle = (side / 2 - 1) * (side + 1);
   for (int64_t axis = 0; axis < 3; axis++)
-    xi2 += seen.by_xi[axis][5] * seen.by_xi[axis][5], eta2 += seen.by_eta[axis][5] * seen.by_eta[axis][5];
-  seen.bend = (xi2 + eta2) / 9, seen.radius = std::sqrt(xi2 + eta2);
+    xi2 += seen.by_xi[axis][middle] * seen.by_xi[axis][middle],
+        eta2 += seen.by_eta[axis][middle] * seen.by_eta[axis][middle];
+  seen.bend = (xi2 + eta2) / double((side - 1) * (side - 1)), seen.radius = std::sqrt(xi2 + eta2);
+  seen.relief = tile.degree > 1 ? relief_of(seen) : 0;
   return seen;
+}
+
+// What the band does between few places is told by their second differences where it changes slowly; more places are
+// looked at where the surface bends, and near an antenna, where the band may peak within the tile.
+inline Seen seen_of(const TreeJob& job, const TreeTile& tile) {
+  const Seen seen = seen_by(tile, kFew);
+  return tile.degree > 1 || seen.radius > kNearby * nearest_of(job, tile) ? seen_by(tile, kMany) : seen;
 }
 
 // Derivatives of the path along xi and eta over the tile, and along its axes, metres per half tile.
 struct Slopes {
-  alignas(64) float xi[kSeen], eta[kSeen], axis[kSeen];
+  alignas(64) float xi[kSeen], eta[kSeen], axis[kAxes];
 };
 
 inline void add_slopes(const float* w, float square, const Seen& seen, Slopes& out) {
-  for (int64_t n = 0; n < kSeen; n++) {
+  for (int64_t n = 0; n < seen.count; n++) {
     const float x = seen.at[0][n], y = seen.at[1][n], z = seen.at[2][n];
     const float inverse = 1 / __builtin_sqrtf(seen.at[3][n] + square + x * w[0] + y * w[1] + z * w[2]);
     const float a = (x + .5f * w[0]) * inverse, b = (y + .5f * w[1]) * inverse, c = (z + .5f * w[2]) * inverse;
     out.xi[n] += a * seen.by_xi[0][n] + b * seen.by_xi[1][n] + c * seen.by_xi[2][n];
     out.eta[n] += a * seen.by_eta[0][n] + b * seen.by_eta[1][n] + c * seen.by_eta[2][n];
   }
-  for (int64_t n = 0; n < kSeen; n++) {
+  for (int64_t n = 0; n < kAxes; n++) {
     const float x = seen.axis_at[0][n], y = seen.axis_at[1][n], z = seen.axis_at[2][n];
     const float inverse = 1 / __builtin_sqrtf(seen.axis_at[3][n] + square + x * w[0] + y * w[1] + z * w[2]);
     out.axis[n] += inverse * ((x + .5f * w[0]) * seen.by_axis[0][n] + (y + .5f * w[1]) * seen.by_axis[1][n] +
@@ -89,14 +146,17 @@ struct Reach {
 
 inline Reach reach_of(const Legs& legs, const Seen& seen) {
   Reach out;
-  for (int64_t n = 0; n < kSeen; n += kLanes)
+  for (int64_t n = 0; n < seen.count; n += kLanes)
     store(out.further + n,
           path(legs, load(seen.at[0] + n), load(seen.at[1] + n), load(seen.at[2] + n), load(seen.at[3] + n)));
   float least = 0, most = 0;
-  for (const float r : out.further) least = r >= least ? least : r, most = r <= most ? most : r;  // no number stays
+  for (int64_t n = 0; n < seen.count; n++) {
+    const float r = out.further[n];
+    least = r >= least ? least : r, most = r <= most ? most : r;  // no number stays
+  }
   // Paths are convex over a plane: none is longer than at a corner, and none much shorter than at the nearest place.
   const double dip = 0.5 * seen.bend * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
-  out.low = least - dip - 1e-3, out.high = most + 1e-3;
+  out.low = least - dip - seen.relief - 1e-3, out.high = most + seen.relief + 1e-3;
   return out;
 }
 

@@ -66,9 +66,10 @@ class Chunk:
         ways: list[NDArray[np.uint8]] = []
         structs: list[TreeTile] = []
         for tile in tiles:
-            weight, way = self._weighed(tile)
+            weight, way, fewer = self._weighed(tile)
             ways.append(way)
-            structs.append(self._struct(tile, weight, way))
+            self._fewer.append(fewer)
+            structs.append(self._struct(tile, weight, way, fewer))
         array = (TreeTile * len(structs))(*structs)
         job = self._job(array)
         call("apertura_plan_tree", job)
@@ -83,21 +84,21 @@ class Chunk:
         self._held.append(array)
         return array.ctypes.data
 
-    def _weighed(self, tile: Tile) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8]]:
+    def _weighed(self, tile: Tile) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8], NDArray[np.uint8]]:
         groups = -(-len(self.trees) // TREE_GROUP)
         if not tile.by_tree:
-            return None, np.full(groups, DIRECTLY, np.uint8)
+            return None, np.full(groups, DIRECTLY, np.uint8), np.zeros(groups, np.uint8)
         if self.beams is None:
-            return None, np.full(groups, BY_TREE, np.uint8)
+            return None, np.full(groups, BY_TREE, np.uint8), np.zeros(groups, np.uint8)
         return weights_over(self.beams, self.trees.profiles.aperture, tile.surface, self.nodes_db)
 
-    def _struct(self, tile: Tile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8]) -> TreeTile:
+    def _struct(
+        self, tile: Tile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]
+    ) -> TreeTile:
         rows, columns = tile.window
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
         counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
-        fewer = np.zeros(len(way), np.uint8)
         self._counts.append(counts)
-        self._fewer.append(fewer)
         struct = TreeTile(
             surface=self._hold(np.ascontiguousarray(surface.coefficients)),
             pixels=self.pixels.ctypes.data + 24 * at,
@@ -174,7 +175,7 @@ class Chunk:
             at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
             places[slot] = self._hold(np.ascontiguousarray(at))
         presum = np.zeros(TREE_FEWER + 1, np.uintp)
-        for fewer in {int(n) for counts in self._fewer for n in counts if n}:
+        for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
             presum[fewer] = self._hold(np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T))
             places[fewer] = self._hold(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
         job.places, job.spread, job.mix, job.presum = map(self._hold, (places, spread, mix, presum))

@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.native_structs import TREE_DELAYS
@@ -26,6 +28,7 @@ SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 
 _TILES, _CHUNKS_SEEN = 5, 3  # that are looked at
 _FLOAT32_DB = -92.0
+_FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
 # Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
 _NODE_S = 1.4e-9  # a node that looks a pulse up
@@ -36,10 +39,11 @@ _PIXEL_S = 4.4e-9  # a pixel of a subaperture's
 _LEAF_S = 1.2e-5  # a leaf over a tile: its plan
 _SURFACE_S = 1.3e-8  # a pixel's place, fitted
 _TILE_S = 6.5e-5  # a tile of a chunk
-_DIRECT_S = 2.8e-10  # a pixel and pulse that go directly
+_APART = 1.1  # times as long as in one go for pixels and pulses that go directly, tile by tile and chunk by chunk
 _WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
 _PLAIN = 2.0  # times as long where each pulse goes for itself: its cells are many
 _FORM_S = 4e-4  # a block of pixels
+_SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
 
@@ -51,6 +55,12 @@ class _Seen:
     looks: tuple[tuple[Looks, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
 
+    @property
+    def phase_rad(self) -> float:
+        """RMS over them, of places of a tile against its centre."""
+        phases = [look.phase_rad for looks in self.looks for look in looks]
+        return float(np.sqrt(np.mean(np.square(phases)))) if phases else 1.0
+
 
 def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield settings of trees, as `apertura.focus.engines.engine.Engine` describes.
@@ -59,20 +69,20 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     -----
     Source: docs/theory/tree.md, "Error" and "Cost".
     """
-    for side_px in asked_or(asked, "side_px", SIDES_PX):
-        for chunk in asked_or(asked, "chunk", CHUNKS):
-            if (side_px, chunk) != (SIDES_PX[0], CHUNKS[0]) and _larger_than_job(job, pulses, side_px, chunk):
-                continue
-            seen = _seen(job, pulses, side_px, chunk)
-            for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
-                oversampling, taps = SETTINGS[nodes_db]
-                oversampling = asked.get("oversampling") or oversampling
-                yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
+    for side_px, chunk in _cuts(job, pulses, asked):
+        seen = _seen(job, pulses, side_px, chunk)
+        for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
+            oversampling, taps = SETTINGS[nodes_db]
+            oversampling = asked.get("oversampling") or oversampling
+            yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
 
 
-def _larger_than_job(job: Job, pulses: int, side_px: int, chunk: int) -> bool:
-    """Return whether a smaller side or chunk already takes all there is."""
-    return side_px >= 2 * min(job.tile_px, max(job.shape)) or chunk >= 8 * max(pulses, LEAF)
+def _cuts(job: Job, pulses: int, asked: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """Return sides of tiles and pulses of chunks to look at; one where the job is not worth a look at more."""
+    cuts = list(product(asked_or(asked, "side_px", SIDES_PX), asked_or(asked, "chunk", CHUNKS)))
+    most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
+    fitting = [(side, chunk) for side, chunk in cuts if side < most_px and chunk < most_pulses] or cuts[:1]
+    return fitting if job.pixels * pulses > _SMALL else fitting[-1:]
 
 
 @dataclass(frozen=True)
@@ -132,11 +142,13 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
         signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
     )
     table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
-    error_db = power_sum_db(table_db, nodes_db + 10 * np.log10(2 * len(sizes) + 1), _FLOAT32_DB)
-    seconds, directly = _seconds(job, seen, pulses, options)
-    tables = 8 * pulses * signal.samples
-    if directly:
-        tables += int(24 * pulses * signal.samples * DIRECTLY_AT[nodes_db].oversampling / signal.oversampling)
+    error_db = power_sum_db(
+        table_db, nodes_db + 10 * np.log10(2 * len(sizes) + 1), _FLOAT32_DB, 20 * np.log10(_FLOAT32 * seen.phase_rad)
+    )
+    asked = {"degree": 2, **DIRECTLY_AT[nodes_db]._asdict()}
+    direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
+    direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
+    seconds, directly = _seconds(job, seen, pulses, options, direct_s)
     nodes = f"interpolation between nodes errs by {nodes_db} dB at each of {len(sizes)} levels"
     return Setting(
         "tree",
@@ -144,8 +156,8 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
         {"nodes_db": nodes_db, "side_px": options.side_px, "chunk": options.chunk},
         error_db,
         seconds,
-        table_seconds=_START_S,
-        table_bytes=tables,
+        table_seconds=_START_S + (direct.table_seconds if directly else 0.0),
+        table_bytes=8 * pulses * signal.samples + (direct.table_bytes if directly else 0),
         reasons={
             "oversampling": f"table errs by {table_db:.1f} dB",
             "taps": "of the table's filters",
@@ -156,8 +168,8 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
     )
 
 
-def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options) -> tuple[float, float]:
-    """Return the seconds of the whole image, and the part of it that goes directly."""
+def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float) -> tuple[float, float]:
+    """Return the seconds of the whole image, and the part of it that goes directly, `direct_s` a pixel and pulse."""
     side = min(options.side_px, job.tile_px, *job.shape)
     chunks = -(-pulses // options.chunk)
     limit = 10 ** (options.nodes_db / 20)
@@ -167,14 +179,17 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options) -> tuple[flo
     for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
         here = next(looks) if np.isfinite(surface.rough_m) else ()
         if not rough <= 2 * limit**2:
-            spent.append(pulses * side**2 * _DIRECT_S)
+            spent.append(pulses * side**2 * direct_s)
             directly.append(1.0)
             continue
         for one in here:
             counts = counts_of(one, options.nodes_db, smooth_rad=2 * limit, weighted=job.beams is not None)
+            directly.append(float(not counts.nodes))
+            if not counts.nodes:
+                spent.append(pulses * side**2 * direct_s)
+                continue
             amounts = features(one, counts, options, job.signal, _Work(min(pulses, options.chunk), side))
             spent.append(chunks * sum(cost * amount for cost, amount in amounts))
-            directly.append(float(not counts.nodes))
     tiles = job.pixels / side**2
     whole = job.share * tiles * float(np.mean(spent)) + _SURFACE_S * job.pixels + _FORM_S * job.tiles
     return whole + job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S, float(np.mean(directly))
@@ -183,9 +198,7 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options) -> tuple[flo
 def features(
     looks: Looks, counts: Counts, options: _Options, signal: Signal, work: "_Work"
 ) -> list[tuple[float, float]]:
-    """Return what one tile and one chunk take: seconds each, and how many."""
-    if not counts.nodes:
-        return [(_DIRECT_S, work.pulses * work.side**2)]
+    """Return what one tile and one chunk take by tree: seconds each, and how many."""
     leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
     samples = looks.span_m / signal.step_m + 6
     looked_up = leaves[0] * counts.fewer if counts.fewer else _PLAIN * work.pulses

@@ -14,7 +14,9 @@ from apertura.focus.engines.tree_nodes import MOST_NODES, supports
 from apertura.focus.engines.tree_surface import Surface
 from apertura.geometry.aperture import Aperture
 
-_SEEN = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
+_FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
+_NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
+_AIRY = 2.0  # units of eq. 4b
 _SPREAD = 4  # pulses that a curve takes beyond its degree: native/tree_plan.hpp, kTreeMore
 _WEIGHTED = 1.5  # rad that weights add to a band: native/tree_job.hpp
 _LOOKED_AT = 3  # subapertures of a level, at most
@@ -34,12 +36,15 @@ class Looks:
         (curve,) RMS phase by which pulses leave curves of growing degree.
     span_m
         Total path across the tile.
+    phase_rad
+        RMS phase of its places against its centre.
     """
 
     bands_rad: tuple[NDArray[np.float64], ...]
     turn_rad: float
     rough_rad: NDArray[np.float64]
     span_m: float
+    phase_rad: float
 
 
 def look(
@@ -63,10 +68,11 @@ def look(
     Source: docs/theory/tree.md, eq. 4.
     """
     k, b = wavenumber_rad_m, band_rad_m
-    slopes = _Slopes(surface)
+    slopes = _slopes(aperture, surface)
     middle = len(aperture) // 2
     here, axes = slopes.of(aperture[middle : middle + 1])
     mixed = here - axes
+    phase_rad = k * float(np.sqrt((here**2).mean(axis=(0, 2, 3)).sum() / 3))
     bands: list[NDArray[np.float64]] = []
     for size in sizes:
         starts, most = np.arange(0, len(aperture), size), np.zeros(2)
@@ -76,10 +82,47 @@ def look(
             here, _ = slopes.of(part[some])
             _, reference = slopes.of(part[(len(part) - 1) // 2 : (len(part) - 1) // 2 + 1])
             width = k * np.abs(here - reference - mixed) + b * np.abs(here)
-            most = np.maximum(most, width.max(axis=(0, 2, 3)))
+            most = np.maximum(most, highest(width.max(axis=0)))
         bands.append(most)
     turn, rough = _leaf(aperture, slopes, k + b)
-    return Looks(tuple(bands), turn, rough, 2 * float(np.abs(here).sum(axis=1).max()))
+    return Looks(tuple(bands), turn, rough, 2 * float(np.abs(here).sum(axis=1).max()), phase_rad)
+
+
+def highest(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the widest bands along columns and rows of any place, (2,), from those at some places, (2, row, column).
+
+    Where one peaks between places a parabola tells how high; along its own axis such a peak has content beyond it.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 4b.
+
+    Examples
+    --------
+    >>> flat = np.tile([1.0, 5.0, 5.0, 1.0], (4, 1))
+    >>> highest(np.stack([flat, flat])).round(2)
+    array([8.8, 5.5])
+    """
+    most = band_rad.copy()
+    units = (band_rad.shape[-1] - 1) ** 2 / 8
+    for axis in (-1, -2):
+        middle, rows = np.moveaxis(band_rad, axis, -1)[..., 1:-1], np.moveaxis(most, axis, -1)[..., 1:-1]
+        before, behind = (np.moveaxis(band_rad, axis, -1)[..., part] for part in (slice(-2), slice(2, None)))
+        second = 2 * middle - before - behind
+        peaks = (second > 0) & (np.abs(behind - before) <= 2 * second)
+        second = np.where(peaks, second, np.inf)
+        rows += (behind - before) ** 2 / (8 * second)
+        own = 0 if axis == -1 else 1
+        rows[own] += _AIRY * np.cbrt(np.where(peaks, second, 0.0)[own] * units)
+    return np.asarray(most.max(axis=(1, 2)))
+
+
+def _slopes(aperture: Aperture, surface: Surface) -> "_Slopes":
+    """Return slopes at few places, or at many where the surface bends or an antenna is near."""
+    few = _Slopes(surface, _FEW)
+    three = aperture[np.array([0, len(aperture) // 2, len(aperture) - 1])]
+    nearest = min(float(np.linalg.norm(leg - surface.centre_m, axis=1).min()) for leg in three.legs)
+    return _Slopes(surface, _MANY) if len(surface.coefficients) > 2 or few.radius_m > _NEARBY * nearest else few
 
 
 def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tuple[float, NDArray[np.float64]]:
@@ -100,27 +143,28 @@ def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tup
 class _Slopes:
     """Derivatives of paths along the columns and rows of a tile."""
 
-    def __init__(self, surface: Surface):
-        degree = len(surface.coefficients) - 1
-        basis = np.polynomial.legendre.legvander(np.append(_SEEN, 0.0), degree)
-        rate = np.stack([_derivative(np.append(_SEEN, 0.0), n) for n in range(degree + 1)], -1)
+    def __init__(self, surface: Surface, side: int):
+        degree, self._side = len(surface.coefficients) - 1, side
+        seen = np.append(np.linspace(-1, 1, side), 0.0)
+        basis = np.polynomial.legendre.legvander(seen, degree)
+        rate = np.stack([_derivative(seen, n) for n in range(degree + 1)], -1)
 
         def at(eta: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.asarray(np.einsum("ia,abk,jb->ijk", eta, surface.coefficients, xi))
 
         self.centre_m = surface.centre_m
         places, along, across = at(basis, basis), at(basis, rate), at(rate, basis)
-        self.places_m = places[:4, :4].reshape(-1, 3)
+        self.places_m = places[:side, :side].reshape(-1, 3)
         self._places_m, self._tangents = places, np.stack([along, across])
-        self.radius_m = float(np.sqrt((along[4, 4] ** 2 + across[4, 4] ** 2).sum()))
+        self.radius_m = float(np.sqrt((along[side, side] ** 2 + across[side, side] ** 2).sum()))
 
     def of(self, aperture: Aperture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return them over the tile, and along its two axes: (pulse, 2, row, column) metres per half tile."""
-        gradient = aperture.path_gradient(self._places_m)
+        side, gradient = self._side, aperture.path_gradient(self._places_m)
         slope = np.stack([(gradient * tangent).sum(-1) for tangent in self._tangents], 1)
-        axes = np.empty_like(slope[:, :, :4, :4])
-        axes[:, 0], axes[:, 1] = slope[:, 0, 4:, :4], slope[:, 1, :4, 4:]
-        return slope[:, :, :4, :4], axes
+        axes = np.empty_like(slope[:, :, :side, :side])
+        axes[:, 0], axes[:, 1] = slope[:, 0, side:, :side], slope[:, 1, :side, side:]
+        return slope[:, :, :side, :side], axes
 
 
 def _derivative(place: NDArray[np.float64], order: int) -> NDArray[np.float64]:

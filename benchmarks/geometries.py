@@ -1,0 +1,169 @@
+"""Error of the tree in random geometries: `python benchmarks/geometries.py` writes benchmarks/geometries.csv.
+
+Range 30 m to 10 km, aperture up to the range, spacing from an eighth of a wavelength to 1 m, 0.4 to 10 GHz; straight,
+wobbling and circular tracks with and without jitter, one node or two, flat, tilted and rolling ground. Each is planned
+for -60 dB with every engine free, then formed by the tree as the planner sets it for that. Echoes are noise and
+scatterers of a flat band; the truth is their sum in float64 over pulses and frequencies at random pixels.
+"""
+
+import argparse
+import csv
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from drawn import Geometry, draw
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.focus.engines import tree
+from apertura.focus.inputs import Profiles
+from apertura.focus.job import Job, Signal
+from apertura.planning.planner import make_plan
+from apertura.quality.error_bound import error_bound
+
+AIM_DB = -60.0
+LINES, GUARD, SCATTERERS, CHECKED = 128, 32, 200, 400
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one geometry."""
+
+    planned: str
+    nodes_db: int
+    side_px: int
+    chunk: int
+    by_tree: float  # shares of pixels × pulses
+    directly: float
+    predicted_db: float
+    measured_db: float
+    bound_db: float
+
+    @property
+    def failure(self) -> str:
+        """What is wrong, in a few words; nothing if nothing is."""
+        missed = ["certified worse than asked"] if self.bound_db > AIM_DB else []
+        worse = ["worse than predicted"] if self.measured_db > self.predicted_db + 3 else []
+        return ", ".join(missed + worse)
+
+
+def frequencies(geometry: Geometry) -> NDArray[np.float64]:
+    """Return the lines of the band, those of the centre frequency between the middle two."""
+    return geometry.carrier_hz + geometry.bandwidth_hz / LINES * (np.arange(LINES) - (LINES - 1) / 2)
+
+
+def echo(geometry: Geometry, generator: np.random.Generator) -> NDArray[np.complex128]:
+    """Return (pulse, line) noise, and a tenth of its power from scatterers among the pixels."""
+    shape = geometry.pulses, LINES
+    lines = np.sqrt(0.5) * (generator.standard_normal(shape) + 1j * generator.standard_normal(shape))
+    flat = geometry.pixels.reshape(-1, 3)
+    paths = geometry.aperture.path(flat[generator.integers(0, len(flat), SCATTERERS)])
+    first, *_, last = -2j * np.pi * frequencies(geometry) / C
+    for path in paths.T:
+        turn, step = np.exp(first * path), np.exp((last - first) / (LINES - 1) * path)
+        lines += np.sqrt(0.1 / SCATTERERS) * turn[:, None] * step[:, None] ** np.arange(LINES)
+    return np.asarray(lines)
+
+
+def profiles_of(geometry: Geometry, lines: NDArray[np.complex128]) -> Profiles:
+    """Return exact samples of the band-limited echo over all pixels and a guard; lines repeat beyond their period."""
+    step_m, some = geometry.step_m, geometry.pixels[:: max(1, geometry.rows // 32), :: max(1, geometry.columns // 32)]
+    edges = (geometry.pixels[edge].reshape(-1, 3) for edge in (0, -1, np.s_[:, 0], np.s_[:, -1]))
+    paths = geometry.aperture.path(np.concatenate([some.reshape(-1, 3), *edges]))
+    start = paths.min(1) - GUARD * step_m
+    length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
+    turned = lines * np.exp(2j * np.pi * start[:, None] / C * (frequencies(geometry) - geometry.carrier_hz))
+    period, at = np.fft.ifft(turned, 2 * LINES, axis=1) * 2 * LINES, np.arange(length)
+    samples = period[:, at % (2 * LINES)] * np.exp(-1j * np.pi * (LINES - 1) / (2 * LINES) * at)
+    return Profiles(samples.astype(np.complex64), start, step_m, geometry.carrier_hz, 2.0, geometry.aperture)
+
+
+def exact(geometry: Geometry, lines: NDArray[np.complex128], places: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the double sum at (place, 3), float64."""
+    frequency, image = frequencies(geometry), np.zeros(len(places), np.complex128)
+    for first in range(0, geometry.pulses, 50):
+        some = slice(first, first + 50)
+        delay = 2 * np.pi / C * geometry.aperture[some].path(places)
+        step, value = np.exp(1j * delay * (frequency[1] - frequency[0])), np.zeros(delay.shape, complex)
+        for line in lines[some].T[::-1]:
+            value *= step
+            value += line[:, None]
+        image += (value * np.exp(1j * delay * frequency[0])).sum(0)
+    return image
+
+
+def job_of(geometry: Geometry, profiles: Profiles) -> Job:
+    """Return what the planner is told."""
+    shape = geometry.rows, geometry.columns
+    at = np.ix_(*(np.linspace(0, size - 1, 5).astype(int) for size in shape))
+    windows = [
+        tuple(slice(at, at + min(256, size)) for at, size in zip(corner, shape, strict=True))
+        for corner in ((0, 0), (shape[0] - min(256, shape[0]), shape[1] - min(256, shape[1])))
+    ]
+    signal = Signal(geometry.carrier_hz, 2.0, profiles.step_m, profiles.samples.shape[1])
+    return Job(
+        geometry.aperture, geometry.pixels[at], shape, geometry.spacing_m, geometry.carrier_hz, geometry.bandwidth_hz,
+        LINES, signal, frame="local", tile_px=512, recorded=False,
+        patches_on=lambda _: tuple(geometry.pixels[window] for window in windows),
+    )  # fmt: skip
+
+
+def measure(geometry: Geometry, **options: int) -> Outcome:
+    """Plan and form one geometry, with options of the tree where they are given, and hold it against the exact sum."""
+    generator = np.random.default_rng([16, geometry.seed])
+    lines = echo(geometry, generator)
+    profiles = profiles_of(geometry, lines)
+    job = job_of(geometry, profiles)
+    planned = make_plan(job, accuracy_db=AIM_DB).engine
+    setting = make_plan(
+        job, accuracy_db=AIM_DB, overrides={"engine": "tree", "presum": 1, "engine_options": {"tree": options}}
+    ).setting
+    counts = np.zeros(3, np.int64)
+    image = tree.form(
+        tree.prepare(profiles, **setting.options), geometry.pixels, counts=counts, **setting.form_options
+    ).ravel()
+    checked = generator.choice(image.size, CHECKED, replace=False)
+    truth = exact(geometry, lines, geometry.pixels.reshape(-1, 3)[checked])
+    power = float((np.abs(image.astype(np.complex128)) ** 2).sum())
+    bound = error_bound(image[checked], truth, np.full(CHECKED, CHECKED / image.size), power=power)
+    wrong = np.abs(image[checked] - truth) ** 2
+    shares = counts / counts.sum()
+    return Outcome(
+        planned, *(setting.form_options[name] for name in ("nodes_db", "side_px", "chunk")), *shares[:2].tolist(),
+        setting.error_db, float(10 * np.log10(wrong.sum() / (np.abs(truth) ** 2).sum())), bound.bound_db,
+    )  # fmt: skip
+
+
+def row_of(geometry: Geometry, outcome: Outcome) -> dict[str, str]:
+    """Return what the table says of one geometry."""
+    names = [f.name for f in fields(geometry) if f.repr] + [f.name for f in fields(outcome)]
+    values = [getattr(geometry, f.name) for f in fields(geometry) if f.repr] + list(astuple(outcome))
+    row = {n: f"{v:.4g}" if isinstance(v, float) else str(v) for n, v in zip(names, values, strict=True)}
+    return row | {"failure": outcome.failure}
+
+
+def main() -> None:
+    """Measure all, save the table and say which failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", nargs=2, type=int, default=(0, 60), metavar=("FIRST", "END"))
+    for name in ("nodes_db", "side_px", "chunk"):
+        parser.add_argument(f"--{name}", type=int, help="of the tree; by default the planner's")
+    parser.add_argument("--table", type=Path, default=Path(__file__).with_suffix(".csv"))
+    arguments = parser.parse_args()
+    options = {name: getattr(arguments, name) for name in ("nodes_db", "side_px", "chunk")}
+    rows = []
+    for seed in range(*arguments.seeds):
+        geometry = draw(seed)
+        rows.append(row_of(geometry, measure(geometry, **options)))
+        print(*rows[-1].values(), sep="\t", flush=True)
+    with arguments.table.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+    failed = [row for row in rows if row["failure"]]
+    print(f"{len(rows)} geometries, {len(failed)} failed", *(f"{r['seed']}: {r['failure']}" for r in failed), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
