@@ -42,6 +42,8 @@ class Contestant:
         Asked for; None where nothing can be asked.
     from_echoes
         Whether range compression is inside.
+    ways
+        Way that pixels × pulses went, where an engine has several → how many, in the last run.
     planning_s
         CPU seconds of our planner, which count in no others; fastsar plans inside `run`.
     """
@@ -54,6 +56,7 @@ class Contestant:
     aim_db: float | None = None
     from_echoes: bool = False
     planning_s: float = 0.0
+    ways: dict[str, int] = field(default_factory=dict)
     shared: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     error_db: float = np.nan
@@ -89,6 +92,7 @@ class Contestant:
             "spread": [_digits(found(self.seconds) + echoes - seconds) for found in (min, max)],
             "planning_seconds": _digits(self.planning_s),
             "pixel_pulses_per_s": _digits(size**2 * pulses / echoes),
+            "ways": {way: _digits(count / max(1, sum(self.ways.values()))) for way, count in self.ways.items()},
             "error_db": round(self.error_db, 1),
             "scaled": self.share < 1,
             "share": _digits(self.share),
@@ -151,7 +155,12 @@ class House:
         windows = _formed(self.scene, setting.form_seconds, limit_s, fields=fields)
         module, ground, grid = load_engine(engine), plan.terrain, self.scene.grid
 
+        ways: tuple[str, ...] = getattr(module, "WAYS", ())
+        went: dict[str, int] = {}
+
         def run() -> tuple[Image, float, float]:
+            counts = np.zeros(len(ways), np.int64)
+            counted = {"counts": counts} if ways else {}
             image = np.zeros(grid.shape, np.complex64)
             begin, pixels_s = time.process_time(), 0.0
             given = inputs(self.profiles)
@@ -163,13 +172,14 @@ class House:
                 for window in windows:
                     places = ground.positions(grid[window])
                     begin = time.process_time()
-                    image[window] += module.form(tables, places, **setting.form_options)
+                    image[window] += module.form(tables, places, **setting.form_options, **counted)
                     pixels_s += time.process_time() - begin
+            went.update(zip(ways, counts.tolist(), strict=True))
             return image[*self.scene.checks], shared_s, pixels_s
 
         line = setting.line + (f", presum {plan.presum.factor}" if plan.presum else "")
         share = share_of(self.scene, windows)
-        return Contestant(engine, line, self.scene, run, share, aim_db, planning_s=planning_s)
+        return Contestant(engine, line, self.scene, run, share, aim_db, planning_s=planning_s, ways=went)
 
 
 def share_of(scene: Scene, windows: Iterable[Window]) -> float:

@@ -42,11 +42,16 @@ def exponents(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def _directly(row: Row) -> str:
+    directly = (row.get("ways") or {}).get("directly")
+    return "" if directly is None else f", {directly:.0%}"
+
+
 def markdown(rows: list[Row]) -> str:
     """Return all rows as a table, ratios against native at −60 dB of the same scene: from profiles and from echoes."""
     lines = [
         "| image × pulses | geometry, ground | contestant | setting | seconds | from echoes | least … most "
-        "| × native −60, from echoes | 10⁹ pixel·pulses/s | error dB | share, rounds, load |",
+        "| × native −60, from echoes | 10⁹ pixel·pulses/s | error dB | share, rounds, load, directly |",
         "|---" * 11 + "|",
     ]
     scenes: dict[tuple[Any, ...], list[Row]] = {}
@@ -64,7 +69,7 @@ def markdown(rows: list[Row]) -> str:
                 row["setting"], seconds, f"{row['seconds_from_echoes']:.3g}",
                 f"{row['spread'][0]:.3g} … {row['spread'][1]:.3g}", ratio,
                 f"{row['pixel_pulses_per_s'] / 1e9:.3g}", f"{row['error_db']:.1f}",
-                f"{row['share']:.2g}, {row['rounds']}, {row['load']}",
+                f"{row['share']:.2g}, {row['rounds']}, {row['load']}{_directly(row)}",
             )  # fmt: skip
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
