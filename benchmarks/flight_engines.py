@@ -1,10 +1,10 @@
 """A whole flight imaged by several engines: minutes of one thread, and the error of each against the double sum.
 
-``python benchmarks/flight_engines.py WORK/flight_10min --engines native tree`` images one pair of a campaign whose echo
-and profile are there, as `python benchmarks/flight.py WORK --minutes 10 --only ingest echo profile` leaves it. Engines
-take turns; with ``--every 8`` one tile in eight stands for all, and its seconds, those of
-tables too, are told times eight. Errors are RMS at
-random pixels over the RMS of what was imaged.
+``python benchmarks/flight_engines.py WORK/flight_10min --engines native tree`` images one pair of a campaign that has
+its echo, profile and tracks, as `flight.py WORK --minutes 10 --only ingest echo scene profile refine` leaves it; three
+minutes are enough for the same image. With ``--every 8`` one tile in eight stands for all, and its seconds, those of
+tables too, are told times eight. Errors are RMS at random pixels over the RMS of what was imaged; shares of
+pixels × pulses say which way they went.
 """
 
 import os
