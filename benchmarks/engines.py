@@ -3,7 +3,8 @@
 Seconds are the median over rounds of the process's CPU time, since other work on the machine stretches the wall
 clock; rounds visit all contestants in turn, so that a slow minute hits each of them. Two threads count the CPU time of
 the busier one, which is the wall clock of an idle machine. Tables are a row of their own; fastsar compresses within
-its call, so its own compression is timed too and taken off. Prints a table and writes benchmarks/latest.json.
+its call, so its own compression is timed too and taken off. Prints a table and puts its rows into
+benchmarks/latest.json.
 """
 
 import os
@@ -12,17 +13,16 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 
 import argparse
 import importlib.util
-import json
 import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectra, turned
+from latest import replace_rows
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.echo.compression import compress, window_weights
@@ -225,7 +225,7 @@ def main() -> None:
         )
         line += " " * 17 if rate is None else f"{rate:>12.3g} pp/s"
         print(line + ("" if error is None else f"{error:>8.1f} dB"))
-    Path(__file__).with_name("latest.json").write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n")
+    replace_rows(table, lambda row: "group" not in row)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,102 @@
+"""A whole flight imaged by several engines: minutes of one thread, and the error of each against the double sum.
+
+``python benchmarks/flight_engines.py WORK/flight_10min --engines native tree`` images one pair of a campaign that has
+its echo, profile and tracks, as `flight.py WORK --minutes 10 --only ingest echo scene profile refine` leaves it; three
+minutes are enough for the same image. With ``--every 8`` one tile in eight stands for all, and its seconds, those of
+tables too, are told times eight. Errors are RMS at random pixels over the RMS of what was imaged; shares of
+pixels × pulses say which way they went.
+"""
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+import argparse
+import contextlib
+import io
+import time
+from pathlib import Path
+
+import numpy as np
+
+from apertura.campaign import Campaign
+from apertura.contracts import Window
+from apertura.focus.engines import ENGINES, load_engine
+from apertura.focus.tiles import compute_tiles
+from apertura.imaging.formation import Formation
+from apertura.imaging.stages import profiles_of
+from apertura.load.pair import open_pair
+from apertura.load.plan import job_of
+from apertura.load.refined import open_refined
+from apertura.load.scene import open_scene
+from apertura.planning.planner import make_plan
+from apertura.quality.error_check import random_pixels
+from apertura.store import open_stage
+
+FLIGHT = "f01"
+
+
+def main() -> None:
+    """Image, compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("campaign", type=Path)
+    parser.add_argument("--pair", default="uav1-uav2")
+    parser.add_argument("--engines", nargs="+", default=["native", "tree"])
+    parser.add_argument("--aims", type=float, nargs="+", default=[-60.0], help="accuracy asked, dB")
+    parser.add_argument("--every", type=int, default=1, help="one tile in so many")
+    parser.add_argument("--checks", type=int, default=600)
+    asked = parser.parse_args()
+    for name in set(asked.engines) - {name for name in ENGINES if load_engine(name).available()}:
+        print(f"without {name}: no engine of this version, or not built here")
+    engines = [name for name in asked.engines if name in ENGINES and load_engine(name).available()]
+    begin = time.process_time()
+    forms = formations(Campaign.load(asked.campaign), asked.pair, engines, asked.aims)
+    print(f"opened and planned {len(forms)} images in {time.process_time() - begin:.0f} CPU s")
+    windows = chosen(forms[0], asked.every)
+    pixels = random_pixels(windows, asked.checks, np.random.default_rng(7))
+    exact = forms[0].exact(pixels)
+    print(f"{len(windows)} of {len(forms[0].windows)} tiles, {len(forms[0].profiles)} pulses", end=", ")
+    print(f"load {os.getloadavg()[0]:.1f}")
+    for formation in forms:
+        image = np.zeros(formation.grid.shape, np.complex64)
+        begin, wall = time.process_time(), time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()):
+            compute_tiles(formation.image, windows, image, threads=1)
+        spent, wall = time.process_time() - begin, time.perf_counter() - wall
+        wrong = np.nan_to_num(image[*pixels.T]) - exact  # what no pulse sees is zero in the double sum
+        power = np.mean([np.mean(np.abs(np.nan_to_num(image[window])) ** 2) for window in windows])
+        error_db = 10 * np.log10(np.mean(np.abs(wrong) ** 2) / power)
+        ways = ", ".join(f"{count / formation.ways.total():.0%} {way}" for way, count in formation.ways.items())
+        whole = spent * len(formation.windows) / len(windows)
+        line = f"{formation.plan.setting.line}, {formation.plan.accuracy_db:.0f} dB asked"
+        print(
+            f"{line}: {whole / 60:.2f} CPU min ({spent:.1f} s measured, {wall:.1f} s wall), {error_db:.1f} dB. {ways}",
+            flush=True,
+        )
+
+
+def formations(campaign: Campaign, pair: str, engines: list[str], aims_db: list[float]) -> list[Formation]:
+    """Return what forms the image with each engine and accuracy."""
+    echo, profile = (open_stage(campaign.stage(stage, FLIGHT, pair), stage) for stage in ("echo", "profile"))
+    scene, track = open_scene(campaign), open_refined(campaign, FLIGHT)
+    opened = track.pair(open_pair(campaign, FLIGHT, pair, echo=echo))
+    profiles = track.profiles(opened, profiles_of(profile, lazy=True))
+    job = job_of(campaign, opened, scene)
+    made = [
+        make_plan(job, accuracy_db=aim_db, overrides={"engine": engine}) for engine in engines for aim_db in aims_db
+    ]
+    return [
+        Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px) for plan in made
+    ]
+
+
+def chosen(formation: Formation, every: int) -> list[Window]:
+    """Return one tile in so many, spread over the image."""
+    side = formation.side_px
+    return [
+        window for window in formation.windows if (window[0].start // side + 5 * (window[1].start // side)) % every == 0
+    ]
+
+
+if __name__ == "__main__":
+    main()

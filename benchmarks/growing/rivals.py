@@ -1,0 +1,132 @@
+"""fastsar on a scene: its exact formers and its factorized one, from phase history, each call whole.
+
+Its images are of a plane centred on the origin, (column, row), and its samples refer to one way of range.
+"""
+
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.scene.terrain import FlatGround
+from growing.contestants import PATIENCE, Contestant, Image, SkippedError, share_of
+from growing.scene import Scene
+
+_AXES = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0))  # columns go east, rows go south
+_POINT_S, _EXACT_S = 2.5e-8, 4.5e-9  # a pixel and a pulse, roughly
+
+
+class Fastsar:
+    """A scene as fastsar reads it."""
+
+    def __init__(self, scene: Scene):
+        import fastsar
+        from fastsar import bp
+
+        self.package, self.compress, self.scene = fastsar, bp.range_compress, scene
+        history = scene.history
+        step_hz = float(history.frequency_hz[1] - history.frequency_hz[0])
+        self.sampling = (float(history.frequency_hz[0]), step_hz)
+        self.one_way_m = history.reference_delay_s * SPEED_OF_LIGHT_M_S / 2
+        self.middle = scene.grid.positions_at([scene.size // 2], [scene.size // 2], 0.0)[0]
+
+    def factorized(self, name: str, finer: int = 1, **options: Any) -> Contestant:
+        """Return its factorized former, planned and called; on finer pixels, of which one in so many is kept.
+
+        Its smallest patches have 16 pixels: only finer pixels make them smaller, and the image more exact.
+        """
+        scene = self.scene
+        if scene.geometry == "bistatic":
+            raise SkippedError("its factorized former is monostatic")
+        if not isinstance(scene.ground, FlatGround):
+            raise SkippedError("its factorized former images planes")
+        size, spacing = scene.size * finer, scene.grid.spacing_m / finer
+        if size > 16384:
+            raise SkippedError(f"{size}² pixels do not fit into memory")
+
+        def run() -> tuple[Image, float, float]:
+            begin = time.process_time()
+            with warnings.catch_warnings(action="ignore"):  # of its own accuracy, which is measured here
+                former = self.package.ImageFormer(*self._grid(size, spacing), **self._options, **options)
+            planned = time.process_time()
+            image = former(scene.history.transfer)
+            formed = time.process_time()
+            return image[::finer, ::finer].T[*scene.checks], planned - begin, formed - planned
+
+        words = [f"{name}={value}" for name, value in options.items()] + ([f"pixels/{finer}"] if finer > 1 else [])
+        return Contestant(name, " ".join(words) or "defaults", scene, run, from_echoes=True)
+
+    def exact(self, limit_s: float) -> Contestant:
+        """Return its exact former of planes, tile by tile; range compression, which every call does, counts once."""
+        scene = self.scene
+        if scene.geometry == "bistatic" or not isinstance(scene.ground, FlatGround):
+            raise SkippedError("its exact former is monostatic and images planes")
+        predicted, every = _EXACT_S * scene.size**2 * len(scene.history), 1
+        while predicted / every > limit_s and scene.tiles(2 * every) != scene.tiles(every):
+            every *= 2
+        tiles = scene.tiles(every)
+        if predicted * share_of(scene, tiles) > PATIENCE * limit_s:
+            raise SkippedError(f"its least part would take {predicted * share_of(scene, tiles):.0f} s")
+
+        def run() -> tuple[Image, float, float]:
+            image = np.zeros(scene.grid.shape, np.complex64)
+            compression = self._compression(8)
+            begin = time.process_time()
+            for rows, columns in tiles:
+                side = columns.stop - columns.start
+                centre = scene.grid.positions_at([rows.start + side // 2], [columns.start + side // 2], 0.0)[0]
+                options = {**self._options, "center": centre - self.middle}
+                former = self.package.ExactFormer(*self._grid(side, scene.grid.spacing_m), **options)
+                image[rows, columns] = former(scene.history.transfer).T
+            spent = time.process_time() - begin
+            return image[*scene.checks], compression, max(0.0, spent - len(tiles) * compression)
+
+        share = share_of(scene, tiles)
+        return Contestant("fastsar exact", "cubic, 8×", scene, run, share, from_echoes=True)
+
+    def points(self, limit_s: float) -> Contestant:
+        """Return its bistatic former of points, of those in the middle of fields; its cost grows with them."""
+        scene, sample = self.scene, scene_points(self.scene)
+        predicted = _POINT_S * sample.shape[0] * sample.shape[1] * sample.shape[2] * len(scene.history)
+        if predicted > PATIENCE * limit_s:
+            raise SkippedError(f"the least part of it would take {predicted:.0f} s")
+        legs = [leg - self.middle for leg in scene.history.aperture.legs]
+        options = {"rcv": legs[1], "ref": self.one_way_m, "backend": "cpu", "window": False}
+
+        def run() -> tuple[Image, float, float]:
+            compression = self._compression(8)
+            begin = time.process_time()
+            image = self.package.backproject(
+                scene.history.transfer, legs[0], *self.sampling, sample - self.middle, **options
+            )
+            spent = time.process_time() - begin
+            full = np.zeros(scene.grid.shape, np.complex64)
+            for window, part in zip(scene.inner, image.reshape(sample.shape[:3]), strict=True):
+                full[window] = part
+            return full[*scene.checks], compression, max(0.0, spent - compression)
+
+        return Contestant("fastsar points", "8×", scene, run, share_of(scene, scene.inner), from_echoes=True)
+
+    def _grid(self, size: int, spacing_m: float) -> tuple[Any, ...]:
+        antenna = self.scene.history.aperture.tx_m - self.middle
+        return (antenna, *self.sampling, len(self.scene.history.frequency_hz), size, size, spacing_m, spacing_m, *_AXES)
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {"backend": "cpu", "window": False, "ref": self.one_way_m}
+
+    def _compression(self, upsample: int) -> float:
+        """Return CPU seconds of its range compression, in its own chunks."""
+        history = self.scene.history.transfer
+        begin = time.process_time()
+        for first in range(0, len(history), 256):
+            self.compress(history[first : first + 256], upsample * history.shape[1])
+        return time.process_time() - begin
+
+
+def scene_points(scene: Scene) -> NDArray[np.float64]:
+    """Return (field, row, column, 3) positions of the pixels of fields' middles, metres."""
+    return np.stack([scene.ground.positions(scene.grid[window]) for window in scene.inner])
