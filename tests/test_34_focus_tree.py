@@ -3,69 +3,23 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import BANDWIDTH_HZ, SUBCARRIERS, compiled, decibels, ecef, error_db, fly, pixel_grid, scatter, swaying_beam
+from scenes import compiled, decibels, ecef, error_db, pixel_grid, scatter, swaying_beam
+from tree_flights import WAVENUMBERS, counted, flown, formed, seen, setting
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import native, pieces, reference, tree
-from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.tree_inputs import SMOOTH, roughness, subaperture_sizes
+from apertura.focus.engines.tree_inputs import roughness
 from apertura.focus.engines.tree_nodes import nodes, supports, weights, widest_band
 from apertura.focus.engines.tree_surface import surfaces_of
-from apertura.focus.engines.tree_view import counts_of, highest, look, nodes_for
-from apertura.focus.job import Job, Signal
+from apertura.focus.engines.tree_view import highest, nodes_for
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.sector import Sector
 
 pytestmark = compiled
-
-STEP_M = C / BANDWIDTH_HZ / 2
-WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * BANDWIDTH_HZ / C}
-
-
-def seen(scene, pixels):
-    """A flight and profiles that hold what lies around its pixels, too: filters of trees are long."""
-    around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
-    wide = scene.profiles(ecef(np.concatenate(around)))
-    return SimpleNamespace(scene=scene, pixels=pixels, profiles=wide, aperture=Aperture(scene.tx, scene.rx))
-
-
-def flown(pixels, **options):
-    """A flight over pixels on which scatterers stand."""
-    return seen(fly(scatter(pixels), **options), pixels)
-
-
-def setting(flight, **asked) -> Setting:
-    """What the tree predicts of a flight with these options."""
-    places, shape = ecef(flight.pixels), flight.pixels.shape[:2]
-    corners = places[np.ix_(*(np.linspace(0, size - 1, 3).astype(int) for size in shape))]
-    signal = Signal(flight.scene.carrier_hz, 2.0, STEP_M, flight.profiles.samples.shape[1])
-    job = Job(flight.aperture, corners, shape, 0.05, flight.scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal)
-    asked = {"side_px": 64, "chunk": 256} | asked
-    return next(iter(tree.candidates(job, pulses=len(flight.aperture), asked=asked)))
-
-
-def formed(flight, pixels=None, *, beams=None, **asked):
-    """The image, and which part of it went by tree, directly and silently."""
-    chosen, counts = setting(flight, **{"nodes_db": -74} | asked), np.zeros(3, np.int64)
-    places = ecef(flight.pixels if pixels is None else pixels)
-    trees = tree.prepare(flight.profiles, **chosen.options)
-    image = tree.form(trees, places, beams=beams, counts=counts, **chosen.form_options)
-    assert counts.sum() == image.size * len(flight.aperture)
-    return image, counts / counts.sum()
-
-
-def counted(aperture, pixels, nodes_db=-74, *, carrier_hz=1.2e9):
-    """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
-    (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
-    seen = look(
-        aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
-    )
-    return counts_of(seen, nodes_db, smooth_rad=SMOOTH * 10 ** (nodes_db / 20), weighted=False)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["bistatic", "monostatic"])
@@ -175,19 +129,21 @@ def test_rolling_ground_goes_by_tree():
     assert error_db(flight.scene, rolling, image) <= setting(flight, nodes_db=-74).error_db + 3
 
 
-def test_pixels_off_their_surface_err_as_predicted():
-    """Eq. 9: six tenths of a millimetre of noise on the ground, which the tree takes at -50 dB."""
-    pixels = pixel_grid(60, 60)
-    rough, flight = pixels.copy(), flown(pixels, pulses=256)
-    rough[..., 2] += 6e-4 * np.random.default_rng(6).standard_normal((60, 60))
+@pytest.mark.parametrize(("carrier_hz", "spacing_m", "rough_m"), [(1.2e9, 0.05, 6e-4), (10e9, 0.01, 5e-4)])
+def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_m):
+    """Eq. 9: noise on the ground that the tree takes at -50 dB; what it adds is delay at 1 GHz, phase at 10 GHz."""
+    pixels = pixel_grid(60, 60, spacing_m=spacing_m)
+    rough, flight = pixels.copy(), flown(pixels, pulses=128, carrier_hz=carrier_hz)
+    rough[..., 2] += rough_m * np.random.default_rng(6).standard_normal((60, 60))
     (surface,) = surfaces_of(ecef(rough), [(slice(0, 60), slice(0, 60))])
     powers = []
     for places in (rough, pixels):
         image, share = formed(flight, places, nodes_db=-50)
         assert share[0] == 1
         powers.append(10 ** (error_db(flight.scene, places, image, 600) / 10))
-    more_db = 10 * np.log10(powers[0] - powers[1])
-    assert more_db == pytest.approx(10 * np.log10(roughness(flight.aperture, surface, **WAVENUMBERS)), abs=1)
+    wave = WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
+    predicted_db = 10 * np.log10(roughness(flight.aperture, surface, **wave))
+    assert 10 * np.log10(powers[0] - powers[1]) == pytest.approx(predicted_db, abs=1)
 
 
 @pytest.mark.parametrize(("range_m", "spacing_m", "levels"), [(12.0, 0.05, 2), (5.0, 0.08, 1), (3.0, 0.15, 0)])

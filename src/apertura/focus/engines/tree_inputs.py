@@ -158,7 +158,8 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     if not np.isfinite(surface.rough_m):
         return np.inf
     rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-    of_phase, of_delay = wavenumber_rad_m**2 * rate.var(), band_rad_m**2 / 3 * (rate**2).mean()
+    against = rate[len(rate) // 2]  # the pulse of m, nearly: that of the whole flight, not of each chunk
+    of_phase, of_delay = wavenumber_rad_m**2 * ((rate - against) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
 

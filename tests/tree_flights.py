@@ -1,0 +1,59 @@
+"""Flights that a tree images: what it predicts of them, what it makes of them, and which way that went."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
+
+from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.focus.engines import tree
+from apertura.focus.engines.engine import Setting
+from apertura.focus.engines.tree_inputs import SMOOTH, subaperture_sizes
+from apertura.focus.engines.tree_surface import surfaces_of
+from apertura.focus.engines.tree_view import counts_of, look
+from apertura.focus.job import Job, Signal
+from apertura.geometry.aperture import Aperture
+
+STEP_M = C / BANDWIDTH_HZ / 2
+WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * BANDWIDTH_HZ / C}
+
+
+def seen(scene, pixels):
+    """A flight and profiles that hold what lies around its pixels, too: filters of trees are long."""
+    around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
+    wide = scene.profiles(ecef(np.concatenate(around)))
+    return SimpleNamespace(scene=scene, pixels=pixels, profiles=wide, aperture=Aperture(scene.tx, scene.rx))
+
+
+def flown(pixels, **options):
+    """A flight over pixels on which scatterers stand."""
+    return seen(fly(scatter(pixels), **options), pixels)
+
+
+def setting(flight, **asked) -> Setting:
+    """What the tree predicts of a flight with these options."""
+    places, shape = ecef(flight.pixels), flight.pixels.shape[:2]
+    corners = places[np.ix_(*(np.linspace(0, size - 1, 3).astype(int) for size in shape))]
+    signal = Signal(flight.scene.carrier_hz, 2.0, STEP_M, flight.profiles.samples.shape[1])
+    job = Job(flight.aperture, corners, shape, 0.05, flight.scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal)
+    asked = {"side_px": 64, "chunk": 256} | asked
+    return next(iter(tree.candidates(job, pulses=len(flight.aperture), asked=asked)))
+
+
+def formed(flight, pixels=None, *, beams=None, **asked):
+    """The image, and which part of it went by tree, directly and silently."""
+    chosen, counts = setting(flight, **{"nodes_db": -74} | asked), np.zeros(3, np.int64)
+    places = ecef(flight.pixels if pixels is None else pixels)
+    trees = tree.prepare(flight.profiles, **chosen.options)
+    image = tree.form(trees, places, beams=beams, counts=counts, **chosen.form_options)
+    assert counts.sum() == image.size * len(flight.aperture)
+    return image, counts / counts.sum()
+
+
+def counted(aperture, pixels, nodes_db=-74, *, carrier_hz=1.2e9):
+    """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
+    (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
+    seen = look(
+        aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
+    )
+    return counts_of(seen, nodes_db, smooth_rad=SMOOTH * 10 ** (nodes_db / 20), weighted=False)
