@@ -40,7 +40,7 @@ def nodes(count: int, error_db: int) -> NDArray[np.float64]:
     Examples
     --------
     >>> nodes(4, -74).round(3)
-    array([-0.929, -0.388,  0.388,  0.929])
+    array([-0.923, -0.38 ,  0.38 ,  0.923])
     """
     if count == 1:
         return np.zeros(1)

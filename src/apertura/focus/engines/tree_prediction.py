@@ -24,6 +24,7 @@ from apertura.focus.engines.tree_inputs import (
 )
 from apertura.focus.engines.tree_surface import Surface, surfaces_of
 from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
+from apertura.focus.engines.tree_weights import DIRECTLY, SILENTLY, weights_over
 from apertura.focus.job import Job, Signal
 
 SETTINGS: Mapping[int, tuple[int, int]] = {
@@ -62,6 +63,7 @@ class _Seen:
     surfaces: tuple[Surface, ...]
     looks: tuple[tuple[Looks, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
+    groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
 
     @property
     def phase_rad(self) -> float:
@@ -127,8 +129,25 @@ def _seen(job: Job, pulses: int, side_px: int, chunk: int) -> _Seen:
         if np.isfinite(surface.rough_m)
     )
     some = job.aperture[job.aperture.sample(64)]
+    groups = [places[start + at : start + at + LEAF] for start in starts for at in (0, chunk // 2 // LEAF * LEAF)]
     rough = tuple(roughness(some, surface, wavenumber_rad_m=k, band_rad_m=b) for surface in surfaces)
-    return _Seen(surfaces, looks, rough)
+    return _Seen(surfaces, looks, rough, tuple(group for group in groups if len(group)))
+
+
+@lru_cache(maxsize=256)
+def _weighed_directly(job: Job, seen: _Seen, nodes_db: int) -> float:
+    """Return the part of the groups of pulses that see a tile whose weights no polynomial follows."""
+    if job.beams is None:
+        return 0.0
+    ways = [
+        weights_over(job.beams[group], job.aperture[group], surface, nodes_db)[1]
+        for surface in seen.surfaces
+        for group in seen.groups
+        if np.isfinite(surface.rough_m)
+    ]
+    taken = np.concatenate([*ways, np.empty(0, np.uint8)])
+    taken = taken[taken != SILENTLY]
+    return float((taken == DIRECTLY).mean()) if len(taken) else 0.0
 
 
 def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
@@ -151,7 +170,10 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
     )
     table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
     error_db = power_sum_db(
-        table_db, nodes_db + 10 * np.log10(2 * len(sizes) + 1), _FLOAT32_DB, 20 * np.log10(_FLOAT32 * seen.phase_rad)
+        table_db,
+        nodes_db + 10 * np.log10(2 * len(sizes) + 1),
+        _FLOAT32_DB,
+        20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
     )
     asked = {"degree": 2, **DIRECTLY_AT[nodes_db]._asdict()}
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
@@ -183,7 +205,7 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: fl
     limit = 10 ** (options.nodes_db / 20)
     spent: list[float] = []
     directly: list[float] = []
-    looks = iter(seen.looks)
+    looks, edge = iter(seen.looks), _weighed_directly(job, seen, options.nodes_db)
     for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
         here = next(looks) if np.isfinite(surface.rough_m) else ()
         if not rough <= 2 * limit**2:
@@ -192,12 +214,13 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: fl
             continue
         for one in here:
             counts = counts_of(one, options.nodes_db, smooth_rad=SMOOTH * limit, weighted=job.beams is not None)
-            directly.append(float(not counts.nodes))
+            directly.append(edge if counts.nodes else 1.0)
             if not counts.nodes:
                 spent.append(pulses * side**2 * direct_s)
                 continue
             amounts = features(one, counts, options, job.signal, _Work(min(pulses, options.chunk), side))
-            spent.append(chunks * sum(cost * amount for cost, amount in amounts))
+            by_tree = chunks * sum(cost * amount for cost, amount in amounts)
+            spent.append((1 - edge) * by_tree + edge * pulses * side**2 * direct_s)
     tiles = job.pixels / side**2
     whole = job.share * tiles * float(np.mean(spent)) + _SURFACE_S * job.pixels + _FORM_S * job.tiles
     return whole + job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S, float(np.mean(directly))
