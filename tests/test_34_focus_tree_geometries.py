@@ -10,7 +10,7 @@ pytestmark = compiled
 
 @pytest.mark.parametrize("seed", [5, 9, 50, 58])
 def test_a_random_geometry_is_certified_as_asked(seed):
-    """Among them tiles inside a circle, tiles as large as the range (9), and a track that wobbles within a leaf (58)."""
+    """Among them tiles inside a circle, tiles as large as the range (9), a track that wobbles within a leaf (58)."""
     found = measure(draw(seed), nodes_db=-74)
     assert not found.failure, found
     assert found.by_tree == 1
