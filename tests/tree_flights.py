@@ -8,8 +8,8 @@ from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import tree
 from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.tree_inputs import SMOOTH, subaperture_sizes
 from apertura.focus.engines.tree_surface import surfaces_of
+from apertura.focus.engines.tree_track import SMOOTH, subaperture_sizes
 from apertura.focus.engines.tree_view import counts_of, look
 from apertura.focus.job import Job, Signal
 from apertura.geometry.aperture import Aperture

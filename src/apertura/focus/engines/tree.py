@@ -20,9 +20,10 @@ from apertura.focus.engines.engine import EngineOptions
 from apertura.focus.engines.native_binding import available, instruction_set
 from apertura.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
 from apertura.focus.engines.tree_chunk import Chunk, Tile
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, Trees, prepare, subaperture_sizes
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, Trees, prepare
 from apertura.focus.engines.tree_prediction import candidates
 from apertura.focus.engines.tree_surface import surfaces_of, windows
+from apertura.focus.engines.tree_track import subaperture_sizes
 from apertura.focus.engines.tree_weights import DIRECTLY
 
 __all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]

@@ -18,9 +18,10 @@ from apertura.focus.engines.native_structs import (
     TreeJob,
     TreeTile,
 )
-from apertura.focus.engines.tree_inputs import LEAF, SMOOTH, Trees, delay_filter
+from apertura.focus.engines.tree_inputs import Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
+from apertura.focus.engines.tree_track import LEAF, SMOOTH
 from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, weights_over
 
 

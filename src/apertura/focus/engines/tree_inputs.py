@@ -11,26 +11,16 @@ from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines import native
-from apertura.focus.engines.native_structs import TREE_DELAYS, TREE_GROUP
+from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.focus.engines.tree_surface import Surface
+from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
-
-LEAF = TREE_GROUP
-"""Pulses that a leaf makes fewer, and sums at its nodes."""
-
-DEGREES = (5, 9, 14, 20)
-"""Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
-
-SMOOTH = 1.0
-"""Of what an interpolation may err by: how far pulses may leave such a curve, RMS. What they leave it by errs more than
-itself: fewer pulses neither show it nor leave it out."""
 
 CELLS_AT_ONCE = 4
 """Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
 
-_SECOND = 256  # pulses of a subaperture of leaves
 _SAMPLED = 64  # pulses at which a rough tile is looked at
 _DELAY_DEGREE = 9
 
@@ -163,17 +153,6 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
 
-def subaperture_sizes(chunk: int) -> tuple[int, ...]:
-    """Return the pulses of the subapertures of each level, the largest last.
-
-    Examples
-    --------
-    >>> subaperture_sizes(1024), subaperture_sizes(256), subaperture_sizes(64)
-    ((64, 256, 1024), (64, 256), (64,))
-    """
-    return tuple(sorted({size for size in (LEAF, _SECOND, chunk) if size <= chunk}))
-
-
 def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
     """Return how many cells a sample is expanded to, for at least so many per resolution cell.
 
@@ -256,30 +235,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
         start_m=np.ascontiguousarray(profiles.start_m, np.float64),
     )
     legs = [leaves_of(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
-    stray, rough = (sum(map(off, legs)) for off in (_stray, leaf_roughness))  # legs may share a platform
+    strayed, rough = (sum(map(off, legs)) for off in (stray, leaf_roughness))  # legs may share a platform
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     found = cells(profiles.oversampling, turn, float(oversampling), taps)
-    return Trees(held, found, np.asarray(stray, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
-
-
-def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
-    count = -(-len(places_m) // LEAF)
-    filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
-    return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
-
-
-def _stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf,) how far pulses lie from the parabola through the first, middle and last one, metres."""
-    x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
-    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
-    rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
-    return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
-
-
-def leaf_roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, curve) RMS distance of pulses from curves of growing degree through them, metres."""
-    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), DEGREES[-1]))[0]
-    terms = np.einsum("pt,npc->ntc", basis, leaves_m - leaves_m[:, :1])
-    power = ((leaves_m - leaves_m[:, :1]) ** 2).sum((1, 2))[:, None] - np.cumsum((terms**2).sum(-1), axis=1)
-    return np.asarray(np.sqrt(np.maximum(power[:, DEGREES], 0) / LEAF))
+    return Trees(held, found, np.asarray(strayed, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))

@@ -13,16 +13,9 @@ from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.native_structs import TREE_DELAYS
-from apertura.focus.engines.tree_inputs import (
-    DIRECTLY_AT,
-    LEAF,
-    SMOOTH,
-    cells,
-    cells_per_sample,
-    roughness,
-    subaperture_sizes,
-)
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, cells, cells_per_sample, roughness
 from apertura.focus.engines.tree_surface import Surface, surfaces_of
+from apertura.focus.engines.tree_track import LEAF, SMOOTH, subaperture_sizes
 from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
 from apertura.focus.engines.tree_weights import DIRECTLY, SILENTLY, weights_over
 from apertura.focus.job import Job, Signal

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.focus.engines.native_structs import TREE_FEWER
-from apertura.focus.engines.tree_inputs import DEGREES, LEAF, leaf_roughness, leaves_of
 from apertura.focus.engines.tree_nodes import MOST_NODES, supports
 from apertura.focus.engines.tree_surface import Surface
+from apertura.focus.engines.tree_track import DEGREES, LEAF, leaf_roughness, leaves_of
 from apertura.geometry.aperture import Aperture
 
 _FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
