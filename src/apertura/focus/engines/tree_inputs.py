@@ -14,7 +14,7 @@ from apertura.focus.engines import native
 from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.focus.engines.tree_surface import Surface
-from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of
+from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of, stray
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
 
