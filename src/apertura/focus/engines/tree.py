@@ -119,9 +119,6 @@ def form(
             tally += image[tile.window].size * np.bincount(way, pulses_of, 3).astype(np.int64)
     if counts is not None:
         counts += tally
-    for tile in tiles:
-        if not np.isfinite(tile.surface.rough_m):
-            image[tile.window][~np.isfinite(pixels[tile.window]).all(axis=2)] = complex(np.nan, np.nan)
     return image
 
 

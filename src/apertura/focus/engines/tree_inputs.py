@@ -223,18 +223,9 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     -----
     Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
     """
-    if not profiles.oversampling >= 1.5:
-        raise ValueError(f"{profiles.oversampling=}: must be at least 1.5")
-    if not len(profiles):
-        raise ValueError(f"{profiles.samples.shape=}: holds no pulse")
-    if not all(np.isfinite(values).all() for values in (profiles.start_m, *profiles.aperture.legs)):
-        raise ValueError("phase centres and starts of the profiles must be finite")
-    held = replace(
-        profiles,
-        samples=np.ascontiguousarray(profiles.samples, np.complex64),
-        start_m=np.ascontiguousarray(profiles.start_m, np.float64),
-    )
-    legs = [leaves_of(np.asarray(leg, np.float64)) for leg in profiles.aperture.legs]
+    samples, start_m, places = profiles.for_tables()
+    held = replace(profiles, samples=samples, start_m=start_m)
+    legs = [leaves_of(leg) for leg in places]
     strayed, rough = (sum(map(off, legs)) for off in (stray, leaf_roughness))  # legs may share a platform
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     found = cells(profiles.oversampling, turn, float(oversampling), taps)

@@ -23,6 +23,7 @@ _NOISE_DB = -20.0  # white noise that weights are made for, beside the error the
 _GAUSS, _SHARE = np.polynomial.legendre.leggauss(160)
 
 
+@lru_cache(maxsize=4096)
 def nodes(count: int, error_db: int) -> NDArray[np.float64]:
     """Return the places of so many nodes, (count,) float64, in -1…1: Chebyshev's, mapped to be nearly even.
 
