@@ -16,7 +16,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.focus.engines.cuda_constants import DEGREE
 from apertura.focus.engines.cuda_device import Resident, available, instruction_set, sum_there
 from apertura.focus.engines.cuda_prediction import candidates
-from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.focus.engines.native_tables import TableDesign, design_table
 from apertura.focus.inputs import Profiles
 
@@ -155,10 +155,9 @@ def form(
     -----
     Source: docs/theory/engine.md, "A GPU".
     """
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
+    pixels = checked_pixels(pixels)
     if beams is not None:
         raise ValueError("engine cuda does not weigh pulses by antennas or a sector")
     if not pixels.size:
         return np.zeros(pixels.shape[:2], np.complex64)
-    return sum_there(tables, np.ascontiguousarray(pixels, np.float64), tolerance_rad)
+    return sum_there(tables, pixels, tolerance_rad)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from apertura.focus.job import Job
@@ -114,6 +115,29 @@ class Engine(Protocol):
 
     @staticmethod
     def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterable[Setting]: ...  # noqa: D102
+
+
+def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the places of pixels as an engine's `form` is given them, contiguous.
+
+    Parameters
+    ----------
+    pixels
+        (y, x, 3) float64, metres.
+
+    Raises
+    ------
+    ValueError
+        If they have another shape.
+
+    Examples
+    --------
+    >>> checked_pixels(np.zeros((2, 4, 3))[:, ::2]).shape
+    (2, 2, 3)
+    """
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
+    return np.ascontiguousarray(pixels, np.float64)
 
 
 def compiled_for() -> str:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from apertura.antenna.beam import Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.focus.engines.native_beams import weights_of
 from apertura.focus.engines.native_binding import INSTRUCTION_SETS, available, call, instruction_set
 from apertura.focus.engines.native_constants import KERNEL
@@ -136,11 +136,9 @@ def form(
     -----
     Source: docs/theory/engine.md, "Paths" and "Antennas"; docs/theory/integration.md, "Edges".
     """
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
     if accumulate not in ("complex64", "complex128"):
         raise ValueError(f"{accumulate=}: must be 'complex64' or 'complex128'")
-    pixels = np.ascontiguousarray(pixels, np.float64)
+    pixels = checked_pixels(pixels)
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
     padded = tables.first_path_m.size

@@ -16,7 +16,7 @@ from pydantic import Field
 from apertura.antenna.beam import Beams
 from apertura.contracts import Window
 from apertura.focus.engines import native
-from apertura.focus.engines.engine import EngineOptions
+from apertura.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.focus.engines.native_binding import available, instruction_set
 from apertura.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
 from apertura.focus.engines.tree_chunk import Chunk, Tile
@@ -98,11 +98,9 @@ def form(
     -----
     Source: docs/theory/tree.md.
     """
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise ValueError(f"{pixels.shape=}: must be (y, x, 3)")
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
-    pixels = np.ascontiguousarray(pixels, np.float64)
+    pixels = checked_pixels(pixels)
     image = np.zeros(pixels.shape[:2], np.complex64)
     tally = np.zeros(3, np.int64)
     tiles = _tiles(trees, pixels, side_px, nodes_db)
