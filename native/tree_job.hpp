@@ -12,6 +12,8 @@ constexpr int64_t kTreeGroup = 64;     // pulses of a leaf, which are taken the 
 constexpr int64_t kTreeDelays = 12;    // taps of the filter that aligns a pulse to a tile
 constexpr int64_t kTreeFewer = 28;     // that may stand for those of a leaf, at most
 constexpr int64_t kTreeCurves = 4;     // smooth curves that the pulses of a leaf may follow
+constexpr int64_t kTreeTerms = 21;     // of the track over a leaf, one more than the degree of the last of them
+constexpr int64_t kTreeMore = 4;       // pulses that a curve takes beyond its degree
 constexpr int64_t kTreeSlots = 136;    // 0 … kTreeNodes: that many nodes; above: pixels of one of the sides of tiles
 constexpr int64_t kTreeDegree = 6;     // of a tile's surface, at most
 constexpr int64_t kTreeWeights = 16;   // of a beam's polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
@@ -40,15 +42,17 @@ struct TreeTile {
 };
 
 struct TreeJob {
-  const float* samples;         // (pulse, length, 2)
-  const double* start;          // (pulse): total path of sample 0
-  const double* transmitter;    // (pulse, 3)
-  const double* receiver;       // (pulse, 3)
-  const float* stray;           // (leaf): metres by which pulses leave the parabola through three of them
-  const float* rough;           // (leaf, kTreeCurves): and smooth curves of growing degree, RMS
-  const float* taps;            // (taps_count, up, 2, 2): of level and slope, each twice (for re, im)
-  const float* delay;           // (delay_terms, kTreeDelays): polynomials of the fraction of a sample
+  const float* samples;       // (pulse, length, 2)
+  const double* start;        // (pulse): total path of sample 0
+  const double* transmitter;  // (pulse, 3)
+  const double* receiver;     // (pulse, 3)
+  const float* stray;         // (leaf): metres by which pulses leave the parabola through three of them
+  const float* rough;         // (leaf, kTreeCurves): and smooth curves of growing degree, RMS
+  const double* track;  // (leaf, antenna, kTreeTerms, 3): its phase centres as polynomials, orthonormal over the leaf
+  const float* taps;    // (taps_count, up, 2, 2): of level and slope, each twice (for re, im)
+  const float* delay;   // (delay_terms, kTreeDelays): polynomials of the fraction of a sample
   const float* const* presum;   // (kTreeFewer + 1): weights (fewer, pulse of a leaf)
+  const double* const* curve;   // (kTreeFewer + 1): the polynomials of `track` at (fewer, kTreeTerms)
   const double* supports;       // (kTreeNodes + 1): band that so many nodes hold, rad per half tile
   const double* const* places;  // (kTreeSlots): nodes or pixels along an axis, -1 … 1
   const float* const* spread;   // (kTreeNodes + 1, kTreeSlots): (node, 2 padded): weights, each twice

@@ -11,6 +11,7 @@
 namespace {
 
 using apertura::kTreeDelays;
+using apertura::kTreeTerms;
 using apertura::kTreeWeights;
 
 constexpr int64_t kRecord = 4;                // floats of a cell: level and slope, re and im each
@@ -169,37 +170,40 @@ inline void take_reference_off(const TreeJob& job, TileState& state, const LeafN
 // Where pulse number `place` of a leaf, which need not be whole, would lie: cubic between its neighbours.
 struct Between {
   int64_t first;
-  double share[4];
-  Between(double place, int64_t count) {
-    first = std::min(std::max<int64_t>(0, int64_t(std::floor(place)) - 1), std::max<int64_t>(0, count - 4));
+  float share[4];
+  explicit Between(double place) {
+    first = std::min(std::max<int64_t>(0, int64_t(std::floor(place)) - 1), apertura::kTreeGroup - 4);
     for (int64_t n = 0; n < 4; n++) {
-      share[n] = n < count ? 1 : 0;
-      for (int64_t m = 0; m < 4 && m < count; m++)
-        if (m != n) share[n] *= (place - double(first + m)) / double(n - m);
+      double product = 1;
+      for (int64_t m = 0; m < 4; m++)
+        if (m != n) product *= (place - double(first + m)) / double(n - m);
+      share[n] = float(product);
     }
   }
 };
 
-// The pulses that stand for those of a leaf: phase centres, and weights of the antennas, at places between them.
+// The pulses that stand for those of a leaf: phase centres on a smooth curve through its own, and antennas' weights.
 struct Virtual {
   Legs legs;
   float weight[kTreeWeights];
 };
 
-inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count, double place) {
-  const Between between(place, count);
-  double antenna[2][3] = {};
+// Number n of so many. Of all curves that they hold, the one of highest degree follows the track most closely.
+inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t fewer, int64_t n) {
   Virtual out{};
-  for (int64_t n = 0; n < 4 && n < count; n++) {
-    const int64_t pulse = begin + between.first + n;
-    for (int64_t axis = 0; axis < 3; axis++) {
-      antenna[0][axis] += between.share[n] * job.transmitter[3 * pulse + axis];
-      antenna[1][axis] += between.share[n] * job.receiver[3 * pulse + axis];
-    }
-    for (int64_t term = 0; tile.weight && term < kTreeWeights; term++)
-      out.weight[term] += float(between.share[n]) * tile.weight[pulse * kTreeWeights + term];
-  }
+  const double *curve = job.curve[fewer] + n * kTreeTerms,
+               *track = job.track + begin / apertura::kTreeGroup * 6 * kTreeTerms;
+  const int64_t terms = std::min(kTreeTerms, fewer - apertura::kTreeMore + 1);
+  double antenna[2][3] = {};
+  for (int64_t leg = 0; leg < 2; leg++, track += 3 * kTreeTerms)
+    for (int64_t term = 0; term < terms; term++)
+      for (int64_t axis = 0; axis < 3; axis++) antenna[leg][axis] += curve[term] * track[3 * term + axis];
   out.legs = legs_between(tile.centre, antenna[0], antenna[1]);
+  if (!tile.weight) return out;
+  const Between between(0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]));
+  for (int64_t near = 0; near < 4; near++)
+    for (int64_t term = 0; term < kTreeWeights; term++)
+      out.weight[term] += between.share[near] * tile.weight[(begin + between.first + near) * kTreeWeights + term];
   return out;
 }
 
@@ -231,8 +235,7 @@ inline void sum_fewer(const TreeJob& job, TileState& state, const LeafNodes& lea
   work.cells.resize(size_t(kRecord * width));
   const Cells cells(work.cells.data(), 0, width, -tile.first_path * double(job.up) / job.step);
   for (int64_t n = 0; n < fewer; n++) {
-    const double place = 0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]);
-    const Virtual pulse = virtual_pulse(job, tile, begin, apertura::kTreeGroup, place);
+    const Virtual pulse = virtual_pulse(job, tile, begin, fewer, n);
     expand(job, lines + n * wide, tile.samples, state.cosines.data(), state.sines.data(), work.cells.data());
     add_pulse<Phase, kMono>(job, leaf, pulse.legs, tile.weight ? pulse.weight : nullptr, cells, state.re.data(),
                             state.im.data());

@@ -8,12 +8,12 @@ using apertura::kDirectly;
 using apertura::kSilently;
 using apertura::kTreeCurves;
 using apertura::kTreeGroup;
+using apertura::kTreeMore;
 using apertura::kTreeNodes;
 using apertura::kTreeWeighted;
 
 constexpr int64_t kCurves[kTreeCurves] = {5, 9, 14, 20};  // degrees of smooth curves over a leaf
 constexpr float kAiry = 3;                                // units of (4b) beyond which nothing is left
-constexpr int64_t kTreeMore = 4;                          // pulses that it takes beyond the degree
 
 // What is known of a leaf before its nodes: how its pulses see the tile.
 struct Sight {

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scenes import compiled, decibels, ecef, error_db, pixel_grid, scatter, swaying_beam
-from tree_flights import WAVENUMBERS, counted, flown, formed, seen, setting
+from tree_flights import WAVENUMBERS, counted, flown, formed, heard, seen, setting, shaken
 
 from apertura.antenna.beam import Beam, Beams
 from apertura.constants import SPEED_OF_LIGHT_M_S as C
@@ -109,6 +109,20 @@ def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
     image, share = formed(shaken)
     assert share[0] == 1
     assert error_db(scene, plain.pixels, image) <= -64
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("jitter_m", [3e-4, 3e-3])
+def test_fewer_pulses_than_follow_a_track_err_as_predicted(plain, jitter_m, together):
+    """Of noise, the hardest of contents: nothing in it is the same from pulse to pulse."""
+    flight = heard(shaken(plain, jitter_m, together=together))
+    images = [formed(flight, nodes_db=-86, presum_db=presum_db)[0] for presum_db in (-100, -40)]
+    seen = [
+        counted(flight.aperture[:256], ecef(plain.pixels[window]), presum_db=-40)
+        for window in pieces("tree", images[0].shape, {"side_px": 64})
+    ]
+    predicted_db = 10 * np.log10(np.mean([tile.presum_rad**2 for tile in seen]))
+    assert predicted_db - 7 <= decibels(images[1] - images[0], images[0]) <= predicted_db
 
 
 def test_rough_ground_goes_directly():

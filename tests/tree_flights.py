@@ -1,5 +1,6 @@
 """Flights that a tree images: what it predicts of them, what it makes of them, and which way that went."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.focus.engines import tree
 from apertura.focus.engines.engine import Setting
 from apertura.focus.engines.tree_surface import surfaces_of
-from apertura.focus.engines.tree_track import SMOOTH, subaperture_sizes
+from apertura.focus.engines.tree_track import subaperture_sizes
 from apertura.focus.engines.tree_view import counts_of, look
 from apertura.focus.job import Job, Signal
 from apertura.geometry.aperture import Aperture
@@ -40,6 +41,23 @@ def setting(flight, **asked) -> Setting:
     return next(iter(tree.candidates(job, pulses=len(flight.aperture), asked=asked)))
 
 
+def shaken(flight, jitter_m, *, together=False):
+    """The flight with white noise on its track, on both nodes alike or each its own, and what it hears of nothing."""
+    white = jitter_m * np.random.default_rng(8).standard_normal((2, *flight.scene.tx.shape))
+    scene = replace(flight.scene, tx=flight.scene.tx + white[0], rx=flight.scene.rx + white[0 if together else 1])
+    silent = replace(scene, transfer=np.zeros_like(scene.transfer))
+    return seen(silent, flight.pixels)
+
+
+def heard(flight):
+    """The flight with profiles that hold nothing but noise of the band."""
+    shape, generator = flight.profiles.samples.shape, np.random.default_rng(9)
+    lines = np.fft.fft(generator.standard_normal((*shape, 2)).view(complex)[..., 0], axis=1)
+    lines[:, shape[1] // 4 : -(shape[1] // 4)] = 0
+    noise = np.fft.ifft(lines, axis=1).astype(np.complex64)
+    return SimpleNamespace(**vars(flight) | {"profiles": replace(flight.profiles, samples=noise)})
+
+
 def formed(flight, pixels=None, *, beams=None, **asked):
     """The image, and which part of it went by tree, directly and silently."""
     chosen, counts = setting(flight, **{"nodes_db": -74} | asked), np.zeros(3, np.int64)
@@ -50,10 +68,10 @@ def formed(flight, pixels=None, *, beams=None, **asked):
     return image, counts / counts.sum()
 
 
-def counted(aperture, pixels, nodes_db=-74, *, carrier_hz=1.2e9):
+def counted(aperture, pixels, nodes_db=-74, *, presum_db=-74, carrier_hz=1.2e9):
     """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
     (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
     seen = look(
         aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
     )
-    return counts_of(seen, nodes_db, smooth_rad=SMOOTH * 10 ** (nodes_db / 20), weighted=False)
+    return counts_of(seen, nodes_db, presum_db=presum_db, weighted=False)

@@ -46,6 +46,9 @@ class Options(EngineOptions):
     nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92] | None = Field(
         None, description="what one interpolation between nodes may err by, dB"
     )
+    presum_db: Annotated[int, Field(ge=-100, le=-40)] | None = Field(
+        None, description="what pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB"
+    )
     side_px: Annotated[int, Field(ge=16, le=TREE_SIDE)] | None = Field(
         None, description="largest side of a tree's tile, pixels"
     )
@@ -58,6 +61,7 @@ def form(
     *,
     beams: Beams | None = None,
     nodes_db: int = -74,
+    presum_db: float = -74,
     side_px: int = 128,
     chunk: int = 1024,
     counts: NDArray[np.int64] | None = None,
@@ -74,6 +78,8 @@ def form(
         Weight of each pulse at each pixel; none by default.
     nodes_db
         What one interpolation between nodes may err by, dB.
+    presum_db
+        What pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB RMS.
     side_px
         Of the tiles that the block is cut into, at most; each gets the same bits with or without the others.
     chunk
@@ -107,7 +113,7 @@ def form(
     sizes = subaperture_sizes(chunk)
     for pulses in trees.chunks(chunk):
         some, weighing = trees[pulses], beams and beams[pulses]
-        ways = Chunk(some, weighing, nodes_db, sizes, pixels, image).add(tiles)
+        ways = Chunk(some, weighing, nodes_db, presum_db, sizes, pixels, image).add(tiles)
         for tile, way in zip(tiles, ways, strict=True):
             for run in _direct_runs(way, len(some)):
                 part, weights = some.direct(nodes_db)[run], weighing and weighing[run]

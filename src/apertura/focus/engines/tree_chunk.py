@@ -21,7 +21,7 @@ from apertura.focus.engines.native_structs import (
 from apertura.focus.engines.tree_inputs import Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
-from apertura.focus.engines.tree_track import LEAF, SMOOTH
+from apertura.focus.engines.tree_track import LEAF, curve
 from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, weights_over
 
 
@@ -42,8 +42,8 @@ class Chunk:
     ----------
     trees, beams
         Of the pulses.
-    nodes_db
-        What one interpolation may err by.
+    nodes_db, presum_db
+        What one interpolation may err by, dB, and what pulses of a leaf may that leave a smooth track.
     sizes
         Pulses of the subapertures of each level.
     pixels, image
@@ -53,6 +53,7 @@ class Chunk:
     trees: Trees
     beams: Beams | None
     nodes_db: int
+    presum_db: float
     sizes: tuple[int, ...]
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
@@ -126,6 +127,7 @@ class Chunk:
             receiver=self._hold(rx),
             stray=self._hold(self.trees.stray_m),
             rough=self._hold(self.trees.rough_m),
+            track=self._hold(self.trees.tracks_m),
             delay=self._hold(delay),
             taps=self._hold(np.ascontiguousarray(taps, np.float32)),
             supports=self._hold(supports(self.nodes_db)),
@@ -144,7 +146,7 @@ class Chunk:
             step=profiles.step_m,
             wavenumber=self.trees.wavenumber_rad_m,
             band=self.trees.band_rad_m,
-            smooth=SMOOTH * 10 ** (self.nodes_db / 20),
+            smooth=10 ** (self.presum_db / 20),
         )
         job.sizes[: len(self.sizes)] = self.sizes
         job.phase_coefficients[:] = design.phase_coefficients.tolist()
@@ -173,11 +175,13 @@ class Chunk:
         for slot in {slot for step in steps for slot in step}:
             at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
             places[slot] = self._hold(np.ascontiguousarray(at))
-        presum = np.zeros(TREE_FEWER + 1, np.uintp)
+        presum, curves = (np.zeros(TREE_FEWER + 1, np.uintp) for _ in range(2))
         for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
             presum[fewer] = self._hold(np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T))
             places[fewer] = self._hold(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
-        job.places, job.spread, job.mix, job.presum = map(self._hold, (places, spread, mix, presum))
+            curves[fewer] = self._hold(curve(fewer, self.nodes_db))
+        job.places, job.spread, job.mix = map(self._hold, (places, spread, mix))
+        job.presum, job.curve = map(self._hold, (presum, curves))
 
     @property
     def _ratios(self) -> list[int]:

@@ -14,7 +14,7 @@ from apertura.focus.engines import native
 from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.focus.engines.tree_surface import Surface
-from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of, stray
+from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of, stray, tracks
 from apertura.focus.inputs import Profiles
 from apertura.geometry.aperture import Aperture
 
@@ -72,6 +72,8 @@ class Trees:
         (leaf,) float32, metres by which pulses of a leaf leave the parabola through its first, middle and last one.
     rough_m
         (leaf, 4) float32, metres by which they leave curves of growing degree, RMS.
+    tracks_m
+        (leaf, antenna, term, 3) float64, phase centres over each leaf as polynomials.
     first
         Number of the first pulse among those prepared.
     tables
@@ -82,6 +84,7 @@ class Trees:
     design: TableDesign
     stray_m: NDArray[np.float32]
     rough_m: NDArray[np.float32]
+    tracks_m: NDArray[np.float64]
     first: int
     tables: _DirectTables
 
@@ -92,11 +95,13 @@ class Trees:
     def __getitem__(self, pulses: slice) -> "Trees":
         """Return those of pulses from a multiple of a leaf on."""
         first, last, _ = pulses.indices(len(self))
+        leaves = slice(first // LEAF, -(-last // LEAF))
         return replace(
             self,
             profiles=self.profiles[first:last],
-            stray_m=self.stray_m[first // LEAF : -(-last // LEAF)],
-            rough_m=self.rough_m[first // LEAF : -(-last // LEAF)],
+            stray_m=self.stray_m[leaves],
+            rough_m=self.rough_m[leaves],
+            tracks_m=self.tracks_m[leaves],
             first=self.first + first,
         )
 
@@ -226,7 +231,8 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     samples, start_m, places = profiles.for_tables()
     held = replace(profiles, samples=samples, start_m=start_m)
     legs = [leaves_of(leg) for leg in places]
-    strayed, rough = (sum(map(off, legs)) for off in (stray, leaf_roughness))  # legs may share a platform
+    strayed, rough = stray(legs[0]) + stray(legs[1]), leaf_roughness(*legs)
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     found = cells(profiles.oversampling, turn, float(oversampling), taps)
-    return Trees(held, found, np.asarray(strayed, np.float32), np.asarray(rough, np.float32), 0, _DirectTables(held))
+    bent = np.stack([tracks(leg) for leg in legs], axis=1)
+    return Trees(held, found, strayed.astype(np.float32), rough.astype(np.float32), bent, 0, _DirectTables(held))

@@ -15,7 +15,7 @@ from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.tree_inputs import DIRECTLY_AT, cells, cells_per_sample, roughness
 from apertura.focus.engines.tree_surface import Surface, surfaces_of
-from apertura.focus.engines.tree_track import LEAF, SMOOTH, subaperture_sizes
+from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
 from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
 from apertura.focus.engines.tree_weights import DIRECTLY, SILENTLY, weights_over
 from apertura.focus.job import Job, Signal
@@ -24,6 +24,9 @@ SETTINGS: Mapping[int, tuple[int, int]] = {
     -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16), -86: (64, 16), -92: (64, 16),
 }  # fmt: skip
 """Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
+
+PRESUMS_DB = (0, 6, 12)
+"""By how much pulses for which fewer stand may err more than an interpolation does."""
 
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Sides of tiles and pulses of the largest subaperture that are considered."""
@@ -77,7 +80,12 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
         for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
             oversampling, taps = SETTINGS[nodes_db]
             oversampling = asked.get("oversampling") or oversampling
-            yield _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, side_px, chunk))
+            quickest = np.inf
+            for presum_db in asked_or(asked, "presum_db", [nodes_db + more for more in PRESUMS_DB]):
+                setting = _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk))
+                if setting.seconds < quickest:  # what may err more takes less time, or is not worth it
+                    quickest = setting.seconds
+                    yield setting
 
 
 def _cuts(job: Job, pulses: int, asked: Mapping[str, Any]) -> list[tuple[int, int]]:
@@ -93,6 +101,7 @@ class _Options:
     oversampling: int
     taps: int
     nodes_db: int
+    presum_db: int
     side_px: int
     chunk: int
 
@@ -162,42 +171,52 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
         signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
     )
     table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
-    error_db = power_sum_db(
-        table_db,
-        nodes_db + 10 * np.log10(2 * len(sizes) + 1),
-        _FLOAT32_DB,
-        20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
-    )
     asked = {"degree": 2, **DIRECTLY_AT[nodes_db]._asdict()}
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
     direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
-    seconds, directly = _seconds(job, seen, pulses, options, direct_s)
+    cost = _cost(job, seen, pulses, options, direct_s)
+    error_db = power_sum_db(
+        table_db,
+        nodes_db + 10 * np.log10(2 * len(sizes) + 1),
+        cost.presum_db,
+        _FLOAT32_DB,
+        20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
+    )
     nodes = f"interpolation between nodes errs by {nodes_db} dB at each of {len(sizes)} levels"
     return Setting(
         "tree",
         {"oversampling": options.oversampling, "taps": options.taps},
-        {"nodes_db": nodes_db, "side_px": options.side_px, "chunk": options.chunk},
+        {"nodes_db": nodes_db, "presum_db": options.presum_db, "side_px": options.side_px, "chunk": options.chunk},
         float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
-        seconds,
-        table_seconds=_START_S + (direct.table_seconds if directly else 0.0),
-        table_bytes=8 * pulses * signal.samples + (direct.table_bytes if directly else 0),
+        cost.seconds,
+        table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
+        table_bytes=8 * pulses * signal.samples + (direct.table_bytes if cost.directly else 0),
         reasons={
             "oversampling": f"table errs by {table_db:.1f} dB",
             "taps": "of the table's filters",
             "nodes_db": nodes,
-            "side_px": f"cheapest here; about {100 * directly:.0f} % of pixel·pulses go directly",
+            "presum_db": f"pulses for which fewer stand err by {cost.presum_db:.0f} dB",
+            "side_px": f"cheapest here; about {100 * cost.directly:.0f} % of pixel·pulses go directly",
             "chunk": "pulses of the largest subaperture, cheapest here",
         },
     )
 
 
-def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float) -> tuple[float, float]:
-    """Return the seconds of the whole image, and the part of it that goes directly, `direct_s` a pixel and pulse."""
+@dataclass(frozen=True)
+class _Cost:
+    """Seconds of the whole image, the part of it that goes directly, and what pulses made fewer err by."""
+
+    seconds: float
+    directly: float
+    presum_db: float
+
+
+def _cost(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float) -> _Cost:
+    """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
     side = min(options.side_px, job.tile_px, *job.shape)
     chunks = -(-pulses // options.chunk)
     limit = 10 ** (options.nodes_db / 20)
-    spent: list[float] = []
-    directly: list[float] = []
+    spent, directly, presum = list[float](), list[float](), [0.0]
     looks, edge = iter(seen.looks), _weighed_directly(job, seen, options.nodes_db)
     for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
         here = next(looks) if np.isfinite(surface.rough_m) else ()
@@ -206,17 +225,19 @@ def _seconds(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: fl
             directly.append(1.0)
             continue
         for one in here:
-            counts = counts_of(one, options.nodes_db, smooth_rad=SMOOTH * limit, weighted=job.beams is not None)
+            counts = counts_of(one, options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
             directly.append(edge if counts.nodes else 1.0)
             if not counts.nodes:
                 spent.append(pulses * side**2 * direct_s)
                 continue
+            presum.append(counts.presum_rad**2)
             amounts = features(one, counts, options, job.signal, _Work(min(pulses, options.chunk), side))
             by_tree = chunks * sum(cost * amount for cost, amount in amounts)
             spent.append((1 - edge) * by_tree + edge * pulses * side**2 * direct_s)
     tiles = job.pixels / side**2
     whole = job.share * tiles * float(np.mean(spent)) + _SURFACE_S * job.pixels + _FORM_S * job.tiles
-    return whole + job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S, float(np.mean(directly))
+    whole += job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S
+    return _Cost(whole, float(np.mean(directly)), float(10 * np.log10(np.mean(presum) + 1e-30)))
 
 
 def features(

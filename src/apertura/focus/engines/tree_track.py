@@ -1,19 +1,18 @@
 """How pulses are grouped into leaves and larger subapertures of a tree, and how smooth the track over a leaf is."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.focus.engines.native_structs import TREE_GROUP
+from apertura.focus.engines.native_structs import TREE_GROUP, TREE_TERMS
+from apertura.focus.engines.tree_nodes import nodes
 
 LEAF = TREE_GROUP
 """Pulses that a leaf makes fewer, and sums at its nodes."""
 
 DEGREES = (5, 9, 14, 20)
 """Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
-
-SMOOTH = 1.0
-"""Of what an interpolation may err by: how far pulses may leave such a curve, RMS. What they leave it by errs more than
-itself: fewer pulses neither show it nor leave it out."""
 
 _SECOND = 256  # pulses of a subaperture of leaves
 
@@ -44,9 +43,61 @@ def stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
 
 
-def leaf_roughness(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, curve) RMS distance of pulses from curves of growing degree through them, metres."""
-    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), DEGREES[-1]))[0]
-    terms = np.einsum("pt,npc->ntc", basis, leaves_m - leaves_m[:, :1])
-    power = ((leaves_m - leaves_m[:, :1]) ** 2).sum((1, 2))[:, None] - np.cumsum((terms**2).sum(-1), axis=1)
-    return np.asarray(np.sqrt(np.maximum(power[:, DEGREES], 0) / LEAF))
+def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, term, 3) float64: the track over each leaf as orthonormal polynomials of the pulses' numbers."""
+    return np.einsum("pt,npc->ntc", _polynomials()[0], leaves_m)
+
+
+def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much the legs of pulses leave curves of growing degree through them, along the worst direction.
+
+    Parameters
+    ----------
+    one_m, other_m
+        (leaf, pulse, 3) float64: phase centres of the two antennas, which may share a platform.
+
+    Returns
+    -------
+    ndarray
+        (leaf, curve) float64, metres RMS, of both legs together.
+
+    Examples
+    --------
+    >>> jitter = 1e-3 * np.random.default_rng(1).standard_normal((2, 1, 64, 3))
+    >>> leaf_roughness(*jitter)[0, 0] < 2e-3 < leaf_roughness(jitter[0], jitter[0])[0, 0]
+    True
+    """
+    apart = _widest(one_m) + _widest(other_m)
+    return np.asarray(np.sqrt(np.maximum(apart, _widest(one_m + other_m))))
+
+
+def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, curve) the largest variance along any direction, of what leaves curves of growing degree."""
+    shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
+    terms = tracks(shifted)
+    for number, degree in enumerate(DEGREES):
+        rest = shifted - np.einsum("pt,ntc->npc", _polynomials()[0][:, : degree + 1], terms[:, : degree + 1])
+        widest[:, number] = np.linalg.eigvalsh(np.einsum("npc,npd->ncd", rest, rest) / LEAF)[:, -1]
+    return np.maximum(widest, 0)
+
+
+@cache
+def curve(fewer: int, nodes_db: int) -> NDArray[np.float64]:
+    """Return the polynomials of `tracks` at the pulses that stand for those of a leaf, (pulse, term) float64.
+
+    Examples
+    --------
+    >>> bends = np.linspace(-1, 1, 64)[None, :, None] ** 3 * np.ones(3)
+    >>> smooth = curve(9, -74) @ tracks(bends)[0]
+    >>> bool(np.abs(smooth[:, 0] - nodes(9, -74) ** 3).max() < 1e-12)
+    True
+    """
+    seen = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
+    return np.ascontiguousarray(seen @ _polynomials()[1])
+
+
+@cache
+def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (pulse, term) orthonormal polynomials, and what makes them of Legendre's."""
+    basis, triangle = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), TREE_TERMS - 1))
+    return basis, np.linalg.inv(triangle)

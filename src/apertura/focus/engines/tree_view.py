@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.focus.engines.native_structs import TREE_FEWER
+from apertura.focus.engines.native_structs import TREE_FEWER, TREE_MORE
 from apertura.focus.engines.tree_nodes import MOST_NODES, supports
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.engines.tree_track import DEGREES, LEAF, leaf_roughness, leaves_of
@@ -17,7 +17,6 @@ from apertura.geometry.aperture import Aperture
 _FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
 _NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
 _AIRY = 3.0  # units of eq. 4b
-_SPREAD = 4  # pulses that a curve takes beyond its degree: native/tree_plan.hpp, kTreeMore
 _WEIGHTED = 1.5  # rad that weights add to a band: native/tree_job.hpp
 _LOOKED_AT = 3  # subapertures of a level, at most
 
@@ -134,7 +133,7 @@ def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tup
         three = leaf[np.array([0, (len(leaf) - 1) // 2, len(leaf) - 1])]
         first, middle, last = three.path(slopes.places_m) - three.path(slopes.centre_m[None])
         turn = max(turn, float((0.5 * np.abs(last - first) + np.abs(first + last - 2 * middle)).max()))
-        off_m = sum(leaf_roughness(leaves_of(leg))[0] for leg in leaf.legs)
+        off_m = leaf_roughness(*(leaves_of(leg) for leg in leaf.legs))[0]
         nearest = min(float(np.linalg.norm(leg[len(leaf) // 2] - slopes.centre_m)) for leg in leaf.legs)
         rough = np.maximum(rough, off_m * slopes.radius_m / nearest / np.sqrt(3))
     return wavenumber_rad_m * turn, wavenumber_rad_m * rough
@@ -193,13 +192,16 @@ class Counts:
         (2,) of each level, along columns and rows; fewer levels where the higher ones hold too many. None: no tree.
     fewer
         Pulses that stand for those of a leaf; 0: each for itself.
+    presum_rad
+        What those of a leaf err by for which fewer stand, RMS.
     """
 
     nodes: tuple[tuple[int, int], ...]
     fewer: int
+    presum_rad: float
 
 
-def counts_of(looks: Looks, nodes_db: int, *, smooth_rad: float, weighted: bool) -> Counts:
+def counts_of(looks: Looks, nodes_db: int, *, presum_db: float, weighted: bool) -> Counts:
     """Return the numbers of nodes of each level, and of pulses that stand for those of a leaf."""
     more = _WEIGHTED if weighted else 0.0
     levels: list[tuple[int, int]] = []
@@ -208,9 +210,10 @@ def counts_of(looks: Looks, nodes_db: int, *, smooth_rad: float, weighted: bool)
         if max(along, across) > MOST_NODES:
             break
         levels.append((int(along), int(across)))
-    smooth = np.flatnonzero(looks.rough_rad <= smooth_rad)
-    fewer = 0
+    smooth = np.flatnonzero(looks.rough_rad <= 10 ** (presum_db / 20))
     if len(smooth):
         turned = int(nodes_for(np.array([looks.turn_rad + more]), nodes_db)[0])
-        fewer = max(DEGREES[smooth[0]] + _SPREAD, turned)
-    return Counts(tuple(levels), fewer if fewer <= TREE_FEWER else 0)
+        fewer = max(DEGREES[smooth[0]] + TREE_MORE, turned)
+        if fewer <= TREE_FEWER:
+            return Counts(tuple(levels), fewer, float(looks.rough_rad[np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1]))
+    return Counts(tuple(levels), 0, 0.0)
