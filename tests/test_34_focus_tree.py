@@ -32,14 +32,14 @@ def plain():
     return flown(pixel_grid(70, 90), pulses=300)
 
 
-@pytest.mark.parametrize("nodes_db", [-50, -74, -92])
+@pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 def test_every_instruction_set_errs_as_predicted(isa, flights, nodes_db):
     image, share = formed(flights, nodes_db=nodes_db)
     assert tree.instruction_set() == isa
     assert share.tolist() == [1, 0, 0]
     predicted_db = setting(flights, nodes_db=nodes_db).error_db
     assert error_db(flights.scene, flights.pixels, image) <= predicted_db + 3
-    assert nodes_db + 3 < predicted_db < nodes_db + 13
+    assert nodes_db + 3 < predicted_db < max(nodes_db + 13, -83)  # cells and float32 err by that
 
 
 def test_tiles_change_nothing_to_the_bit(isa, plain):
@@ -213,7 +213,7 @@ def test_prepared_pulses_add_up(plain, edges):
     assert decibels(total - whole, whole) <= -65
 
 
-@pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -92)])
+@pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -98)])
 def test_the_table_of_supports_is_what_nodes_hold(count, nodes_db):
     assert supports(nodes_db)[count] == pytest.approx(widest_band(count, nodes_db), abs=0.02)
 

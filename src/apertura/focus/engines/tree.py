@@ -43,7 +43,7 @@ class Options(EngineOptions):
     oversampling: Annotated[int, Field(ge=8, le=64)] | None = Field(
         None, description="table cells per resolution cell c/B of total path"
     )
-    nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92] | None = Field(
+    nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92, -98] | None = Field(
         None, description="what one interpolation between nodes may err by, dB"
     )
     presum_db: Annotated[int, Field(ge=-100, le=-40)] | None = Field(

@@ -41,6 +41,7 @@ DIRECTLY_AT = {
     -80: Directly(8, 7e-4),
     -86: Directly(10, 3e-4),
     -92: Directly(12, 1.5e-4),
+    -98: Directly(12, 1.5e-4),
 }
 """Error of one interpolation between nodes, dB → the direct kernel's setting beside it, which errs less than a tree."""
 

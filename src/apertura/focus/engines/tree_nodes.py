@@ -15,7 +15,7 @@ MOST_NODES = 128
 COUNTS = (*range(2, 9), *range(10, 65, 2), *range(68, MOST_NODES + 1, 4))
 """Numbers of nodes that are used."""
 
-NODES_DB = (-44, -50, -56, -62, -68, -74, -80, -86, -92)
+NODES_DB = (-44, -50, -56, -62, -68, -74, -80, -86, -92, -98)
 """RMS errors of one interpolation that nodes are made for."""
 
 _NOISE_DB = -20.0  # white noise that weights are made for, beside the error they are made for

@@ -21,7 +21,7 @@ from apertura.focus.engines.tree_weights import DIRECTLY, SILENTLY, weights_over
 from apertura.focus.job import Job, Signal
 
 SETTINGS: Mapping[int, tuple[int, int]] = {
-    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16), -86: (64, 16), -92: (64, 16),
+    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16), -86: (64, 16), -92: (64, 16), -98: (64, 16),
 }  # fmt: skip
 """Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
 
@@ -36,17 +36,17 @@ _FLOAT32_DB = -92.0
 _FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
 # Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
-_NODE_S = 1.4e-9  # a node that looks a pulse up
-_EXPAND_S = 1.9e-9  # sixteen taps of a cell's filters
-_ALIGN_S = 2.5e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
-_MIX_S = 1.5e-11  # a complex multiply-add of merges and pixels
-_PIXEL_S = 4.4e-9  # a pixel of a subaperture's
-_LEAF_S = 1.2e-5  # a leaf over a tile: its plan
-_SURFACE_S = 1.3e-8  # a pixel's place, fitted
-_TILE_S = 6.5e-5  # a tile of a chunk
+_NODE_S = 7e-10  # a node that looks a pulse up
+_EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
+_EACH_EXPAND_S = 4.6e-9  # of pulses that go for themselves, whose cells tiles side by side share
+_ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
+_MIX_S = 5e-12  # a complex multiply-add of merges and pixels
+_PIXEL_S = 4.5e-9  # a pixel of a subaperture's
+_LEAF_S = 6e-6  # a leaf over a tile: its plan
+_SURFACE_S = 1.6e-8  # a pixel's place, fitted
+_TILE_S = 4e-5  # a tile of a chunk
 _APART = 1.1  # times as long as in one go for pixels and pulses that go directly, tile by tile and chunk by chunk
 _WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
-_PLAIN = 2.0  # times as long where each pulse goes for itself: its cells are many
 _FORM_S = 4e-4  # a block of pixels
 _SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
@@ -108,10 +108,11 @@ class _Options:
 
 @dataclass(frozen=True)
 class _Work:
-    """One tile and one chunk: pulses, and pixels along a side."""
+    """One tile and one chunk: pulses, pixels along a side, and how many such tiles lie along the side of a block."""
 
     pulses: int
     side: int
+    beside: float
 
 
 @lru_cache(maxsize=64)
@@ -215,6 +216,7 @@ def _cost(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float
     """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
     side = min(options.side_px, job.tile_px, *job.shape)
     chunks = -(-pulses // options.chunk)
+    work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
     limit = 10 ** (options.nodes_db / 20)
     spent, directly, presum = list[float](), list[float](), [0.0]
     looks, edge = iter(seen.looks), _weighed_directly(job, seen, options.nodes_db)
@@ -231,7 +233,7 @@ def _cost(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float
                 spent.append(pulses * side**2 * direct_s)
                 continue
             presum.append(counts.presum_rad**2)
-            amounts = features(one, counts, options, job.signal, _Work(min(pulses, options.chunk), side))
+            amounts = features(one, counts, options, job.signal, work)
             by_tree = chunks * sum(cost * amount for cost, amount in amounts)
             spent.append((1 - edge) * by_tree + edge * pulses * side**2 * direct_s)
     tiles = job.pixels / side**2
@@ -246,13 +248,13 @@ def features(
     """Return what one tile and one chunk take by tree: seconds each, and how many."""
     leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
     samples = looks.span_m / signal.step_m + 6
-    looked_up = leaves[0] * counts.fewer if counts.fewer else _PLAIN * work.pulses
+    looked_up = leaves[0] * counts.fewer if counts.fewer else work.pulses
     cells_of = cells_per_sample(signal.oversampling, options.oversampling)
     aligned = work.pulses * (samples + options.taps) * (TREE_DELAYS + counts.fewer) if counts.fewer else 0.0
     columns, rows = counts.nodes[0]
     return [
         (_NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
-        (_EXPAND_S, looked_up * samples * cells_of * options.taps / 16),
+        (_EXPAND_S if counts.fewer else _EACH_EXPAND_S / work.beside, looked_up * samples * cells_of * options.taps / 16),
         (_ALIGN_S, aligned),
         (_MIX_S, _mixed(counts, leaves, work.side)),
         (_PIXEL_S, leaves[len(counts.nodes) - 1] * work.side**2),
