@@ -13,12 +13,6 @@ struct Work {
   MergeScratch merge;
 };
 
-bool any_taken(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t end) {
-  for (int64_t p = begin; p < end && p < job.pulses; p += apertura::kTreeGroup)
-    if (tile.way[p / apertura::kTreeGroup] == apertura::kByTree) return true;
-  return false;
-}
-
 // Brings a leaf's sums up the tree, as far as its subapertures are complete; at the top of the tile to its pixels.
 void climb(const TreeJob& job, TileState& state, int64_t begin, int64_t end, bool summed, Work& work) {
   const TreeTile& tile = state.tile;

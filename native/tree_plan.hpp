@@ -165,6 +165,7 @@ inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Seen& se
   for (int64_t n = 0; n < count; n++) {
     const int64_t begin = n * size, end = std::min(begin + size, job.pulses) - 1;
     const int64_t pulses[3] = {begin, (begin + end) / 2, end};
+    if (tile.way[begin / kTreeGroup] != apertura::kByTree) continue;
     for (int64_t i = 0; i < 3; i++) {
       const Legs legs = legs_of(job, tile.centre, pulses[i]);
       leaves.slopes[3 * n + i] = slopes_at(legs, seen);
@@ -176,6 +177,13 @@ inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Seen& se
   return leaves;
 }
 
+// Whether any of some pulses goes by the tree of a tile.
+inline bool any_taken(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t end) {
+  for (int64_t p = begin; p < end && p < job.pulses; p += apertura::kTreeGroup)
+    if (tile.way[p / apertura::kTreeGroup] == apertura::kByTree) return true;
+  return false;
+}
+
 // Node counts of one level. Returns whether the nodes there are do for all subapertures that any pulse takes.
 inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, const Leaves& leaves, const Slopes& mixed,
                        int64_t level) {
@@ -184,21 +192,21 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
   bool holds = true;
   for (int64_t begin = 0; begin < job.pulses; begin += size, nodes += 2) {
     const int64_t end = std::min(begin + size, job.pulses);
+    nodes[0] = nodes[1] = 2;
+    if (!any_taken(job, tile, begin, end)) continue;
     const Slopes middle = slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
     const Reference reference(middle, mixed, seen);
     Band band;
     float stray_xi = 0, stray_eta = 0;
-    bool taken = false;
     for (int64_t n = begin / leaf; n * leaf < end; n++) {
       if (tile.way[n * leaf / kTreeGroup] != apertura::kByTree) continue;
-      taken = true;
       for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, seen);
       stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
     }
     const double more = tile.weight ? kTreeWeighted : 0;
     const int64_t xi = nodes_for(job, Band::most(band.xi, seen, 1) + stray_xi + more);
     const int64_t eta = nodes_for(job, Band::most(band.eta, seen, seen.side) + stray_eta + more);
-    holds &= !taken || (xi <= kTreeNodes && eta <= kTreeNodes);
+    holds &= xi <= kTreeNodes && eta <= kTreeNodes;
     nodes[0] = uint8_t(std::min(xi, kTreeNodes)), nodes[1] = uint8_t(std::min(eta, kTreeNodes));
   }
   return holds;

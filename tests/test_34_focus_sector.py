@@ -5,7 +5,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import compiled, decibels, ecef, fly, monostatic, pixel_grid, scatter, strip_history, swaying_beam
+from scenes import (
+    compiled,
+    decibels,
+    ecef,
+    fly,
+    monostatic,
+    pixel_grid,
+    scatter,
+    straight_track,
+    strip_history,
+    swaying_beam,
+)
 
 from apertura.antenna.beam import Beams
 from apertura.antenna.illumination import reached
@@ -107,6 +118,17 @@ def test_images_by_parts_of_the_scene_have_no_seams(isa, flown):
     weight = beams.sector.weight(flown.aperture, places.reshape(-1, 3)).reshape(131, *places.shape[:2])
     steps = np.abs(np.diff(weight, axis=2)).max(axis=(0, 1))
     assert steps[31] <= 1.5 * np.median(steps)
+
+
+def test_a_place_is_what_the_definition_says_in_any_frame_and_beside_one_that_is_none():
+    track = straight_track(9) + [4.1e6, 0.9e6, 4.8e6]
+    aperture, points = monostatic(track), track[4] + np.array([[0.3, 17.0, -9.0], [np.nan] * 3, [-4.0, 30.0, -10.0]])
+    sector = Sector.of(aperture, chord_m=2.0, centre=0.1, half=0.25)
+    away = points[None] - track[:, None]
+    toward = 2 * away / np.linalg.norm(away, axis=-1, keepdims=True)
+    expected = np.einsum("pnx,px->pn", toward, sector.tx_axis) - 0.1
+    np.testing.assert_allclose(sector.place(aperture, points), expected, atol=1e-9)
+    assert sector[:0].place(aperture[:0], points).shape == (0, 3)
 
 
 def test_the_edge_is_level_at_both_ends():

@@ -194,6 +194,17 @@ def test_the_edges_of_a_sector_go_directly(plain):
     assert weighed_error_db(plain, image, beams) <= -62
 
 
+def test_what_a_tile_cannot_take_goes_to_its_quarters(monkeypatch):
+    """The edge of a sector crosses a large tile for longer than each of its quarters."""
+    flight = flown(pixel_grid(140, 150), pulses=300)
+    beams = Beams(None, None, Sector.of(flight.aperture, chord_m=1.2, centre=0.02, half=0.25))
+    image, share = formed(flight, beams=beams, side_px=256)
+    monkeypatch.setattr(tree, "LEAST_QUARTER_PX", 256)
+    whole, less = formed(flight, beams=beams, side_px=256)
+    assert share[0] > less[0] + 0.1
+    assert max(weighed_error_db(flight, one, beams) for one in (image, whole)) <= -62
+
+
 def test_the_edge_of_a_beam_goes_directly(plain):
     soft, angle = swaying_beam(plain.scene.tx, (12, 0, 0), sway_deg=1), np.radians([-5.0, 0, 5.0])
     beams = Beams(Beam(soft.axes, angle, np.ones(3), angle, np.ones(3)))

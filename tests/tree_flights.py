@@ -74,4 +74,4 @@ def counted(aperture, pixels, nodes_db=-74, *, presum_db=-74, carrier_hz=1.2e9):
     seen = look(
         aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
     )
-    return counts_of(seen, nodes_db, presum_db=presum_db, weighted=False)
+    return counts_of(seen, nodes_db=nodes_db, presum_db=presum_db, weighted=False)

@@ -102,11 +102,20 @@ class Sector:
         """
         if len(self.tx_axis) != len(aperture):
             raise ValueError(f"{len(self.tx_axis)=}: must be one for each of {len(aperture)} pulses")
-        place = np.full((len(aperture), *points_m.shape[:-1]), -self.centre)
+        # Products of matrices, about a place so near that squares of distances lose nothing.
+        flat, middle = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
+        seen = flat - middle
+        place = np.full((len(aperture), len(flat)), -self.centre)
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
-            apart = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
-            place += np.einsum("p...x,px->p...", apart, axis) / np.linalg.norm(apart, axis=-1)
-        return place
+            antenna = leg - middle
+            square = antenna @ (-2 * seen.T)
+            square += (antenna**2).sum(axis=1)[:, None]
+            square += (seen**2).sum(axis=1)
+            along = axis @ seen.T
+            along -= (antenna * axis).sum(axis=1)[:, None]
+            along /= np.sqrt(square, out=square)
+            place += along
+        return place.reshape(len(aperture), *points_m.shape[:-1])
 
     def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weight of each pulse at each point: as `place`, 0 to 1."""

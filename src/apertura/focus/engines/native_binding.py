@@ -16,6 +16,8 @@ from apertura.focus.engines.native_structs import STRUCTS
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
+_BUILT = str(files("apertura.focus.engines") / "_backprojection.so")  # found once: calls may be short
+
 
 def layout() -> dict[str, str]:
     """Return the layout of the structs as this module lays them out: field → where it lies, struct → its size.
@@ -125,7 +127,7 @@ def call(function: str, job: ctypes.Structure) -> None:
 
 def library_path() -> Path:
     """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers."""
-    return Path(os.environ.get("APERTURA_KERNEL") or str(files("apertura.focus.engines") / "_backprojection.so"))
+    return Path(os.environ.get("APERTURA_KERNEL") or _BUILT)
 
 
 def library() -> ctypes.CDLL:

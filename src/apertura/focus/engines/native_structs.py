@@ -7,7 +7,7 @@ _int64 = ctypes.c_int64
 _double = ctypes.c_double
 
 TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
-TREE_TERMS, TREE_MORE = 21, 4
+TREE_TERMS, TREE_MORE, TREE_WEIGHTS = 21, 4, 16
 """As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
 a leaf; pixels along a tile; taps that align a pulse; pulses that stand for those of a leaf, at most."""
 
@@ -84,7 +84,8 @@ class TreeJob(ctypes.Structure):
 
     _fields_ = [
         *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "rough", "track")),
-        *((name, _pointer) for name in ("taps", "delay", "presum", "curve", "supports", "places", "spread", "mix", "tiles")),
+        *((name, _pointer) for name in ("taps", "delay", "presum", "curve", "supports", "places", "spread", "mix")),
+        ("tiles", _pointer),
         *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
         *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
         ("sizes", _int64 * TREE_LEVELS),

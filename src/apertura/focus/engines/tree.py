@@ -6,7 +6,8 @@ go through the direct kernel.
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import pairwise, product
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,8 +20,9 @@ from apertura.focus.engines import native
 from apertura.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.focus.engines.native_binding import available, instruction_set
 from apertura.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
-from apertura.focus.engines.tree_chunk import Chunk, Tile
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, Trees, prepare
+from apertura.focus.engines.native_tables import Tables
+from apertura.focus.engines.tree_chunk import Chunk, Task, Tile
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_PIXELS, LEAST_QUARTER_PX, Trees, prepare
 from apertura.focus.engines.tree_prediction import candidates
 from apertura.focus.engines.tree_surface import surfaces_of, windows
 from apertura.focus.engines.tree_track import subaperture_sizes
@@ -31,10 +33,6 @@ __all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set"
 READS: Literal["profiles"] = "profiles"
 
 WAYS = ("by tree", "directly", "without an echo")
-
-
-LEAST_PIXELS = 32**2
-"""Of a tile: fewer go directly."""
 
 
 class Options(EngineOptions):
@@ -107,23 +105,15 @@ def form(
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
-    image = np.zeros(pixels.shape[:2], np.complex64)
-    tally = np.zeros(3, np.int64)
-    tiles = _tiles(trees, pixels, side_px, nodes_db)
-    sizes = subaperture_sizes(chunk)
+    block = _Block(pixels, np.zeros(pixels.shape[:2], np.complex64), nodes_db, presum_db, subaperture_sizes(chunk))
+    tiles = block.tiles(trees, list(windows(pixels.shape[:2], side_px)))
     for pulses in trees.chunks(chunk):
-        some, weighing = trees[pulses], beams and beams[pulses]
-        ways = Chunk(some, weighing, nodes_db, presum_db, sizes, pixels, image).add(tiles)
-        for tile, way in zip(tiles, ways, strict=True):
-            for run in _direct_runs(way, len(some)):
-                part, weights = some.direct(nodes_db)[run], weighing and weighing[run]
-                tolerance_rad = DIRECTLY_AT[nodes_db].tolerance_rad
-                image[tile.window] += native.form(part, pixels[tile.window], beams=weights, tolerance_rad=tolerance_rad)
-            pulses_of = np.minimum(TREE_GROUP, len(some) - TREE_GROUP * np.arange(len(way)))
-            tally += image[tile.window].size * np.bincount(way, pulses_of, 3).astype(np.int64)
+        some = trees[pulses]
+        every = np.ones(-(-len(some) // TREE_GROUP), bool)
+        block.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
     if counts is not None:
-        counts += tally
-    return image
+        counts += block.counts
+    return block.image
 
 
 def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
@@ -131,19 +121,63 @@ def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[
     return windows(shape, form_options["side_px"])
 
 
-def _tiles(trees: Trees, pixels: NDArray[np.float64], side_px: int, nodes_db: int) -> list[Tile]:
-    """Return the tiles of a block; those that are small or rough do not go by tree."""
-    parts = list(windows(pixels.shape[:2], side_px))
-    limit = 2 * 10 ** (nodes_db / 10)
-    return [
-        Tile(part, surface, pixels[part].size >= 3 * LEAST_PIXELS and trees.roughness(surface) <= limit)
-        for part, surface in zip(parts, surfaces_of(pixels, parts), strict=True)
-    ]
+@dataclass(eq=False)
+class _Block:
+    """A block of pixels, its image, how trees are to err, and how many pixels × pulses went which way."""
+
+    pixels: NDArray[np.float64]
+    image: NDArray[np.complex64]
+    nodes_db: int
+    presum_db: float
+    sizes: tuple[int, ...]
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(WAYS), np.int64))
+    _quarters: dict[Tile, list[Tile]] = field(default_factory=dict)
+
+    def tiles(self, trees: Trees, parts: list[Window]) -> list[Tile]:
+        """Return tiles of the block; those that are small or rough do not go by tree."""
+        limit = 2 * 10 ** (self.nodes_db / 10)
+        return [
+            Tile(part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and trees.roughness(surface) <= limit)
+            for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
+        ]
+
+    def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
+        """Add groups of the pulses to tiles; what the tree of a tile cannot take goes to its quarters, or directly."""
+        chunk = Chunk(trees, beams, self.nodes_db, self.presum_db, self.sizes, self.pixels, self.image)
+        pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
+        left: list[Task] = []
+        for (tile, wanted), way in zip(tasks, chunk.add(tasks), strict=True):
+            direct = wanted & (way == DIRECTLY)
+            smaller = self._quartered(trees, tile) if direct.any() else []
+            left += [(quarter, direct) for quarter in smaller]
+            done = wanted & ~direct if smaller else wanted
+            self.counts += self.image[tile.window].size * np.bincount(way[done], pulses_of[done], 3).astype(np.int64)
+            for run in () if smaller else _runs(direct, len(trees)):
+                self._add_directly(trees.direct(self.nodes_db)[run], beams and beams[run], tile.window)
+        if left:
+            self.add(trees, beams, left)
+
+    def _quartered(self, trees: Trees, tile: Tile) -> list[Tile]:
+        """Return the quarters of a tile, none of one too small: it sees less of what is not smooth."""
+        rows, columns = tile.window
+        if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:
+            return []
+        if tile not in self._quarters:
+            tops, lefts = (
+                (slice(part.start, middle), slice(middle, part.stop))
+                for part, middle in ((part, (part.start + part.stop) // 2) for part in tile.window)
+            )
+            self._quarters[tile] = self.tiles(trees, list(product(tops, lefts)))
+        return self._quarters[tile]
+
+    def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
+        tolerance_rad = DIRECTLY_AT[self.nodes_db].tolerance_rad
+        self.image[window] += native.form(tables, self.pixels[window], beams=beams, tolerance_rad=tolerance_rad)
 
 
-def _direct_runs(way: NDArray[np.uint8], pulses: int) -> Iterator[slice]:
-    """Yield runs of pulses that are taken directly."""
-    edges = [0, *(np.flatnonzero(np.diff(way)) + 1).tolist(), len(way)]
+def _runs(groups: NDArray[np.bool_], pulses: int) -> Iterator[slice]:
+    """Yield runs of pulses in these groups."""
+    edges = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist(), len(groups)]
     for first, last in pairwise(edges):
-        if way[first] == DIRECTLY:
+        if groups[first]:
             yield slice(first * TREE_GROUP, min(pulses, last * TREE_GROUP))

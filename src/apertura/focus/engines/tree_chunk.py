@@ -2,7 +2,7 @@
 
 import ctypes
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from apertura.focus.engines.native_structs import (
     TREE_GROUP,
     TREE_NODES,
     TREE_SLOTS,
+    TREE_WEIGHTS,
     TreeJob,
     TreeTile,
 )
@@ -22,7 +23,7 @@ from apertura.focus.engines.tree_inputs import Trees, delay_filter
 from apertura.focus.engines.tree_nodes import matrices, nodes, pixel_places, supports
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.engines.tree_track import LEAF, curve
-from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, weights_over
+from apertura.focus.engines.tree_weights import BY_TREE, DIRECTLY, SILENTLY, weights_over
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,14 @@ class Tile:
     window: Window
     surface: Surface
     by_tree: bool
+
+
+Task = tuple[Tile, NDArray[np.bool_]]
+"""A tile, and which groups of 64 pulses are to be added to it."""
+
+_Taken = tuple[
+    NDArray[np.float32] | None, NDArray[np.uint8], NDArray[np.uint8]
+]  # weights, ways, which go by themselves
 
 
 @dataclass(eq=False)
@@ -61,16 +70,14 @@ class Chunk:
     _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
     _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that stand for those of a leaf
 
-    def add(self, tiles: list[Tile]) -> list[NDArray[np.uint8]]:
-        """Add what goes by tree; return how groups of 64 pulses are taken over each tile."""
-        ways: list[NDArray[np.uint8]] = []
-        structs: list[TreeTile] = []
-        for tile in tiles:
-            weight, way, fewer = self._weighed(tile)
-            ways.append(way)
-            self._fewer.append(fewer)
-            structs.append(self._struct(tile, weight, way, fewer))
-        array = (TreeTile * len(structs))(*structs)
+    def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
+        """Add what goes by tree, of the groups of 64 pulses given for each tile; return how groups are taken."""
+        seen = [taken for _, some in groupby(tasks, key=lambda task: id(task[1])) for taken in self._taken(list(some))]
+        ways = [way for _, way, _ in seen]
+        self._fewer = [fewer for *_, fewer in seen]
+        array = (TreeTile * len(tasks))(
+            *(self._struct(tile, *taken) for (tile, _), taken in zip(tasks, seen, strict=True))
+        )
         job = self._job(array)
         call("apertura_plan_tree", job)
         for struct, way in zip(array, ways, strict=True):
@@ -84,13 +91,32 @@ class Chunk:
         self._held.append(array)
         return array.ctypes.data
 
-    def _weighed(self, tile: Tile) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8], NDArray[np.uint8]]:
-        groups = -(-len(self.trees) // TREE_GROUP)
-        if not tile.by_tree:
-            return None, np.full(groups, DIRECTLY, np.uint8), np.zeros(groups, np.uint8)
-        if self.beams is None:
-            return None, np.full(groups, BY_TREE, np.uint8), np.zeros(groups, np.uint8)
-        return weights_over(self.beams, self.trees.profiles.aperture, tile.surface, self.nodes_db)
+    def _taken(self, tasks: list[Task]) -> list[_Taken]:
+        """Return how the same groups of pulses are taken over some tiles."""
+        wanted = tasks[0][1]
+        plain: list[_Taken] = [
+            (
+                None,
+                np.where(wanted, BY_TREE if tile.by_tree else DIRECTLY, SILENTLY).astype(np.uint8),
+                np.zeros(len(wanted), np.uint8),
+            )
+            for tile, _ in tasks
+        ]
+        weighed = [number for number, (tile, _) in enumerate(tasks) if tile.by_tree]
+        if self.beams is None or not weighed:
+            return plain
+        first, last = np.flatnonzero(wanted)[[0, -1]]
+        groups, pulses = slice(first, last + 1), slice(first * TREE_GROUP, (last + 1) * TREE_GROUP)
+        surfaces = [tasks[number][0].surface for number in weighed]
+        aperture = self.trees.profiles.aperture[pulses]
+        found = zip(*weights_over(self.beams[pulses], aperture, surfaces, self.nodes_db), strict=True)
+        for number, (weights, ways, each) in zip(weighed, found, strict=True):
+            weight = np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)
+            _, way, fewer = plain[number]
+            weight[pulses], fewer[groups] = weights, each
+            way[groups] = np.where(wanted[groups], ways, SILENTLY)
+            plain[number] = weight, way, fewer
+        return plain
 
     def _struct(
         self, tile: Tile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]

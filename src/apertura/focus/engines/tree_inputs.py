@@ -21,6 +21,12 @@ from apertura.geometry.aperture import Aperture
 CELLS_AT_ONCE = 4
 """Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
 
+LEAST_PIXELS = 32**2
+"""Of a tile: fewer go directly."""
+
+LEAST_QUARTER_PX = 64
+"""Side of the quarter of a tile: smaller ones are not worth a tree of their own."""
+
 _SAMPLED = 64  # pulses at which a rough tile is looked at
 _DELAY_DEGREE = 9
 

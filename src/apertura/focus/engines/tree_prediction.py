@@ -2,26 +2,24 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
-from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.native_structs import TREE_DELAYS
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, cells, cells_per_sample, roughness
-from apertura.focus.engines.tree_surface import Surface, surfaces_of
+from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_QUARTER_PX, cells, cells_per_sample
+from apertura.focus.engines.tree_survey import Seen, seen_of, weighed_directly
 from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
-from apertura.focus.engines.tree_view import Counts, Looks, counts_of, look
-from apertura.focus.engines.tree_weights import DIRECTLY, SILENTLY, weights_over
+from apertura.focus.engines.tree_view import Counts, Looks, counts_of
 from apertura.focus.job import Job, Signal
 
 SETTINGS: Mapping[int, tuple[int, int]] = {
-    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16), -86: (64, 16), -92: (64, 16), -98: (64, 16),
+    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16),
+    -86: (64, 16), -92: (64, 16), -98: (64, 16),
 }  # fmt: skip
 """Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
 
@@ -31,7 +29,6 @@ PRESUMS_DB = (0, 6, 12)
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Sides of tiles and pulses of the largest subaperture that are considered."""
 
-_TILES, _CHUNKS_SEEN = 5, 3  # that are looked at
 _FLOAT32_DB = -92.0
 _FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
@@ -52,22 +49,6 @@ _SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """A few tiles of one side, each seen from a few chunks."""
-
-    surfaces: tuple[Surface, ...]
-    looks: tuple[tuple[Looks, ...], ...]
-    rough: tuple[float, ...]  # mean squared error by pixels off their surface
-    groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
-
-    @property
-    def phase_rad(self) -> float:
-        """RMS over them, of places of a tile against its centre."""
-        phases = [look.phase_rad for looks in self.looks for look in looks]
-        return float(np.sqrt(np.mean(np.square(phases)))) if phases else 1.0
-
-
 def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield settings of trees, as `apertura.focus.engines.engine.Engine` describes.
 
@@ -76,7 +57,7 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     Source: docs/theory/tree.md, "Error" and "Cost".
     """
     for side_px, chunk in _cuts(job, pulses, asked):
-        seen = _seen(job, pulses, side_px, chunk)
+        seen = seen_of(job, pulses, side_px, chunk)
         for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
             oversampling, taps = SETTINGS[nodes_db]
             oversampling = asked.get("oversampling") or oversampling
@@ -115,58 +96,7 @@ class _Work:
     beside: float
 
 
-@lru_cache(maxsize=64)
-def _seen(job: Job, pulses: int, side_px: int, chunk: int) -> _Seen:
-    """Return some tiles, and how they are seen from some chunks."""
-    side = min(side_px, job.tile_px, *job.shape)
-    whole = [(slice(0, side), slice(0, side))]
-    surfaces = tuple(surfaces_of(np.ascontiguousarray(patch), whole)[0] for patch in _patches(job, side))
-    places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
-    starts = np.arange(0, pulses, chunk)
-    starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS_SEEN).astype(int))]
-    k, b = job.signal.wavenumber_rad_m, np.pi / (job.signal.step_m * job.signal.oversampling)
-    chunks = [job.aperture[places[start : start + chunk]] for start in starts]
-    looks = tuple(
-        tuple(look(part, surface, subaperture_sizes(chunk), wavenumber_rad_m=k, band_rad_m=b) for part in chunks)
-        for surface in surfaces
-        if np.isfinite(surface.rough_m)
-    )
-    some = job.aperture[job.aperture.sample(64)]
-    groups = [places[start + at : start + at + LEAF] for start in starts for at in (0, chunk // 2 // LEAF * LEAF)]
-    rough = tuple(roughness(some, surface, wavenumber_rad_m=k, band_rad_m=b) for surface in surfaces)
-    return _Seen(surfaces, looks, rough, tuple(group for group in groups if len(group)))
-
-
-@lru_cache(maxsize=256)
-def _weighed_directly(job: Job, seen: _Seen, nodes_db: int) -> float:
-    """Return the part of the groups of pulses that see a tile whose weights no polynomial follows."""
-    if job.beams is None:
-        return 0.0
-    ways = [
-        weights_over(job.beams[group], job.aperture[group], surface, nodes_db)[1]
-        for surface in seen.surfaces
-        for group in seen.groups
-        if np.isfinite(surface.rough_m)
-    ]
-    taken = np.concatenate([*ways, np.empty(0, np.uint8)])
-    taken = taken[taken != SILENTLY]
-    return float((taken == DIRECTLY).mean()) if len(taken) else 0.0
-
-
-def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
-    """Return the pixels' places of a few tiles: those of the job, or on planes about some points of its ground."""
-    if job.patches_m:
-        return list(job.patches_m)
-    count = len(job.points_m)
-    right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
-    at = np.arange(side) - (side - 1) / 2
-    return [
-        job.points_m[n] + at[:, None, None] * down[n] + at[None, :, None] * right[n]
-        for n in np.unique(np.linspace(0, count - 1, _TILES).astype(int))
-    ]
-
-
-def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
+def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
     design = cells(
         signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
@@ -175,7 +105,7 @@ def _setting(job: Job, seen: _Seen, pulses: int, options: _Options) -> Setting:
     asked = {"degree": 2, **DIRECTLY_AT[nodes_db]._asdict()}
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
     direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
-    cost = _cost(job, seen, pulses, options, direct_s)
+    cost = _cost(job, pulses, options, direct_s)
     error_db = power_sum_db(
         table_db,
         nodes_db + 10 * np.log10(2 * len(sizes) + 1),
@@ -212,34 +142,43 @@ class _Cost:
     presum_db: float
 
 
-def _cost(job: Job, seen: _Seen, pulses: int, options: _Options, direct_s: float) -> _Cost:
+def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
     """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
     side = min(options.side_px, job.tile_px, *job.shape)
-    chunks = -(-pulses // options.chunk)
+    whole = _SURFACE_S * job.pixels + _FORM_S * job.tiles
+    left, presum = 1.0, 0.0  # what larger tiles did not take
+    while True:
+        share, seconds, presum_rad2 = _by_tree(job, pulses, options, side)
+        weighed_s = job.weights * job.share * job.pixels / side**2 * pulses * _WEIGHTS * BEAM_S
+        taken = max(0.0, left - (1 - share))
+        whole, presum = whole + taken * seconds + left * weighed_s, max(presum, presum_rad2)
+        left, side = left - taken, side // 2
+        if not left or side < LEAST_QUARTER_PX:
+            break
+    whole += left * pulses * job.share * job.pixels * direct_s
+    return _Cost(whole, left, float(10 * np.log10(presum + 1e-30)))
+
+
+def _by_tree(job: Job, pulses: int, options: _Options, side: int) -> tuple[float, float, float]:
+    """Return the share of an image that tiles of one side can take, seconds of all of it, and error by presum, rad²."""
+    seen = seen_of(job, pulses, side, options.chunk)
     work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
-    limit = 10 ** (options.nodes_db / 20)
-    spent, directly, presum = list[float](), list[float](), [0.0]
-    looks, edge = iter(seen.looks), _weighed_directly(job, seen, options.nodes_db)
+    edge, limit = weighed_directly(job, seen, options.nodes_db), 10 ** (options.nodes_db / 20)
+    spent, share, presum = list[float](), list[float](), [0.0]
+    counted, looks = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db), iter(seen.looks)
     for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
         here = next(looks) if np.isfinite(surface.rough_m) else ()
-        if not rough <= 2 * limit**2:
-            spent.append(pulses * side**2 * direct_s)
-            directly.append(1.0)
-            continue
-        for one in here:
-            counts = counts_of(one, options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
-            directly.append(edge if counts.nodes else 1.0)
-            if not counts.nodes:
-                spent.append(pulses * side**2 * direct_s)
-                continue
-            presum.append(counts.presum_rad**2)
-            amounts = features(one, counts, options, job.signal, work)
-            by_tree = chunks * sum(cost * amount for cost, amount in amounts)
-            spent.append((1 - edge) * by_tree + edge * pulses * side**2 * direct_s)
-    tiles = job.pixels / side**2
-    whole = job.share * tiles * float(np.mean(spent)) + _SURFACE_S * job.pixels + _FORM_S * job.tiles
-    whole += job.weights * job.share * tiles * pulses * _WEIGHTS * BEAM_S
-    return _Cost(whole, float(np.mean(directly)), float(10 * np.log10(np.mean(presum) + 1e-30)))
+        found = [(one, counted(one, weighted=job.beams is not None)) for one in here if rough <= 2 * limit**2]
+        held = [(one, counts) for one, counts in found if counts.nodes]
+        share.append((1 - edge) * len(held) / max(1, len(here)))
+        presum += [counts.presum_rad**2 for _, counts in held]
+        spent += [
+            sum(cost * amount for cost, amount in features(one, counts, options, job.signal, work))
+            for one, counts in held
+        ]
+    chunks, tiles = -(-pulses // options.chunk), job.pixels / side**2
+    seconds = job.share * chunks * tiles * float(np.mean(spent or [0.0]))
+    return float(np.mean(share)), seconds, float(np.mean(presum))
 
 
 def features(
@@ -252,9 +191,10 @@ def features(
     cells_of = cells_per_sample(signal.oversampling, options.oversampling)
     aligned = work.pulses * (samples + options.taps) * (TREE_DELAYS + counts.fewer) if counts.fewer else 0.0
     columns, rows = counts.nodes[0]
+    expand_s = _EXPAND_S if counts.fewer else _EACH_EXPAND_S / work.beside
     return [
         (_NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
-        (_EXPAND_S if counts.fewer else _EACH_EXPAND_S / work.beside, looked_up * samples * cells_of * options.taps / 16),
+        (expand_s, looked_up * samples * cells_of * options.taps / 16),
         (_ALIGN_S, aligned),
         (_MIX_S, _mixed(counts, leaves, work.side)),
         (_PIXEL_S, leaves[len(counts.nodes) - 1] * work.side**2),

@@ -45,7 +45,7 @@ def stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf, term, 3) float64: the track over each leaf as orthonormal polynomials of the pulses' numbers."""
-    return np.einsum("pt,npc->ntc", _polynomials()[0], leaves_m)
+    return np.asarray(np.einsum("pt,npc->ntc", _polynomials()[0], leaves_m))
 
 
 def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:

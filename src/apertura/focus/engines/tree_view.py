@@ -201,7 +201,7 @@ class Counts:
     presum_rad: float
 
 
-def counts_of(looks: Looks, nodes_db: int, *, presum_db: float, weighted: bool) -> Counts:
+def counts_of(looks: Looks, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
     """Return the numbers of nodes of each level, and of pulses that stand for those of a leaf."""
     more = _WEIGHTED if weighted else 0.0
     levels: list[tuple[int, int]] = []
@@ -215,5 +215,6 @@ def counts_of(looks: Looks, nodes_db: int, *, presum_db: float, weighted: bool) 
         turned = int(nodes_for(np.array([looks.turn_rad + more]), nodes_db)[0])
         fewer = max(DEGREES[smooth[0]] + TREE_MORE, turned)
         if fewer <= TREE_FEWER:
-            return Counts(tuple(levels), fewer, float(looks.rough_rad[np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1]))
+            followed = np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1
+            return Counts(tuple(levels), fewer, float(looks.rough_rad[followed]))
     return Counts(tuple(levels), 0, 0.0)
