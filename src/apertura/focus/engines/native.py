@@ -169,6 +169,7 @@ def _expand(
     used = (length - 1) * design.up // design.down + 1
     steps = -(-used // (design.up * TAPS)) * TAPS
     width = -(-(used + 2 * MARGIN) // TAPS) * TAPS
+    width += 16 * (width % 256 == 0)  # else all rows share lines of the cache: up to four times as long
     index = np.arange(steps) * design.up + np.arange(design.up)[:, None]
     carrier = _parts(np.exp(1j * _turn(np.asarray(carrier_rad_per_cell * index))), axis=1)
     cells = np.zeros((pulses, 2 * (degree + 1), width), np.float32)
