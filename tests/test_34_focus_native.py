@@ -287,3 +287,17 @@ def test_bad_input_is_refused(plain):
         native.form(tables, np.zeros((4, 4)))
     with pytest.raises(ValueError, match="accumulate"):
         native.form(tables, np.zeros((4, 4, 3)), accumulate="float16")
+
+
+def test_rows_of_a_table_do_not_share_lines_of_the_cache(plain):
+    """Rows a multiple of 1 KiB apart fall on the same ones; lengths of profiles meet such rows again and again."""
+    profiles = plain[2][:1]
+    rows = [
+        native.prepare(
+            replace(profiles, samples=np.zeros((1, length), np.complex64)), oversampling=oversampling
+        ).cells.strides[1]
+        for oversampling in (6, 16, 20)
+        for length in range(40, 140)
+    ]
+    assert all(row % 1024 for row in rows)
+    assert all(row % 64 == 0 for row in rows)
