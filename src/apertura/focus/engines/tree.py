@@ -105,15 +105,16 @@ def form(
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
-    block = _Block(pixels, np.zeros(pixels.shape[:2], np.complex64), nodes_db, presum_db, subaperture_sizes(chunk))
-    tiles = block.tiles(trees, list(windows(pixels.shape[:2], side_px)))
+    image = np.zeros(pixels.shape[:2], np.complex64)
+    block = _Block(trees, pixels, image, nodes_db, presum_db, subaperture_sizes(chunk))
+    tiles = block.tiles(list(windows(pixels.shape[:2], side_px)))
     for pulses in trees.chunks(chunk):
         some = trees[pulses]
         every = np.ones(-(-len(some) // TREE_GROUP), bool)
         block.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
     if counts is not None:
         counts += block.counts
-    return block.image
+    return image
 
 
 def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
@@ -123,8 +124,9 @@ def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[
 
 @dataclass(eq=False)
 class _Block:
-    """A block of pixels, its image, how trees are to err, and how many pixels × pulses went which way."""
+    """A block of pixels and all pulses, its image, how trees are to err, how many pixels × pulses went which way."""
 
+    trees: Trees
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
     nodes_db: int
@@ -133,22 +135,22 @@ class _Block:
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(WAYS), np.int64))
     _quarters: dict[Tile, list[Tile]] = field(default_factory=dict)
 
-    def tiles(self, trees: Trees, parts: list[Window]) -> list[Tile]:
+    def tiles(self, parts: list[Window]) -> list[Tile]:
         """Return tiles of the block; those that are small or rough do not go by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
-            Tile(part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and trees.roughness(surface) <= limit)
+            Tile(part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit)
             for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
         ]
 
     def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
-        """Add groups of the pulses to tiles; what the tree of a tile cannot take goes to its quarters, or directly."""
+        """Add groups of some pulses to tiles; what the tree of a tile cannot take goes to its quarters, or directly."""
         chunk = Chunk(trees, beams, self.nodes_db, self.presum_db, self.sizes, self.pixels, self.image)
         pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
         left: list[Task] = []
         for (tile, wanted), way in zip(tasks, chunk.add(tasks), strict=True):
             direct = wanted & (way == DIRECTLY)
-            smaller = self._quartered(trees, tile) if direct.any() else []
+            smaller = self._quartered(tile) if direct.any() else []
             left += [(quarter, direct) for quarter in smaller]
             done = wanted & ~direct if smaller else wanted
             self.counts += self.image[tile.window].size * np.bincount(way[done], pulses_of[done], 3).astype(np.int64)
@@ -157,7 +159,7 @@ class _Block:
         if left:
             self.add(trees, beams, left)
 
-    def _quartered(self, trees: Trees, tile: Tile) -> list[Tile]:
+    def _quartered(self, tile: Tile) -> list[Tile]:
         """Return the quarters of a tile, none of one too small: it sees less of what is not smooth."""
         rows, columns = tile.window
         if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:
@@ -167,7 +169,7 @@ class _Block:
                 (slice(part.start, middle), slice(middle, part.stop))
                 for part, middle in ((part, (part.start + part.stop) // 2) for part in tile.window)
             )
-            self._quarters[tile] = self.tiles(trees, list(product(tops, lefts)))
+            self._quarters[tile] = self.tiles(list(product(tops, lefts)))
         return self._quarters[tile]
 
     def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
