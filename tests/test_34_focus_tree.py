@@ -125,6 +125,19 @@ def test_fewer_pulses_than_follow_a_track_err_as_predicted(plain, jitter_m, toge
     assert predicted_db - 7 <= decibels(images[1] - images[0], images[0]) <= predicted_db
 
 
+@pytest.mark.parametrize(("height_m", "nodes_db", "sheets"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
+def test_rough_ground_is_read_between_sheets(height_m, nodes_db, sheets):
+    """Eq. 11: relief from pixel to pixel goes by trees that lie one above the other; one sheet less and it does not."""
+    rough = pixel_grid(70, 90)
+    rough[..., 2] += height_m * np.random.default_rng(6).uniform(-1, 1, rough.shape[:2])
+    flight = flown(rough, pulses=300)
+    image, share = formed(flight, nodes_db=nodes_db, sheets=32, side_px=128)
+    assert share.tolist() == [1, 0, 0]
+    assert error_db(flight.scene, rough, image) <= setting(flight, nodes_db=nodes_db, sheets=32).error_db + 3
+    needed = next(most for most in range(33) if formed(flight, nodes_db=nodes_db, sheets=most, side_px=128)[1][0])
+    assert needed == sheets
+
+
 def test_rough_ground_goes_directly():
     rough = pixel_grid(70, 90)
     rough[..., 2] += 0.02 * np.random.default_rng(6).standard_normal(rough.shape[:2])

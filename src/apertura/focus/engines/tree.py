@@ -7,6 +7,7 @@ go through the direct kernel.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise, product
 from typing import Annotated, Any, Literal
 
@@ -24,6 +25,7 @@ from apertura.focus.engines.native_tables import Tables
 from apertura.focus.engines.tree_chunk import Chunk, Task, Tile
 from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_PIXELS, LEAST_QUARTER_PX, Trees, prepare
 from apertura.focus.engines.tree_prediction import candidates
+from apertura.focus.engines.tree_sheets import MOST_SHEETS, Relief, Sheets, sheets_for
 from apertura.focus.engines.tree_surface import surfaces_of, windows
 from apertura.focus.engines.tree_track import subaperture_sizes
 from apertura.focus.engines.tree_weights import DIRECTLY
@@ -51,6 +53,9 @@ class Options(EngineOptions):
         None, description="largest side of a tree's tile, pixels"
     )
     chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
+    sheets: Annotated[int, Field(ge=0, le=MOST_SHEETS)] | None = Field(
+        None, description="between which a tile of rough ground is read, at most"
+    )
 
 
 def form(
@@ -62,6 +67,7 @@ def form(
     presum_db: float = -74,
     side_px: int = 128,
     chunk: int = 1024,
+    sheets: int = 0,
     counts: NDArray[np.int64] | None = None,
 ) -> NDArray[np.complex64]:
     """Sum the pulses over a block of pixels.
@@ -82,6 +88,8 @@ def form(
         Of the tiles that the block is cut into, at most; each gets the same bits with or without the others.
     chunk
         Pulses of the largest subaperture.
+    sheets
+        Between which a tile of rough ground is read, at most; where more are needed it goes directly.
     counts
         (3,) int64 to which the number of pixels × pulses is added that went by tree, directly, or had no echo.
 
@@ -106,14 +114,22 @@ def form(
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
     image = np.zeros(pixels.shape[:2], np.complex64)
-    block = _Block(trees, pixels, image, nodes_db, presum_db, subaperture_sizes(chunk))
-    tiles = block.tiles(list(windows(pixels.shape[:2], side_px)))
-    for pulses in trees.chunks(chunk):
-        some = trees[pulses]
-        every = np.ones(-(-len(some) // TREE_GROUP), bool)
-        block.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
+    block = partial(_Block, trees, nodes_db, presum_db, chunk)
+    flat = block(pixels, image)
+    tiles = flat.tiles(list(windows(pixels.shape[:2], side_px)))
+    raised = {tile: found for tile in tiles if not tile.by_tree and (found := flat.sheets(tile, sheets))}
+    flat.sum(beams, [tile for tile in tiles if tile not in raised])
+    tally = flat.counts
+    for tile, found in raised.items():
+        places = found.pixels
+        on_sheets = block(places, np.zeros(places.shape[:2], np.complex64))
+        on_sheets.sum(beams, on_sheets.tiles(found.windows))
+        image[tile.window] = found.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
+        way = on_sheets.counts // len(found.heights_m)
+        tally += way
+        tally[0] += image[tile.window].size * len(trees) - way.sum()
     if counts is not None:
-        counts += block.counts
+        counts += tally
     return image
 
 
@@ -127,11 +143,11 @@ class _Block:
     """A block of pixels and all pulses, its image, how trees are to err, how many pixels × pulses went which way."""
 
     trees: Trees
-    pixels: NDArray[np.float64]
-    image: NDArray[np.complex64]
     nodes_db: int
     presum_db: float
-    sizes: tuple[int, ...]
+    chunk: int
+    pixels: NDArray[np.float64]
+    image: NDArray[np.complex64]
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(WAYS), np.int64))
     _quarters: dict[Tile, list[Tile]] = field(default_factory=dict)
 
@@ -143,9 +159,32 @@ class _Block:
             for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
         ]
 
+    def sheets(self, tile: Tile, most: int) -> Sheets | None:
+        """Return the sheets that a rough tile is read between; None where more are needed, or it is no relief."""
+        trees, limit = self.trees, 10 ** (self.nodes_db / 20)
+        pixels = self.pixels[tile.window]
+        if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
+            return None
+        relief = Relief.of(tile.surface, pixels)
+        if trees.wavenumber_rad_m * relief.aside_m > limit:
+            return None
+        wave = {"wavenumber_rad_m": trees.wavenumber_rad_m, "band_rad_m": trees.band_rad_m}
+        band = relief.band_rad(trees.profiles.aperture, **wave)
+        return Sheets.of(relief, band, self.nodes_db) if sheets_for(band, self.nodes_db) <= most else None
+
+    def sum(self, beams: Beams | None, tiles: list[Tile]) -> None:
+        """Add all pulses to tiles."""
+        for pulses in self.trees.chunks(self.chunk):
+            some = self.trees[pulses]
+            every = np.ones(-(-len(some) // TREE_GROUP), bool)
+            if tiles:
+                self.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
+
     def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
         """Add groups of some pulses to tiles; what the tree of a tile cannot take goes to its quarters, or directly."""
-        chunk = Chunk(trees, beams, self.nodes_db, self.presum_db, self.sizes, self.pixels, self.image)
+        chunk = Chunk(
+            trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
+        )
         pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
         left: list[Task] = []
         for (tile, wanted), way in zip(tasks, chunk.add(tasks), strict=True):

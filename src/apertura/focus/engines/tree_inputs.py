@@ -131,6 +131,11 @@ class Trees:
         return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
 
     @property
+    def middle(self) -> Aperture:
+        """The middle pulse."""
+        return self.profiles.aperture[len(self) // 2 : len(self) // 2 + 1]
+
+    @property
     def wavenumber_rad_m(self) -> float:
         """2πf_mid/c."""
         return 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S

@@ -12,6 +12,7 @@ from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_QUARTER_PX, cells, cells_per_sample
+from apertura.focus.engines.tree_sheets import MOST_SHEETS, sheets_for
 from apertura.focus.engines.tree_survey import Seen, seen_of, weighed_directly
 from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
 from apertura.focus.engines.tree_view import Counts, Looks, counts_of
@@ -38,6 +39,7 @@ _EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
 _EACH_EXPAND_S = 4.6e-9  # of pulses that go for themselves, whose cells tiles side by side share
 _ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
 _MIX_S = 5e-12  # a complex multiply-add of merges and pixels
+_READ_S = 5e-8  # a pixel read from one of its sheets
 _PIXEL_S = 4.5e-9  # a pixel of a subaperture's
 _LEAF_S = 6e-6  # a leaf over a tile: its plan
 _SURFACE_S = 1.6e-8  # a pixel's place, fitted
@@ -63,7 +65,8 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
             oversampling = asked.get("oversampling") or oversampling
             quickest = np.inf
             for presum_db in asked_or(asked, "presum_db", [nodes_db + more for more in PRESUMS_DB]):
-                setting = _setting(job, seen, pulses, _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk))
+                options = _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk, asked.get("sheets"))
+                setting = _setting(job, seen, pulses, options)
                 if setting.seconds < quickest:  # what may err more takes less time, or is not worth it
                     quickest = setting.seconds
                     yield setting
@@ -85,6 +88,7 @@ class _Options:
     presum_db: int
     side_px: int
     chunk: int
+    sheets: int | None  # as many as pay
 
 
 @dataclass(frozen=True)
@@ -106,10 +110,11 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
     direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
+    presum_db = float(10 * np.log10(cost.presum_rad2 + 1e-30))
     error_db = power_sum_db(
         table_db,
-        nodes_db + 10 * np.log10(2 * len(sizes) + 1),
-        cost.presum_db,
+        nodes_db + 10 * np.log10(2 * len(sizes) + 1 + (cost.layers > 1)),
+        presum_db,
         _FLOAT32_DB,
         20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
     )
@@ -117,7 +122,13 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
     return Setting(
         "tree",
         {"oversampling": options.oversampling, "taps": options.taps},
-        {"nodes_db": nodes_db, "presum_db": options.presum_db, "side_px": options.side_px, "chunk": options.chunk},
+        {
+            "nodes_db": nodes_db,
+            "presum_db": options.presum_db,
+            "side_px": options.side_px,
+            "chunk": options.chunk,
+            "sheets": cost.sheets,
+        },
         float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
@@ -126,59 +137,87 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
             "oversampling": f"table errs by {table_db:.1f} dB",
             "taps": "of the table's filters",
             "nodes_db": nodes,
-            "presum_db": f"pulses for which fewer stand err by {cost.presum_db:.0f} dB",
+            "presum_db": f"pulses for which fewer stand err by {presum_db:.0f} dB",
             "side_px": f"cheapest here; about {100 * cost.directly:.0f} % of pixel·pulses go directly",
             "chunk": "pulses of the largest subaperture, cheapest here",
+            "sheets": f"more do not pay on rough ground; {cost.layers if cost.layers > 1 else 'none'} needed here",
         },
     )
 
 
 @dataclass(frozen=True)
 class _Cost:
-    """Seconds of the whole image, the part of it that goes directly, and what pulses made fewer err by."""
+    """Of an image, or of the tiles of one side.
+
+    Attributes
+    ----------
+    seconds
+        Of the whole; of tiles: if they took it all.
+    directly
+        Part that no tree takes.
+    presum_rad2
+        What pulses made fewer err by.
+    sheets
+        Between which a tile may be read, at most.
+    layers
+        Sheets that tiles looked at are read between, at most.
+    """
 
     seconds: float
     directly: float
-    presum_db: float
+    presum_rad2: float
+    sheets: int
+    layers: int
 
 
 def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
     """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
     side = min(options.side_px, job.tile_px, *job.shape)
+    first = part = _by_tree(job, pulses, options, side, direct_s)
     whole = _SURFACE_S * job.pixels + _FORM_S * job.tiles
     left, presum = 1.0, 0.0  # what larger tiles did not take
     while True:
-        share, seconds, presum_rad2 = _by_tree(job, pulses, options, side)
         weighed_s = job.weights * job.share * job.pixels / side**2 * pulses * _WEIGHTS * BEAM_S
-        taken = max(0.0, left - (1 - share))
-        whole, presum = whole + taken * seconds + left * weighed_s, max(presum, presum_rad2)
+        taken = max(0.0, left - part.directly)
+        whole, presum = whole + taken * part.seconds + left * weighed_s, max(presum, part.presum_rad2)
         left, side = left - taken, side // 2
         if not left or side < LEAST_QUARTER_PX:
             break
+        part = _by_tree(job, pulses, options, side, None)
     whole += left * pulses * job.share * job.pixels * direct_s
-    return _Cost(whole, left, float(10 * np.log10(presum + 1e-30)))
+    return _Cost(whole, left, presum, first.sheets, first.layers)
 
 
-def _by_tree(job: Job, pulses: int, options: _Options, side: int) -> tuple[float, float, float]:
-    """Return the share of an image that tiles of one side can take, seconds of all of it, and error by presum, rad²."""
-    seen = seen_of(job, pulses, side, options.chunk)
+def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: float | None) -> _Cost:
+    """Return what tiles of one side take and cost; they are read between sheets where `direct_s` is given."""
+    seen, chunks = seen_of(job, pulses, side, options.chunk), -(-pulses // options.chunk)
     work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
     edge, limit = weighed_directly(job, seen, options.nodes_db), 10 ** (options.nodes_db / 20)
-    spent, share, presum = list[float](), list[float](), [0.0]
-    counted, looks = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db), iter(seen.looks)
-    for surface, rough in zip(seen.surfaces, seen.rough, strict=True):
-        here = next(looks) if np.isfinite(surface.rough_m) else ()
-        found = [(one, counted(one, weighted=job.beams is not None)) for one in here if rough <= 2 * limit**2]
-        held = [(one, counts) for one, counts in found if counts.nodes]
-        share.append((1 - edge) * len(held) / max(1, len(here)))
-        presum += [counts.presum_rad**2 for _, counts in held]
-        spent += [
-            sum(cost * amount for cost, amount in features(one, counts, options, job.signal, work))
-            for one, counts in held
+    counted = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
+    counts = [[counted(one) for one in here] for here in seen.looks]
+    costs = [
+        [
+            chunks * sum(cost * amount for cost, amount in features(one, found, options, job.signal, work))
+            for one, found in zip(here, founds, strict=True)
+            if found.nodes
         ]
-    chunks, tiles = -(-pulses // options.chunk), job.pixels / side**2
-    seconds = job.share * chunks * tiles * float(np.mean(spent or [0.0]))
-    return float(np.mean(share)), seconds, float(np.mean(presum))
+        for here, founds in zip(seen.looks, counts, strict=True)
+    ]
+    once, read_s = float(np.mean([one for each in costs for one in each] or [np.inf])), _READ_S * side**2
+    pay = min(MOST_SHEETS, int(pulses * side**2 * direct_s / (once + read_s))) if direct_s else 0
+    sheets = pay if options.sheets is None or not direct_s else options.sheets
+    spent, share, presum, most, tiles = list[float](), list[float](), [0.0], 1, iter(zip(counts, costs, strict=True))
+    for surface, rough, (band, aside) in zip(seen.surfaces, seen.rough, seen.sheets_rad, strict=True):
+        founds, cost = next(tiles) if np.isfinite(surface.rough_m) else ([], [])
+        layers = 1 if rough <= 2 * limit**2 else sheets_for(band, options.nodes_db) if aside <= limit else sheets + 1
+        if layers > max(1, sheets):
+            cost = []
+        most = max(most, layers) if cost else most
+        share.append((1 - edge) * len(cost) / max(1, len(founds)))
+        spent += [layers * (one + (read_s if layers > 1 else 0.0)) for one in cost]
+        presum += [found.presum_rad**2 for found in founds if found.nodes and cost]
+    seconds = job.share * job.pixels / side**2 * float(np.mean(spent or [0.0]))
+    return _Cost(seconds, 1 - float(np.mean(share)), float(np.mean(presum)), sheets, most)
 
 
 def features(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.focus.engines.native_prediction import pixel_steps
 from apertura.focus.engines.tree_inputs import roughness
+from apertura.focus.engines.tree_sheets import Relief
 from apertura.focus.engines.tree_surface import Surface, surfaces_of
 from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
 from apertura.focus.engines.tree_view import Looks, look
@@ -24,6 +25,7 @@ class Seen:
     surfaces: tuple[Surface, ...]
     looks: tuple[tuple[Looks, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
+    sheets_rad: tuple[tuple[float, float], ...]  # band along heights, and phase of what leaves the surface otherwise
     groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
 
     @property
@@ -38,7 +40,8 @@ def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> Seen:
     """Return some tiles, and how they are seen from some chunks."""
     side = min(side_px, job.tile_px, *job.shape)
     whole = [(slice(0, side), slice(0, side))]
-    surfaces = tuple(surfaces_of(np.ascontiguousarray(patch), whole)[0] for patch in _patches(job, side))
+    patches = [np.ascontiguousarray(patch[whole[0]]) for patch in _patches(job, side)]
+    surfaces = tuple(surfaces_of(patch, whole)[0] for patch in patches)
     places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
     starts = np.arange(0, pulses, chunk)
     starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS_SEEN).astype(int))]
@@ -52,7 +55,22 @@ def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> Seen:
     some = job.aperture[job.aperture.sample(64)]
     groups = [places[start + at : start + at + LEAF] for start in starts for at in (0, chunk // 2 // LEAF * LEAF)]
     rough = tuple(roughness(some, surface, wavenumber_rad_m=k, band_rad_m=b) for surface in surfaces)
-    return Seen(surfaces, looks, rough, tuple(group for group in groups if len(group)))
+    sheets = tuple(
+        _sheets(job, surface, patch, wavenumber_rad_m=k, band_rad_m=b)
+        for surface, patch in zip(surfaces, patches, strict=True)
+    )
+    return Seen(surfaces, looks, rough, sheets, tuple(group for group in groups if len(group)))
+
+
+def _sheets(
+    job: Job, surface: Surface, patch: NDArray[np.float64], *, wavenumber_rad_m: float, band_rad_m: float
+) -> tuple[float, float]:
+    """Return what `Seen` says of the sheets of a tile."""
+    if not np.isfinite(surface.rough_m):
+        return np.inf, np.inf
+    relief = Relief.of(surface, patch)
+    band = relief.band_rad(job.aperture, wavenumber_rad_m=wavenumber_rad_m, band_rad_m=band_rad_m)
+    return band, wavenumber_rad_m * relief.aside_m
 
 
 @lru_cache(maxsize=256)
