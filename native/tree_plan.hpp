@@ -30,18 +30,20 @@ inline Sight sight_of(const TreeJob& job, const TreeTile& tile, const Seen& seen
   const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
   double slack = 0;
   Reach last;
+  int64_t seen_to = begin;
   for (int64_t n = begin; n < end; n += n + 8 < end || n == end - 1 ? 8 : end - 1 - n) {
-    const Legs legs = legs_of(job, tile.centre, n);
-    const Reach reach = reach_of(legs, seen);
-    if (n > begin)
-      slack = std::max(slack, 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high)));
-    sight.low = n == begin ? reach.low : std::min(sight.low, reach.low);
-    sight.high = n == begin ? reach.high : std::max(sight.high, reach.high);
-    last = reach;
-    const double centre = legs.range - job.start[n];
-    const double low = (centre + reach.low - slack) / job.step, high = (centre + reach.high + slack) / job.step;
-    sight.inside &= low >= margin && high <= length - margin;
-    sight.outside &= high <= -margin || low >= length + margin;
+    const Reach reach = reach_of(legs_of(job, tile.centre, n), seen);
+    if (n == begin) last = reach, sight.low = reach.low, sight.high = reach.high;
+    const double apart = 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high));
+    for (; seen_to <= n; seen_to++) {  // each profile may begin where it likes
+      const double centre = legs_of(job, tile.centre, seen_to).range - job.start[seen_to];
+      const double low = (centre + std::min(reach.low, last.low) - apart) / job.step;
+      const double high = (centre + std::max(reach.high, last.high) + apart) / job.step;
+      sight.inside &= low >= margin && high <= length - margin;
+      sight.outside &= high <= -margin || low >= length + margin;
+    }
+    sight.low = std::min(sight.low, reach.low), sight.high = std::max(sight.high, reach.high);
+    slack = std::max(slack, apart), last = reach;
   }
   sight.low -= slack, sight.high += slack;
   for (int64_t n = 0; n < 3; n++) sight.reach[n] = reach_of(legs_of(job, tile.centre, three[n]), seen);

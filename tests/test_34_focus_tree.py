@@ -81,7 +81,8 @@ def test_tiles_at_the_end_of_profiles_go_directly():
     whole, _ = formed(flight)
     flight.profiles = replace(flight.profiles, samples=flight.profiles.samples[:, :100])
     image, share = formed(flight)
-    direct = native.form(native.prepare(flight.profiles, oversampling=6), ecef(flight.pixels))
+    cells = tree.prepare(flight.profiles).directly(-74).oversampling
+    direct = native.form(native.prepare(flight.profiles, oversampling=cells), ecef(flight.pixels))
     assert 0.2 < share[0] < 0.8
     assert share[1] > 0.2
     assert decibels(image - direct, direct) <= -62
@@ -216,6 +217,43 @@ def test_what_a_tile_cannot_take_goes_to_its_quarters(monkeypatch):
     whole, less = formed(flight, beams=beams, side_px=256)
     assert share[0] > less[0] + 0.1
     assert max(weighed_error_db(flight, one, beams) for one in (image, whole)) <= -62
+
+
+@pytest.mark.parametrize("pulses", [65, 68, 129, 130, 193])
+def test_the_last_pulses_of_a_flight_are_weighed_as_all_others(plain, pulses):
+    """Also where they are fewer than those between two that are looked at: the beam ends among the last four."""
+    few, turn = flown(pixel_grid(70, 90), pulses=pulses), np.radians(30)
+    axes = swaying_beam(few.scene.tx, (12, 0, 0), sway_deg=0).axes
+    axes[-4:] = [[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]] @ axes[-4:]
+    angle = np.radians([-32.0, 0, 32.0])
+    beams = Beams(Beam(axes, angle, np.ones(3), angle, np.ones(3)))
+    image, _ = formed(few, beams=beams)
+    assert weighed_error_db(few, image, beams) <= -60
+
+
+@pytest.mark.parametrize("first", [1, 17, 65])
+def test_a_profile_that_begins_elsewhere_is_seen_wherever_it_comes(first):
+    flight = flown(pixel_grid(70, 90), pulses=128)
+    start_m, samples = flight.profiles.start_m.copy(), flight.profiles.samples.copy()
+    start_m[first] += 35 * flight.profiles.step_m  # in the middle of the scene
+    flight.profiles = replace(flight.profiles, start_m=start_m, samples=samples)
+    image, share = formed(flight)
+    assert share[1] > 0.2
+    cells = tree.prepare(flight.profiles).directly(-74).oversampling
+    direct = native.form(native.prepare(flight.profiles, oversampling=cells), ecef(flight.pixels))
+    assert decibels(image - direct, direct) <= -62
+
+
+@pytest.mark.parametrize("asked", [{"side_px": 300}, {"side_px": 0}, {"chunk": 100}, {"nodes_db": -44}, {"sheets": 99}])
+def test_what_the_library_cannot_hold_is_refused(plain, asked):
+    with pytest.raises(ValueError, match=next(iter(asked))):
+        tree.form(tree.prepare(plain.profiles), ecef(plain.pixels), **asked)
+
+
+@pytest.mark.parametrize("pulses", [slice(10, 300), slice(32, 64), slice(None, None, 2)])
+def test_pulses_from_the_middle_of_a_leaf_are_refused(plain, pulses):
+    with pytest.raises(ValueError, match="multiple of 64"):
+        tree.prepare(plain.profiles)[pulses]
 
 
 def test_the_edge_of_a_beam_goes_directly(plain):

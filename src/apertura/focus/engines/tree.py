@@ -23,7 +23,7 @@ from apertura.focus.engines.native_binding import available, instruction_set
 from apertura.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
 from apertura.focus.engines.native_tables import Tables
 from apertura.focus.engines.tree_chunk import Chunk, Task, Tile
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_PIXELS, LEAST_QUARTER_PX, Trees, prepare
+from apertura.focus.engines.tree_inputs import LEAST_PIXELS, LEAST_QUARTER_PX, Trees, prepare
 from apertura.focus.engines.tree_prediction import candidates
 from apertura.focus.engines.tree_sheets import MOST_SHEETS, Relief, Sheets, sheets_for
 from apertura.focus.engines.tree_surface import surfaces_of, windows
@@ -102,7 +102,7 @@ def form(
     Raises
     ------
     ValueError
-        If `pixels` has another shape, or beams are of other pulses.
+        If `pixels` has another shape, beams are of other pulses, or an option is none of `Options`.
     MemoryError
         If the library found no memory.
 
@@ -110,6 +110,8 @@ def form(
     -----
     Source: docs/theory/tree.md.
     """
+    asked = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk, "sheets": sheets}
+    Options.model_validate(asked)
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
@@ -212,7 +214,7 @@ class _Block:
         return self._quarters[tile]
 
     def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
-        tolerance_rad = DIRECTLY_AT[self.nodes_db].tolerance_rad
+        tolerance_rad = self.trees.directly(self.nodes_db).tolerance_rad
         self.image[window] += native.form(tables, self.pixels[window], beams=beams, tolerance_rad=tolerance_rad)
 
 

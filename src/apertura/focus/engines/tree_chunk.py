@@ -2,7 +2,7 @@
 
 import ctypes
 from dataclasses import dataclass, field
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,7 @@ class Chunk:
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
         """Add what goes by tree, of the groups of 64 pulses given for each tile; return how groups are taken."""
-        seen = [taken for _, some in groupby(tasks, key=lambda task: id(task[1])) for taken in self._taken(list(some))]
+        seen = [self._taken(*task) for task in tasks]
         ways = [way for _, way, _ in seen]
         self._fewer = [fewer for *_, fewer in seen]
         array = (TreeTile * len(tasks))(
@@ -91,32 +91,18 @@ class Chunk:
         self._held.append(array)
         return array.ctypes.data
 
-    def _taken(self, tasks: list[Task]) -> list[_Taken]:
-        """Return how the same groups of pulses are taken over some tiles."""
-        wanted = tasks[0][1]
-        plain: list[_Taken] = [
-            (
-                None,
-                np.where(wanted, BY_TREE if tile.by_tree else DIRECTLY, SILENTLY).astype(np.uint8),
-                np.zeros(len(wanted), np.uint8),
-            )
-            for tile, _ in tasks
-        ]
-        weighed = [number for number, (tile, _) in enumerate(tasks) if tile.by_tree]
-        if self.beams is None or not weighed:
-            return plain
+    def _taken(self, tile: Tile, wanted: NDArray[np.bool_]) -> _Taken:
+        """Return the weights of the pulses over a tile, how groups of them are taken, and which go by themselves."""
+        way, each = np.where(wanted, BY_TREE if tile.by_tree else DIRECTLY, SILENTLY), np.zeros(len(wanted), np.uint8)
+        if self.beams is None or not tile.by_tree:
+            return None, way.astype(np.uint8), each
         first, last = np.flatnonzero(wanted)[[0, -1]]
         groups, pulses = slice(first, last + 1), slice(first * TREE_GROUP, (last + 1) * TREE_GROUP)
-        surfaces = [tasks[number][0].surface for number in weighed]
+        weight = np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)
         aperture = self.trees.profiles.aperture[pulses]
-        found = zip(*weights_over(self.beams[pulses], aperture, surfaces, self.nodes_db), strict=True)
-        for number, (weights, ways, each) in zip(weighed, found, strict=True):
-            weight = np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)
-            _, way, fewer = plain[number]
-            weight[pulses], fewer[groups] = weights, each
-            way[groups] = np.where(wanted[groups], ways, SILENTLY)
-            plain[number] = weight, way, fewer
-        return plain
+        weight[pulses], found, each[groups] = weights_over(self.beams[pulses], aperture, tile.surface, self.nodes_db)
+        way[groups] = np.where(wanted[groups], found, SILENTLY)
+        return weight, way.astype(np.uint8), each
 
     def _struct(
         self, tile: Tile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]

@@ -38,18 +38,25 @@ class Directly(NamedTuple):
     tolerance_rad: float
 
 
-DIRECTLY_AT = {
-    -50: Directly(4, 1.5e-3),
-    -56: Directly(4, 1.5e-3),
-    -62: Directly(5, 1.5e-3),
-    -68: Directly(5, 1.5e-3),
-    -74: Directly(6, 1.5e-3),
-    -80: Directly(8, 7e-4),
-    -86: Directly(10, 3e-4),
-    -92: Directly(12, 1.5e-4),
-    -98: Directly(12, 1.5e-4),
-}
-"""Error of one interpolation between nodes, dB → the direct kernel's setting beside it, which errs less than a tree."""
+_TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
+
+
+@lru_cache
+def directly(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> Directly:
+    """Return how the direct kernel takes what trees of such nodes cannot: it errs less than they do.
+
+    Examples
+    --------
+    >>> [directly(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
+    [4, 6, 12]
+    """
+    least: tuple[float, int] = (np.inf, 0)
+    for oversampling in range(4, 33):  # more cells need not err less: the polynomial of the phase changes
+        design = design_table(profile_oversampling, carrier_rad_per_sample, oversampling=float(oversampling), degree=2)
+        least = min(least, (design.error_db(np.ones(64)), oversampling))
+        if least[0] <= nodes_db + 5:
+            break
+    return Directly(least[1], _TOLERANCES_RAD.get(nodes_db, 1.5e-3))
 
 
 class _DirectTables:
@@ -100,8 +107,16 @@ class Trees:
         return len(self.profiles)
 
     def __getitem__(self, pulses: slice) -> "Trees":
-        """Return those of pulses from a multiple of a leaf on."""
-        first, last, _ = pulses.indices(len(self))
+        """Return those of pulses from a multiple of a leaf on.
+
+        Raises
+        ------
+        ValueError
+            If they begin elsewhere, or are not in a row.
+        """
+        first, last, step = pulses.indices(len(self))
+        if step != 1 or first % LEAF:
+            raise ValueError(f"{pulses}: pulses of a tree are taken from a multiple of {LEAF} on, and in a row")
         leaves = slice(first // LEAF, -(-last // LEAF))
         return replace(
             self,
@@ -122,7 +137,11 @@ class Trees:
 
     def direct(self, nodes_db: int) -> Tables:
         """Return the direct kernel's tables for these pulses."""
-        return self.tables[DIRECTLY_AT[nodes_db].oversampling][self.first : self.first + len(self)]
+        return self.tables[self.directly(nodes_db).oversampling][self.first : self.first + len(self)]
+
+    def directly(self, nodes_db: int) -> Directly:
+        """Return the direct kernel's setting beside trees of such nodes."""
+        return directly(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
 
     def roughness(self, surface: Surface) -> float:
         """Return the error that pixels off the surface of a tile make, as the function of that name."""

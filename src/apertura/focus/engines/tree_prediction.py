@@ -11,7 +11,7 @@ import numpy as np
 from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_structs import TREE_DELAYS
-from apertura.focus.engines.tree_inputs import DIRECTLY_AT, LEAST_QUARTER_PX, cells, cells_per_sample
+from apertura.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample, directly
 from apertura.focus.engines.tree_sheets import MOST_SHEETS, sheets_for
 from apertura.focus.engines.tree_survey import Seen, seen_of, weighed_directly
 from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
@@ -106,7 +106,8 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
         signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
     )
     table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
-    asked = {"degree": 2, **DIRECTLY_AT[nodes_db]._asdict()}
+    carrier_rad = signal.wavenumber_rad_m * signal.step_m
+    asked = {"degree": 2, **directly(nodes_db, signal.oversampling, carrier_rad)._asdict()}
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
     direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
@@ -117,6 +118,9 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
         presum_db,
         _FLOAT32_DB,
         20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
+    )
+    error_db = float(
+        10 * np.log10((1 - cost.directly) * 10 ** (error_db / 10) + cost.directly * 10 ** (direct.error_db / 10))
     )
     nodes = f"interpolation between nodes errs by {nodes_db} dB at each of {len(sizes)} levels"
     return Setting(

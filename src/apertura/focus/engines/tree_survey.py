@@ -80,9 +80,9 @@ def weighed_directly(job: Job, seen: Seen, nodes_db: int) -> float:
         return 0.0
     smooth = [surface for surface in seen.surfaces if np.isfinite(surface.rough_m)]
     ways = [
-        weights_over(job.beams[group], job.aperture[group], smooth, nodes_db)[1].ravel()
+        weights_over(job.beams[group], job.aperture[group], surface, nodes_db)[1]
+        for surface in smooth
         for group in seen.groups
-        if smooth
     ]
     taken = np.concatenate([*ways, np.empty(0, np.uint8)])
     taken = taken[taken != SILENTLY]

@@ -4,6 +4,7 @@ The same counts as native/tree_plan.hpp makes for every tile, taken at a few.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,16 +128,21 @@ def _slopes(aperture: Aperture, surface: Surface) -> "_Slopes":
 def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tuple[float, NDArray[np.float64]]:
     """Return how far the carrier turns within half a leaf, and by what pulses leave smooth curves."""
     starts = np.arange(0, max(1, len(aperture) - LEAF + 1), LEAF)
-    turn, rough = 0.0, np.zeros(len(DEGREES))
+    turn, rough = 0.0, 0.0
     for start in starts[np.unique(np.linspace(0, len(starts) - 1, _LOOKED_AT).astype(int))]:
         leaf = aperture[start : start + LEAF]
         three = leaf[np.array([0, (len(leaf) - 1) // 2, len(leaf) - 1])]
         first, middle, last = three.path(slopes.places_m) - three.path(slopes.centre_m[None])
         turn = max(turn, float((0.5 * np.abs(last - first) + np.abs(first + last - 2 * middle)).max()))
-        off_m = leaf_roughness(*(leaves_of(leg) for leg in leaf.legs))[0]
         nearest = min(float(np.linalg.norm(leg[len(leaf) // 2] - slopes.centre_m)) for leg in leaf.legs)
-        rough = np.maximum(rough, off_m * slopes.radius_m / nearest / np.sqrt(3))
-    return wavenumber_rad_m * turn, wavenumber_rad_m * rough
+        rough = max(rough, slopes.radius_m / nearest / np.sqrt(3))
+    return wavenumber_rad_m * turn, wavenumber_rad_m * rough * _roughest(aperture)
+
+
+@lru_cache(maxsize=64)
+def _roughest(aperture: Aperture) -> NDArray[np.float64]:
+    """Return (curve,) by how much the pulses of any leaf leave curves of growing degree."""
+    return np.asarray(leaf_roughness(*(leaves_of(leg) for leg in aperture.legs)).max(axis=0))
 
 
 class _Slopes:

@@ -1,6 +1,5 @@
 """Weights of antennas and sectors over the tiles of a tree: a polynomial for each pulse, where that will do."""
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -23,72 +22,65 @@ _CHECKED = 8  # pulses of which one is looked at between the places
 
 
 def weights_over(
-    beams: Beams, aperture: Aperture, surfaces: Sequence[Surface], error_db: float
+    beams: Beams, aperture: Aperture, surface: Surface, error_db: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the weight of each pulse over tiles, how groups of pulses are taken, and which cannot be made fewer.
+    """Return the weight of each pulse over a tile, how groups of pulses are taken, and which cannot be made fewer.
 
     Parameters
     ----------
     beams, aperture
         Of the same pulses.
-    surfaces
-        Of the tiles: for many at once a pulse takes a fifth of the time.
+    surface
+        Of the tile.
     error_db
         What polynomials may err by, relative to the largest weight.
 
     Returns
     -------
     weights
-        (tile, pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
+        (pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
     way
-        (tile, group of 64 pulses) uint8: by tree where polynomials hold, silently where no pulse weighs anything.
+        (group of 64 pulses,) uint8: by tree where polynomials hold, silently where no pulse weighs anything.
     each
-        (tile, group) uint8: 1 where weights change from pulse to pulse otherwise than smoothly, so that no pulse can
-        stand for others.
+        (group,) uint8: 1 where weights change from pulse to pulse otherwise than smoothly, so that no pulse can stand
+        for others.
 
     Notes
     -----
     Source: docs/theory/tree.md, "Weights".
     """
     at, between, to_terms, terms_between = _matrices()
-    values = _seen(beams, aperture, surfaces, at)
+    positions, among = _positions(surface, at), _positions(surface, between)
+    values = beams.weight(aperture, positions)
     terms = values @ to_terms.T
-    some = slice(_CHECKED // 2, None, _CHECKED) if len(aperture) > _CHECKED else slice(None)
-    checked = _seen(beams[some], aperture[some], surfaces, between)
-    error = np.abs(terms[some] @ terms_between.T - checked).max(axis=2)
-    centres = np.stack([surface.centre_m for surface in surfaces])
-    radii = [np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max() for surface in surfaces]
-    lit = reached(beams, aperture, centres, np.array(radii), pulses=TREE_GROUP)
     limit = 10 ** (error_db / 20) * 3  # the largest of an error is about three times its RMS
-    largest, error = _by_group(values.max(axis=2), TREE_GROUP), _by_group(error, TREE_GROUP // _CHECKED)
-    # A beam may be narrower than what lies between the places.
-    holds = (largest > 0) & (error <= limit * largest)
-    way = np.where(lit, np.where(holds, BY_TREE, DIRECTLY), SILENTLY).astype(np.uint8)
-    each = np.zeros(lit.shape, np.uint8)
+    groups = -(-len(values) // TREE_GROUP)
+    largest, each = _by_group(values.max(axis=1)), np.zeros(groups, bool)
     full = len(values) // TREE_GROUP  # of a group not full each pulse goes for itself anyway
     each[:full] = _jumps(values[: full * TREE_GROUP]) > limit * largest[:full]
-    return np.ascontiguousarray(terms.swapaxes(0, 1), np.float32), way.T.copy(), each.T.copy()
+    each[full:] = True
+    # Where weights jump every pulse is looked at: one between two that hold need not.
+    some = np.flatnonzero(each[np.arange(len(values)) // TREE_GROUP] | (np.arange(len(values)) % _CHECKED == 0))
+    error = np.zeros(len(values))
+    error[some] = np.abs(terms[some] @ terms_between.T - beams[some].weight(aperture[some], among)).max(axis=1)
+    radius_m = np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max(keepdims=True)
+    lit = reached(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
+    # A beam may be narrower than what lies between the places, and end between two of them.
+    whole = _by_group(((values == 0).any(axis=1) & (values != 0).any(axis=1)).astype(float)) == 0
+    holds = whole & (largest > 0) & (_by_group(error) <= limit * largest)
+    way = np.where(lit, np.where(holds, BY_TREE, DIRECTLY), SILENTLY)
+    return np.ascontiguousarray(terms, np.float32), way.astype(np.uint8), each.astype(np.uint8)
 
 
-def _seen(
-    beams: Beams, aperture: Aperture, surfaces: Sequence[Surface], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the weights at some places of tiles, (pulse, tile, place)."""
-    at = np.concatenate([_positions(surface, places) for surface in surfaces])
-    return beams.weight(aperture, at).reshape(len(aperture), len(surfaces), -1)
-
-
-def _by_group(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the largest of each group of so many pulses, (group, tile); zero where there is none."""
-    padded = np.pad(values, ((0, -len(values) % size), (0, 0)))
-    return np.asarray(padded.reshape(-1, size, values.shape[1]).max(axis=1))
+def _by_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest value of each group of pulses."""
+    return np.asarray(np.maximum.reduceat(values, np.arange(0, len(values), TREE_GROUP)))
 
 
 def _jumps(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much weights leave a curve over the pulses of a group, at most: (group, tile)."""
-    grouped = values.reshape(len(values) // TREE_GROUP, TREE_GROUP, values.shape[1] * values.shape[2])
-    rest = np.abs(grouped - _curve() @ (_curve().T @ grouped)).max(axis=1)
-    return np.asarray(rest.reshape(len(grouped), *values.shape[1:]).max(axis=2))
+    """Return by how much the weights of groups of pulses leave a curve over them, at most: (group,)."""
+    grouped = values.reshape(len(values) // TREE_GROUP, TREE_GROUP, values.shape[1])
+    return np.asarray(np.abs(grouped - _curve() @ (_curve().T @ grouped)).max(axis=(1, 2)))
 
 
 @lru_cache
