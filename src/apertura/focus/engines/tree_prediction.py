@@ -39,6 +39,7 @@ _EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
 _EACH_EXPAND_S = 4.6e-9  # of pulses that go for themselves, whose cells tiles side by side share
 _ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
 _MIX_S = 5e-12  # a complex multiply-add of merges and pixels
+_SHEET_BYTES = 64  # a pixel's on one sheet
 _READ_S = 5e-8  # a pixel read from one of its sheets
 _PIXEL_S = 4.5e-9  # a pixel of a subaperture's
 _LEAF_S = 6e-6  # a leaf over a tile: its plan
@@ -136,7 +137,9 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
         float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
-        table_bytes=8 * pulses * signal.samples + (direct.table_bytes if cost.directly else 0),
+        table_bytes=8 * pulses * signal.samples
+        + (direct.table_bytes if cost.directly else 0)
+        + _SHEET_BYTES * options.side_px**2 * (cost.layers if cost.layers > 1 else 0),
         reasons={
             "oversampling": f"table errs by {table_db:.1f} dB",
             "taps": "of the table's filters",
