@@ -48,7 +48,7 @@ def directly(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample:
     Examples
     --------
     >>> [directly(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
-    [4, 6, 12]
+    [4, 5, 12]
     """
     least: tuple[float, int] = (np.inf, 0)
     for oversampling in range(4, 33):  # more cells need not err less: the polynomial of the phase changes
