@@ -64,7 +64,7 @@ def form(
     *,
     beams: Beams | None = None,
     nodes_db: int = -74,
-    presum_db: float = -74,
+    presum_db: int = -74,
     side_px: int = 128,
     chunk: int = 1024,
     sheets: int = 0,
@@ -146,7 +146,7 @@ class _Block:
 
     trees: Trees
     nodes_db: int
-    presum_db: float
+    presum_db: int
     chunk: int
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]

@@ -62,7 +62,7 @@ class Chunk:
     trees: Trees
     beams: Beams | None
     nodes_db: int
-    presum_db: float
+    presum_db: int
     sizes: tuple[int, ...]
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]

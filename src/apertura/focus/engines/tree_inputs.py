@@ -1,18 +1,16 @@
-"""What trees of all tiles share: profiles, the filters that expand them, and tables for what goes directly."""
+"""What trees of all tiles share: profiles, and the filters that expand them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from threading import Lock
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.engines import native
 from apertura.focus.engines.native_structs import TREE_DELAYS
 from apertura.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
+from apertura.focus.engines.tree_direct import Directly, DirectTables, directly
 from apertura.focus.engines.tree_surface import Surface
 from apertura.focus.engines.tree_track import LEAF, leaf_roughness, leaves_of, stray, tracks
 from apertura.focus.inputs import Profiles
@@ -29,47 +27,6 @@ LEAST_QUARTER_PX = 64
 
 _SAMPLED = 64  # pulses at which a rough tile is looked at
 _DELAY_DEGREE = 9
-
-
-class Directly(NamedTuple):
-    """How the direct kernel takes what a tree cannot."""
-
-    oversampling: int
-    tolerance_rad: float
-
-
-_TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
-
-
-@lru_cache
-def directly(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> Directly:
-    """Return how the direct kernel takes what trees of such nodes cannot: it errs less than they do.
-
-    Examples
-    --------
-    >>> [directly(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
-    [4, 5, 12]
-    """
-    least: tuple[float, int] = (np.inf, 0)
-    for oversampling in range(4, 33):  # more cells need not err less: the polynomial of the phase changes
-        design = design_table(profile_oversampling, carrier_rad_per_sample, oversampling=float(oversampling), degree=2)
-        least = min(least, (design.error_db(np.ones(64)), oversampling))
-        if least[0] <= nodes_db + 5:
-            break
-    return Directly(least[1], _TOLERANCES_RAD.get(nodes_db, 1.5e-3))
-
-
-class _DirectTables:
-    """Tables of the direct kernel, made when a tile first asks for them and shared by all."""
-
-    def __init__(self, profiles: Profiles):
-        self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
-
-    def __getitem__(self, oversampling: int) -> Tables:
-        with self._lock:
-            if oversampling not in self._tables:
-                self._tables[oversampling] = native.prepare(self._profiles, oversampling=oversampling, degree=2)
-            return self._tables[oversampling]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +57,7 @@ class Trees:
     rough_m: NDArray[np.float32]
     tracks_m: NDArray[np.float64]
     first: int
-    tables: _DirectTables
+    tables: DirectTables
 
     def __len__(self) -> int:
         """Return the number of pulses."""
@@ -266,4 +223,4 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
     found = cells(profiles.oversampling, turn, float(oversampling), taps)
     bent = np.stack([tracks(leg) for leg in legs], axis=1)
-    return Trees(held, found, strayed.astype(np.float32), rough.astype(np.float32), bent, 0, _DirectTables(held))
+    return Trees(held, found, strayed.astype(np.float32), rough.astype(np.float32), bent, 0, DirectTables(held))

@@ -11,7 +11,8 @@ import numpy as np
 from apertura.focus.engines import native_prediction
 from apertura.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
 from apertura.focus.engines.native_structs import TREE_DELAYS
-from apertura.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample, directly
+from apertura.focus.engines.tree_direct import directly
+from apertura.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample
 from apertura.focus.engines.tree_sheets import MOST_SHEETS, sheets_for
 from apertura.focus.engines.tree_survey import Seen, seen_of, weighed_directly
 from apertura.focus.engines.tree_track import LEAF, subaperture_sizes
@@ -103,37 +104,24 @@ class _Work:
 
 def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
-    design = cells(
-        signal.oversampling, signal.wavenumber_rad_m * signal.step_m, float(options.oversampling), options.taps
-    )
-    table_db, sizes = design.error_db(signal.window), subaperture_sizes(options.chunk)
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
+    design = cells(signal.oversampling, carrier_rad, float(options.oversampling), options.taps)
+    table_db, levels = design.error_db(signal.window), len(subaperture_sizes(options.chunk))
     asked = {"degree": 2, **directly(nodes_db, signal.oversampling, carrier_rad)._asdict()}
     direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
     direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
     presum_db = float(10 * np.log10(cost.presum_rad2 + 1e-30))
-    error_db = power_sum_db(
-        table_db,
-        nodes_db + 10 * np.log10(2 * len(sizes) + 1 + (cost.layers > 1)),
-        presum_db,
-        _FLOAT32_DB,
-        20 * np.log10(_FLOAT32 * seen.phase_rad + 1e-9),
-    )
-    error_db = float(
-        10 * np.log10((1 - cost.directly) * 10 ** (error_db / 10) + cost.directly * 10 ** (direct.error_db / 10))
-    )
-    nodes = f"interpolation between nodes errs by {nodes_db} dB at each of {len(sizes)} levels"
+    interpolated_db = nodes_db + 10 * float(np.log10(2 * levels + 1 + (cost.layers > 1)))
+    phase_db = 20 * float(np.log10(_FLOAT32 * seen.phase_rad + 1e-9))
+    tree_db = power_sum_db(table_db, interpolated_db, presum_db, _FLOAT32_DB, phase_db)
+    powers = 10 ** (np.array([tree_db, direct.error_db]) / 10)
+    error_db = 10 * np.log10(powers @ [1 - cost.directly, cost.directly])
     return Setting(
         "tree",
         {"oversampling": options.oversampling, "taps": options.taps},
-        {
-            "nodes_db": nodes_db,
-            "presum_db": options.presum_db,
-            "side_px": options.side_px,
-            "chunk": options.chunk,
-            "sheets": cost.sheets,
-        },
+        {name: getattr(options, name) for name in ("nodes_db", "presum_db", "side_px", "chunk")}
+        | {"sheets": cost.sheets},
         float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
@@ -143,7 +131,7 @@ def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
         reasons={
             "oversampling": f"table errs by {table_db:.1f} dB",
             "taps": "of the table's filters",
-            "nodes_db": nodes,
+            "nodes_db": f"interpolation between nodes errs by {nodes_db} dB at each of {levels} levels",
             "presum_db": f"pulses for which fewer stand err by {presum_db:.0f} dB",
             "side_px": f"cheapest here; about {100 * cost.directly:.0f} % of pixel·pulses go directly",
             "chunk": "pulses of the largest subaperture, cheapest here",

@@ -50,8 +50,7 @@ def weights_over(
     Source: docs/theory/tree.md, "Weights".
     """
     at, between, to_terms, terms_between = _matrices()
-    positions, among = _positions(surface, at), _positions(surface, between)
-    values = beams.weight(aperture, positions)
+    values = beams.weight(aperture, _positions(surface, at))
     terms = values @ to_terms.T
     limit = 10 ** (error_db / 20) * 3  # the largest of an error is about three times its RMS
     groups = -(-len(values) // TREE_GROUP)
@@ -61,8 +60,8 @@ def weights_over(
     each[full:] = True
     # Where weights jump every pulse is looked at: one between two that hold need not.
     some = np.flatnonzero(each[np.arange(len(values)) // TREE_GROUP] | (np.arange(len(values)) % _CHECKED == 0))
-    error = np.zeros(len(values))
-    error[some] = np.abs(terms[some] @ terms_between.T - beams[some].weight(aperture[some], among)).max(axis=1)
+    error, checked = np.zeros(len(values)), beams[some].weight(aperture[some], _positions(surface, between))
+    error[some] = np.abs(terms[some] @ terms_between.T - checked).max(axis=1)
     radius_m = np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max(keepdims=True)
     lit = reached(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
     # A beam may be narrower than what lies between the places, and end between two of them.
