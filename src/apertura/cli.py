@@ -14,7 +14,7 @@ import typer
 from apertura import __version__, product_commands, raw_commands
 from apertura.atlas.commands import app as study
 from apertura.errors import CampaignError, explained
-from apertura.paths import leave_working_folder
+from apertura.isolation import as_typed, given
 from apertura.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
 from apertura.step_commands import Threads
 from apertura.step_commands import app as step
@@ -47,19 +47,18 @@ PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 def _opened(campaign: Path) -> "Campaign":
     from apertura.campaign import Campaign
 
-    return Campaign.load(leave_working_folder(campaign))
+    return Campaign.load(given(campaign))
 
 
 def main() -> None:
     """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
-    started = Path.cwd()
     with ended_by_signals():
         try:
             app()
         except CampaignError as error:
             from apertura.settings import located
 
-            _say(located(str(error).replace(f"{started}/", "")))
+            _say(located(as_typed(error)))
             leave_status(2)
             raise SystemExit(2) from None
         except Interrupted as signalled:
@@ -124,7 +123,7 @@ def run(
     from apertura.workflow import Show, run_workflow
 
     show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
-    status = run_workflow(campaign, cores, *context.args, paranoid=paranoid, show=show)
+    status = run_workflow(given(campaign), cores, *context.args, paranoid=paranoid, show=show)
     if status == 0 and forms_results(["", *context.args]):
         opened = _opened(campaign)
         from apertura.steps.summary import is_finished, print_products, print_summary
@@ -174,13 +173,13 @@ def check(
     """Print all that is wrong with a campaign folder, a line each, and which results are overtaken; run nothing."""
     from apertura.check import print_findings
 
-    raise SystemExit(2 if print_findings(campaign, products=products, paranoid=paranoid) else 0)
+    raise SystemExit(2 if print_findings(given(campaign), products=products, paranoid=paranoid) else 0)
 
 
 @app.command()
 def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
     """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
-    opened = _opened(campaign)  # before anything large is imported, see `leave_working_folder`
+    opened = _opened(campaign)
     from apertura.steps.plan import print_plan
 
     print_plan(opened, threads=threads)
@@ -191,7 +190,7 @@ def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_C
     """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
     from apertura.workflow import run_workflow
 
-    status = run_workflow(campaign, cores, *context.args, "speed_accuracy")
+    status = run_workflow(given(campaign), cores, *context.args, "speed_accuracy")
     if status == 0:
         print(*(campaign / f"results/study/speed_accuracy.{suffix}" for suffix in ("png", "html", "csv")), sep="\n")
     raise SystemExit(status)
@@ -214,13 +213,13 @@ def init(
     """Write the commented config of a new campaign folder."""
     from apertura.settings.template import config_template, flights_template
 
-    folder = directory / "config"
+    folder = given(directory) / "config"
     for path, text in ((folder / "config.yaml", config_template(kind)), (folder / "flights.tsv", flights_template())):
         if path.exists():
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-        print(path)
+        print(as_typed(path))
 
 
 @app.command()
@@ -241,7 +240,7 @@ def simulate(
         return
     paths = paths or []
     if len(paths) + (preset is not None) not in {1, 2} or not paths:
-        given = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
-        raise CampaignError(given, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
-    chosen = paths[0] if len(paths) > 1 else simulation.preset(preset or "demo")
-    print(simulation.simulate(paths[-1], chosen, seed=seed))
+        typed = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
+        raise CampaignError(typed, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+    chosen = given(paths[0]) if len(paths) > 1 else simulation.preset(preset or "demo")
+    print(as_typed(simulation.simulate(given(paths[-1]), chosen, seed=seed)))

@@ -1,6 +1,5 @@
 """Where a name that a stranger's file gives may lead: to a file inside the folder, through no link."""
 
-import os
 from pathlib import Path
 
 from apertura.errors import CampaignError, quoted
@@ -47,15 +46,27 @@ def inside(root: Path, name: str, *, where: object) -> Path:
     return way[-1]
 
 
-def leave_working_folder(path: Path) -> Path:
-    """Return a path as an absolute one, and make the package's own folder the working folder.
+def check_shell_name(root: Path) -> None:
+    """Raise CampaignError if the path of a campaign holds what a shell would run between double quotes.
 
-    Libraries read settings from the working folder when they are imported (numba ``.numba_config.yaml``, matplotlib
-    ``matplotlibrc``), and with them run code. Steps are started in a campaign folder, which is a stranger's.
+    Executors of Snakemake hand commands to a shell: that of Slurm as ``sbatch --wrap="…"``, with the folder's path in them.
+
+    Examples
+    --------
+    >>> check_shell_name(Path("/data/a campaign's folder"))
+    >>> check_shell_name(Path("/data/$(reboot)"))
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: /data/$(reboot): a path with '$'; ...
     """
-    absolute = path.absolute()
-    os.chdir(Path(__file__).parent)
-    return absolute
+    active = next((mark for mark in '$`"\\' if mark in str(root)), None)
+    if active or not str(root).isprintable():
+        raise CampaignError(
+            f"a path with {active!r}" if active else "a path with control characters",
+            where=root,
+            expected="a path that a shell takes as it stands, where steps run on other machines",
+            remedy="Rename the folder.",
+        )
 
 
 def shipped() -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.paths import leave_working_folder
+from apertura.isolation import as_typed, given
 
 ALL_CORES = os.cpu_count() or 1
 
@@ -18,7 +18,7 @@ def score(
     from apertura.campaign import Campaign
     from apertura.steps.score import print_findings
 
-    print_findings(Campaign.load(leave_working_folder(campaign)), paths=paths)
+    print_findings(Campaign.load(given(campaign)), paths=paths)
 
 
 def verify(
@@ -30,11 +30,10 @@ def verify(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
 ) -> None:
     """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
-    there = None if campaign is None else campaign.absolute()
-    path = leave_working_folder(product)
+    there = None if campaign is None else given(campaign)
     from apertura.audit.verify import print_verified
 
-    raise typer.Exit(print_verified(path, there, quiet=quiet))
+    raise typer.Exit(print_verified(given(product), there, quiet=quiet))
 
 
 def reproduce(
@@ -46,11 +45,10 @@ def reproduce(
     ] = None,
 ) -> None:
     """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
-    kept = None if keep is None else keep.absolute()
-    path = leave_working_folder(product)
+    kept = None if keep is None else given(keep)
     from apertura.audit.reproduce import print_reproduced
 
-    raise typer.Exit(print_reproduced(path, cores=cores, keep=kept))
+    raise typer.Exit(print_reproduced(given(product), cores=cores, keep=kept))
 
 
 def diff(
@@ -60,21 +58,18 @@ def diff(
     whole: Annotated[bool, typer.Option("--all", help="every line of a section, however many")] = False,
 ) -> None:
     """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
-    there = second.absolute()
-    path = leave_working_folder(first)
     from apertura.audit.diff import print_differences
 
-    raise typer.Exit(print_differences(path, there, whole=whole))
+    raise typer.Exit(print_differences(given(first), given(second), whole=whole))
 
 
 def check_crate(
     folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
 ) -> None:
     """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
-    path = leave_working_folder(folder)
     from apertura.audit.passed_on import print_checked
 
-    raise typer.Exit(print_checked(path))
+    raise typer.Exit(print_checked(given(folder)))
 
 
 def report(
@@ -87,18 +82,18 @@ def report(
     from apertura.steps.page import open_report
     from apertura.workflow import run_workflow
 
-    campaign = campaign.absolute()
+    campaign = given(campaign)
     status = run_workflow(campaign, cores, "all", "pages")
     if status:
         raise SystemExit(status)
-    opened = Campaign.load(leave_working_folder(campaign))
+    opened = Campaign.load(campaign)
     with open_report(opened) as (temporary, style):
         asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
         status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
         if status:
             raise SystemExit(status)
     for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
-        typer.echo(path)
+        typer.echo(as_typed(path))
 
 
 def map_page(
@@ -110,4 +105,4 @@ def map_page(
     from apertura.campaign import Campaign
     from apertura.load.map_server import served
 
-    served(Campaign.load(leave_working_folder(campaign)), port=port).show(in_browser=open_)
+    served(Campaign.load(given(campaign)), port=port).show(in_browser=open_)

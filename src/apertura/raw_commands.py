@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.paths import leave_working_folder
+from apertura.isolation import given
 
 
 def inspect(
@@ -19,11 +19,10 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
 ) -> None:
     """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
-    picture = None if plot is None else plot.absolute()
-    there = leave_working_folder(path)
+    picture = None if plot is None else given(plot)
     from apertura.inspection.command import inspect_path
 
-    raise typer.Exit(inspect_path(there, settings or (), name=path, plot=picture, as_json=as_json))
+    raise typer.Exit(inspect_path(given(path), settings or (), name=path, plot=picture, as_json=as_json))
 
 
 def align(
@@ -44,7 +43,7 @@ def align(
     """Find the clock and the range of a recorder against its flight log: where echoes add up best."""
     from apertura.campaign import Campaign
 
-    opened = Campaign.load(leave_working_folder(campaign))
+    opened = Campaign.load(given(campaign))
     from apertura.steps.align import print_alignment
 
     asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.paths import leave_working_folder
+from apertura.isolation import as_typed, given
 from apertura.progress import telling, told_at
 
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
@@ -20,12 +20,11 @@ def _run(function: str, campaign: Path, *arguments: str, **options: object) -> N
     """Run ``module:function`` on a campaign and print the paths that it wrote."""
     from apertura.campaign import Campaign
 
-    started, campaign = Path.cwd(), leave_working_folder(campaign)
-    opened = Campaign.load(campaign)
+    opened = Campaign.load(given(campaign))
     with telling(opened.result(*told_at([function.rpartition(":")[2], *arguments]))):
         written = pkgutil.resolve_name(function)(opened, *arguments, **options)
     for path in [written] if isinstance(written, Path) else written:
-        print(path.relative_to(started) if path.is_relative_to(started) else path)
+        print(as_typed(path))
 
 
 @app.command()

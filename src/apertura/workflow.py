@@ -18,9 +18,11 @@ from apertura.atomic import remove
 from apertura.campaign import Campaign
 from apertura.check import print_problems
 from apertura.check.stale import forms_results, stale_lines, stale_results
+from apertura.errors import CampaignError
+from apertura.isolation import given, isolate
 from apertura.lineage import on_demand
 from apertura.lock import hold
-from apertura.paths import shipped
+from apertura.paths import check_shell_name, shipped
 from apertura.progress import RUN
 from apertura.runs.expectation import Outlook
 from apertura.runs.failure import failures
@@ -36,6 +38,8 @@ _LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
+_HOLDS_CODE = ("--prof", "--workflow-p", "--configf", "--snakefile", "-s", "--jobscript", "--js")
+"""How options of snakemake begin that name files which it takes code from; it knows them by their beginnings, too."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _LOG = "snakemake.log"
 
@@ -65,6 +69,7 @@ class _Files:
     @property
     def environment(self) -> dict[str, str]:
         """What snakemake and its steps are told; rules call `apertura`, which need not be on the caller's PATH."""
+        isolate()
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
         return {**os.environ, "PATH": path, STATUS_FILE: str(self.status), JOURNAL: str(self.journal)}
 
@@ -101,6 +106,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         If the campaign is not fit to run, or another run holds it.
     """
     elsewhere = _runs_elsewhere(arguments)
+    options = code_from_outside(root, arguments)
+    if elsewhere:
+        check_shell_name(root.absolute())
     if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
         return 2
     root = root.absolute()
@@ -112,7 +120,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
     overtaken = [manifest for manifest in stale if not on_demand(manifest)]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    command = _command(root, cores, [*profiles_found(arguments), *forced])
+    command = _command(root, cores, [*options, *forced])
     if forms:
         files, at_once = _Files.of(campaign), 0 if elsewhere else cores
         note(files.journal, "start", cores=at_once)
@@ -186,26 +194,60 @@ def _killed_for_memory() -> int:
         return 0
 
 
-def profiles_found(arguments: Sequence[str]) -> list[str]:
-    """Return options of snakemake with the profile's whole path: it lies here or beside the workflow, or is a name.
+def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
+    """Return options of snakemake with the whole paths of files that it takes code from, none of them in the campaign.
 
-    Snakemake is started in another folder than the caller's.
+    Snakemake is started in another folder than the caller's. A profile, as a config, may hold Python (YTE).
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    arguments
+        Options and targets.
+
+    Raises
+    ------
+    CampaignError
+        If such a file lies in the campaign folder, or is reached through it.
 
     Examples
     --------
-    >>> [Path(word).is_dir() for word in profiles_found(["-n", "--profile=profiles/slurm"])]
-    [False, False, True]
+    >>> options = code_from_outside(Path("campaign"), ["-n", "--profile=profiles/slurm"])
+    >>> options[:2], Path(options[2]) == shipped() / "profiles" / "slurm"
+    (['-n', '--profile'], True)
     """
-    found = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--profile=") else [one])]
-    for at, word in enumerate(found[1:], 1):
-        whole = (place / word for place in (Path.cwd(), shipped()) if found[at - 1] == "--profile")
-        found[at] = next((str(path) for path in whole if path.exists()), word)
+    found = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--") else [one])]
+    option = ""
+    for at, word in enumerate(found):
+        if word.startswith("-"):
+            option = word
+        elif option.startswith(_HOLDS_CODE):
+            found[at] = _whole(root, option, word)
     return found
+
+
+def _whole(root: Path, option: str, name: str) -> str:
+    """Return a path whole, what is shipped before what lies where the caller is; a name that is neither as it is."""
+    ours, theirs = shipped() / name, given(Path(name))
+    if ours.exists() and not Path(name).is_absolute():
+        return str(ours)
+    if not theirs.exists():
+        return name
+    if any(way.is_relative_to(root.resolve()) for way in (theirs.resolve(), theirs.parent.resolve())):
+        raise CampaignError(
+            f"{option} {name} lies in the campaign folder",
+            "apertura run",
+            "a file of your own: Snakemake runs code that it holds, and a campaign folder brings data",
+            "Read it, and copy it out of the campaign folder if you trust it.",
+        )
+    return str(theirs)
 
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
     """Return whether steps run on other machines than this one."""
-    return any(argument.startswith(("--executor", "--profile", "-e")) for argument in arguments)
+    named = any(argument.startswith(("--exec", "--prof", "-e")) for argument in arguments)
+    return named or "SNAKEMAKE_PROFILE" in os.environ
 
 
 def _supervised(
@@ -217,7 +259,7 @@ def _supervised(
     """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
     process = subprocess.Popen(
         command,
-        cwd=Path(__file__).parent,  # never the campaign's: see `leave_working_folder`
+        cwd=Path(__file__).parent,  # never the campaign's: see `apertura.isolation`
         env=environment,
         stdout=output,
         stderr=output,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from apertura.check.loading import load
 from apertura.errors import CampaignError
+from apertura.isolation import as_typed
 from apertura.settings import located
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ CHECKS: Mapping[str, str] = {
     "flights": "apertura.check.flights:check_flights",
     "files": "apertura.check.files:check_files",
     "links": "apertura.check.links:check_links",
+    "modules": "apertura.check.links:check_modules",
     "results": "apertura.check.results:check_writable",
     "codes": "apertura.check.codes:check_codes",
     "recordings": "apertura.check.recordings:check_recordings",
@@ -84,7 +86,7 @@ def print_problems(root: str | Path, *, without: Collection[str] = (), stream: T
     """Print the problems of a campaign folder, one line each; return how many there are."""
     found = problems(root, without=without)
     for problem in found:
-        print(as_line(problem), file=stream or sys.stdout)
+        print(as_typed(as_line(problem)), file=stream or sys.stdout)
     return len(found)
 
 

@@ -1,4 +1,4 @@
-"""Links below the results: what is written or deleted there must not reach another place."""
+"""Links below the results, through which another place would be written; modules, which Snakemake's jobs would import."""
 
 import os
 from collections.abc import Iterator
@@ -7,12 +7,27 @@ from pathlib import Path
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 
+_IMPORTED = ".snakemake/pip-deployments"
+"""Relative to the working folder (snakemake 9, `PIP_DEPLOYMENTS_PATH`): for plugins that a job installs itself."""
+
 
 def check_links(inspected: Inspected) -> Iterator[CampaignError]:
     """Yield an error for each symbolic link that the results, or Snakemake's own records, hold or are."""
     for folder in ("results", ".snakemake"):
         top = inspected.campaign.root / folder
         yield from (_refused(path) for path in _links(top))
+
+
+def check_modules(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield an error where modules lie in the folder that Snakemake puts on its search path in every job."""
+    folder = inspected.campaign.root / _IMPORTED
+    if folder.is_dir() and any(folder.iterdir()):
+        yield CampaignError(
+            "Python modules in Snakemake's own folder",
+            where=folder,
+            expected="a campaign folder without code: every job would import them",
+            remedy="Remove that folder; plugins of Snakemake are installed beside apertura.",
+        )
 
 
 def _links(top: Path) -> Iterator[Path]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from apertura.errors import CampaignError
+from apertura.isolation import given
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -46,7 +47,7 @@ PAPER_FIGURES: dict[str, tuple[str, ...]] = {
 }
 """The paper's figures with data, in its order → the experiments whose campaigns they show."""
 
-Folder = Annotated[Path, typer.Option("--folder", help="where results are written")]
+Folder = Annotated[Path, typer.Option("--folder", callback=given, help="where results are written")]
 
 
 @app.command()
@@ -57,8 +58,8 @@ def paper_part(part: str, folder: Folder = PAPER) -> None:
     require("part", part, PAPER_PARTS)
     path = folder / "parts" / f"{part}.csv"
     claims = pkgutil.resolve_name(f"apertura.study.paper.{PAPER_PARTS[part]}")
-    given = [part.removeprefix("loss_")] if PAPER_PARTS[part] == _LOSS else []
-    write_table(path, claims(*given, *([folder / CAMPAIGNS] if part in PAPER_READS else [])))
+    error = [part.removeprefix("loss_")] if PAPER_PARTS[part] == _LOSS else []
+    write_table(path, claims(*error, *([folder / CAMPAIGNS] if part in PAPER_READS else [])))
     typer.echo(path)
 
 
