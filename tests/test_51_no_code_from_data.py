@@ -1,127 +1,564 @@
-"""A campaign folder brings data. Whatever else lies in it is not run: each test would leave a marker if it were."""
+"""A campaign folder brings data. Whatever else lies in it is neither run nor opened, by whatever road it is reached."""
 
 import os
-import pickle
+import shlex
+import shutil
+import signal
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import pytest
-from folders import copy_writable
+import yaml
+import zarr
+from attack.planted import SNAKEMAKES_OWN, hostile_texts, plant
+from folders import copy_writable, edit_config, run_steps
+from test_43_terrain import write_plane
+from typer.main import get_command
+
+from apertura.cli import app
+from apertura.settings.template import config_schema
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
-CODE = "import os; os.close(os.open({marker!r}, os.O_CREAT))"
+BATCH_SYSTEM = ROOT / "tests" / "attack" / "batch_system"
+PLAIN_PATH = f"{BIN}{os.pathsep}/usr/bin{os.pathsep}/bin{os.pathsep}."
+"""Of a person who has the working folder on the path, last."""
 
-LOOKS = ("plan", "check", "summary", "step scene")
-"""What a person types in a campaign folder."""
+TYPED = {
+    "align": "align . f01 uav1 --point 500000 5300000 500",
+    "chart": "chart . -n",
+    "check": "check .",
+    "check-crate": "check-crate .",
+    "clean": "clean . --yes",
+    "diff": "diff results/f01/uav1-uav1/db.tif results/f01/uav1-uav2/db.tif",
+    "init": "init new",
+    "inspect": "inspect .",
+    "list": "list",
+    "map": "map .",
+    "plan": "plan .",
+    "report": "report .",
+    "reproduce": "reproduce results/f01/uav1-uav1/db.tif",
+    "run": "run . --cores 2",
+    "score": "score .",
+    "simulate": "simulate simulated",
+    "status": "status",
+    "summary": "summary",
+    "verify": "verify results/f01/fused/coherent_db.tif",
+    "step assess": "step assess f01",
+    "step calibrate": "step calibrate f01",
+    "step chart": "step chart f01 uav1-uav1 --seconds 1",
+    "step cphd": "step cphd f01 uav1-uav2",
+    "step echo": "step echo f01 uav1-uav2",
+    "step export": "step export f01 fused",
+    "step image": "step image f01 uav1-uav2",
+    "step ingest": "step ingest f01 uav1",
+    "step interferogram": "step interferogram none",
+    "step layers": "step layers f01 uav1-uav2",
+    "step page": "step page f01",
+    "step pictures": "step pictures f01 uav1-uav2",
+    "step profile": "step profile f01 uav1-uav2",
+    "step refine": "step refine f01",
+    "step tiles": "step tiles f01 uav1-uav2 1-of-2",
+    "step whole-chart": "step whole-chart --repeats 1",
+    "study atlas-chart": "study atlas-chart none",
+    "study atlas-sweep": "study atlas-sweep none",
+    "study paper-figure": "study paper-figure scene",
+    "study paper-part": "study paper-part parameters",
+    "study refinement-picture": "study refinement-picture none",
+    "study refinement-sweep": "study refinement-sweep none",
+    "study stability-chart": "study stability-chart none",
+    "study stability-sweep": "study stability-sweep none none",
+}
+"""Command → what is typed in the campaign folder, where that is more than the command."""
+
+MAY_REFUSE = {"align", "diff", "verify", "step calibrate", "step interferogram", "step whole-chart"}
+"""Commands that have something to say of such a campaign."""
+
+QUICK = ("check", "init", "plan", "step scene")
 
 ROADS = {
-    "snakemake from the sources": ([BIN / "snakemake", "--directory", "{campaign}"], ROOT),
-    "snakemake from elsewhere": (
-        [BIN / "snakemake", "--snakefile", ROOT / "Snakefile", "--directory", "{campaign}"],
-        None,
+    "apertura, in the campaign": ("{bin}/apertura run . --cores 2", "{campaign}"),
+    "apertura, from elsewhere": ("{bin}/apertura run {campaign} --cores 2 --groups echo=g", None),
+    "apertura, tiles by several jobs": ("{bin}/apertura run . --cores 2 --set-scatter tiles=2", "{campaign}"),
+    "snakemake, from the sources": ("{bin}/snakemake --directory {campaign} --cores 2", "{root}"),
+    "snakemake, from elsewhere": ("{bin}/snakemake --snakefile {root}/Snakefile --directory {campaign} -c 2", None),
+    "Slurm, in the campaign": ("{bin}/apertura run . --profile profiles/slurm --cores 2 {quick}", "{campaign}"),
+    "Slurm, from elsewhere": ("{bin}/apertura run {campaign} --profile {root}/profiles/slurm -c 2 {quick}", None),
+    "Slurm, plain snakemake": (
+        "{bin}/snakemake --directory {campaign} --profile profiles/slurm --cores 2 {quick}",
+        "{root}",
     ),
-    "apertura from elsewhere": ([BIN / "apertura", "run", "{campaign}"], None),
-    "apertura in the campaign": ([BIN / "apertura", "run", "."], "{campaign}"),
-    "apertura check in the campaign": ([BIN / "apertura", "check", "."], "{campaign}"),
+    "a batch system that hands on no environment": (
+        "{bin}/apertura run . --executor cluster-generic --cluster-generic-submit-cmd "
+        "'env -i PATH={bin}:/usr/bin:/bin sh' --jobs 1 --cores 2",
+        "{campaign}",
+    ),
 }
+"""A campaign from its raw files to its products."""
+
+OUT_OF_REACH = "--set-scatter tiles=1 --latency-wait 2 --slurm-init-seconds-before-status-checks 1"
 
 
-class _Code:
-    def __init__(self, code):
-        self.code = code
-
-    def __reduce__(self):
-        return exec, (self.code,)
-
-
-def plant(root, marker):
-    """Lay code wherever a tool that trusts the folder would look for some."""
-    code = CODE.format(marker=str(marker))
-    yte = f"__use_yte__: true\n__definitions__:\n  - {code!r}\ncores: 1\n"
-    files = dict.fromkeys(("profiles/default/config.yaml", "default/config.yaml", "config.yaml"), yte)
-    files |= {f"profiles/default/config.v{version}+.yaml": yte for version in (8, 9)}
-    files |= dict.fromkeys(("Snakefile", "workflow/Snakefile", "workflow/profiles/default/Snakefile"), f"{code}\n")
-    modules = ("snakemake", "yaml", "numpy", "json", "encodings", "apertura", "sitecustomize", "usercustomize", "zarr")
-    files |= {f"{name}.py": f"{code}\n" for name in modules}
-    files |= {"apertura/__init__.py": f"{code}\n", "pyproject.toml": "[tool.x]\n", "python.pth": f"import os; {code}\n"}
-    files |= dict.fromkeys(("apertura.sh", "bash", "python", ".envrc", ".bashrc"), f"#!/bin/sh\ntouch {marker}\n")
-    # Settings that libraries read from the working folder when they are imported; these would be an error at least.
-    files |= {".numba_config.yaml": "[", "matplotlibrc": "backend: nosuch\n\x00"}
-    for name, text in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-        path.chmod(0o755)
-    for name in ("iocache/latest.pkl", "metadata/cmVzdWx0cw==", "auxiliary/code.pkl"):
-        path = root / ".snakemake" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(_Code(code)))
+def leaves():
+    """Every command there is, as it is typed."""
+    commands = get_command(app).commands
+    for name, command in commands.items():
+        yield from (f"{name} {one}" for one in command.commands) if hasattr(command, "commands") else [name]
 
 
-def run(road, campaign, elsewhere, *options):
-    command, folder = ROADS[road]
-    command = [str(part).format(campaign=campaign) for part in command]
-    options = () if "check" in command else ("--cores", "1", *options)
-    return subprocess.run(
-        [*command, *options],
-        cwd=elsewhere if folder is None else str(folder).format(campaign=campaign),
-        env={**os.environ, "PATH": f"{BIN}{os.pathsep}/usr/bin:/bin"},
+def start(words, folder, **environment):
+    return subprocess.Popen(
+        words,
+        cwd=folder,
+        env={**os.environ, "PATH": PLAIN_PATH, **environment},
         text=True,
-        capture_output=True,
-        check=False,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
     )
+
+
+def run(words, folder, **environment):
+    """Run a command to its end; return its status and all that it printed."""
+    process = start(words, folder, **environment)
+    printed, said = process.communicate(timeout=500)
+    return process.returncode, printed + said
+
+
+def one_message(status, said):
+    assert status == 2, said
+    assert "Traceback" not in said
+    assert len(said.strip().splitlines()) < 12, said
+    return said
+
+
+@pytest.fixture(scope="session")
+def _on_a_plane(_tiny, tmp_path_factory):
+    root = copy_writable(_tiny, tmp_path_factory.mktemp("plane") / "campaign")
+    write_plane(root, height_m=500.0)
+    edit_config(root, lambda config: config["scene"].update(dem="dem.tif", dem_datum="ellipsoid"))
+    return root
+
+
+@pytest.fixture(scope="session")
+def _finished(_on_a_plane, tmp_path_factory):
+    return run_steps(copy_writable(_on_a_plane, tmp_path_factory.mktemp("finished_plane") / "campaign")).root
+
+
+@pytest.fixture
+def unfinished(_on_a_plane, tmp_path):
+    return copy_writable(_on_a_plane, tmp_path / "campaign")
+
+
+@pytest.fixture
+def finished(_finished, tmp_path):
+    return copy_writable(_finished, tmp_path / "campaign")
+
+
+def test_a_marker_that_is_run_or_opened_is_seen(unfinished, tmp_path):
+    """What the other tests rest on: Python started in the folder, and a file outside that is read."""
+    planted = plant(unfinished)
+    with planted.fires() as fired:
+        subprocess.run([sys.executable, "-c", "import yaml"], cwd=unfinished, check=False)
+        subprocess.run([sys.executable, "-P", "-c", "import yaml"], cwd=unfinished, check=True)
+        (planted.outside / "init").read_bytes()
+        (unfinished / "matplotlibrc").read_bytes()
+    assert {"ran yaml.py", "opened outside/init", "opened campaign/matplotlibrc"} <= set(fired)
+    assert "ran numpy.py" not in fired
+
+
+def every_command():
+    return [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in leaves()]
+
+
+def test_every_command_is_tried():
+    assert set(TYPED) | MAY_REFUSE <= set(leaves())
+
+
+@pytest.mark.parametrize("command", every_command())
+def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, command):
+    planted = plant(finished)
+    words = [str(BIN / "apertura"), *shlex.split(TYPED.get(command, command))]
+    with planted.fires() as fired:
+        if command == "map":
+            status, said = mapped(words, finished)
+        else:
+            status, said = run(words, finished)
+    assert fired == []
+    assert "Traceback" not in said
+    allowed = {0, 2} if command in MAY_REFUSE or command.startswith("study") else {0}
+    assert status in allowed, said
+
+
+def mapped(words, folder):
+    """Ask the map's server for all that a browser would, and end it."""
+    process = start(words, folder)
+    address = process.stdout.readline().strip()
+    answers = []
+    base = address.replace("localhost", "127.0.0.1").partition("/map/")[0].rstrip("/")
+    for name in ("", "map/", "map/index.html", "map/app.js", "map/app.css", "map/map.json", "map/shell.js", "yaml.py"):
+        for host in (base, base.replace("127.0.0.1", "localhost")):
+            try:
+                with urllib.request.urlopen(f"{host}/{name}") as answer:
+                    answers.append(answer.read())
+            except urllib.error.HTTPError as error:
+                answers.append(error.read())
+    process.send_signal(signal.SIGINT)
+    said = "".join(process.communicate(timeout=20))
+    assert not any(b"evil.example" in answer or b"os.O_CREAT" in answer for answer in answers)
+    return process.returncode, said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("road", ROADS)
-def test_no_file_beside_the_data_is_run(tiny, tmp_path, road):
-    marker = tmp_path / "marker"
-    plant(tiny, marker)
-    done = run(road, tiny, tmp_path, "-n")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert not marker.exists()
-
-
-@pytest.mark.parametrize("words", LOOKS)
-def test_nor_by_commands_typed_in_the_folder(finished_tiny, tmp_path, words):
-    """Such as numba's cache of compiled code, unpickled from where `.numba_config.yaml` says."""
-    campaign, marker = copy_writable(finished_tiny.root, tmp_path / "campaign"), tmp_path / "marker"
-    plant(campaign, marker)
-    words = [*words.split(), *([] if "step" in words or "summary" in words else ["."])]
-    done = subprocess.run([BIN / "apertura", *words], cwd=campaign, text=True, capture_output=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert not marker.exists()
+def test_nothing_fires_from_the_raw_files_to_the_products(unfinished, tmp_path, road):
+    planted, jobs = plant(unfinished), tmp_path / "jobs"
+    jobs.mkdir()
+    command, folder = ROADS[road]
+    names = {"bin": BIN, "root": ROOT, "campaign": unfinished, "quick": OUT_OF_REACH}
+    folder = tmp_path if folder is None else folder.format(**names)
+    path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
+    with planted.fires() as fired:
+        status, said = run(shlex.split(command.format(**names)), folder, PATH=path, BATCH_JOBS=str(jobs))
+    assert fired == []
+    assert status == 0, said
+    assert (unfinished / "results/f01/fused/coherent_db.tif").is_file()
+    assert ("Slurm" in road) is any(jobs.iterdir())
 
 
 @pytest.mark.slow
-def test_nor_while_steps_run(tiny, tmp_path):
-    marker = tmp_path / "marker"
-    plant(tiny, marker)
-    done = run("apertura in the campaign", tiny, tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tiny / "results/f01/fused/coherent_db.tif").is_file()
-    assert not marker.exists()
+@pytest.mark.parametrize("road", ["apertura, in the campaign", "snakemake, from the sources", "Slurm, in the campaign"])
+def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_import_them(unfinished, tmp_path, road):
+    planted, jobs = plant(unfinished, in_snakemakes_own=True), tmp_path / "jobs"
+    jobs.mkdir()
+    command, folder = ROADS[road]
+    names = {"bin": BIN, "root": ROOT, "campaign": unfinished, "quick": OUT_OF_REACH}
+    path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
+    with planted.fires() as fired:
+        status, said = run(
+            shlex.split(command.format(**names)), folder.format(**names), PATH=path, BATCH_JOBS=str(jobs)
+        )
+    assert fired == []
+    assert status != 0
+    assert f"{SNAKEMAKES_OWN}: Python modules in Snakemake's own folder" in said.replace("\n", " ")
+    assert not any(jobs.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--profile profiles/own",
+        "--profile=./profiles/slurm",
+        "--profile {campaign}/profiles/slurm",
+        "--prof {campaign}/profiles/slurm",
+        "--profile {campaign}/../campaign/profiles/slurm/config.yaml",
+        "--profile {linked}",
+        "--workflow-profile {campaign}/profiles/default",
+        "--workflow-profile=profiles/none",
+        "--configfile {campaign}/config.yaml",
+        "--snakefile Snakefile",
+        "-s {campaign}/Snakefile",
+        "--jobscript {campaign}/bash",
+    ],
+)
+def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, words):
+    planted, linked = plant(unfinished), tmp_path / "linked"
+    linked.symlink_to(unfinished / "profiles" / "slurm")
+    words = shlex.split(words.format(campaign=unfinished, linked=linked))
+    with planted.fires() as fired:
+        said = one_message(*run([BIN / "apertura", "run", ".", "-n", *words], unfinished))
+    assert fired == []
+    assert "lies in the campaign folder" in said
+
+
+def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere_are_found(unfinished, tmp_path):
+    planted, own = plant(unfinished), tmp_path / "elsewhere" / "mine"
+    own.mkdir(parents=True)
+    (own / "config.yaml").write_text("printshellcmds: true\n")
+    for folder, profile in ((unfinished, "profiles/default"), (own.parent, "mine"), (tmp_path, "elsewhere/mine")):
+        with planted.fires() as fired:
+            status, said = run([BIN / "apertura", "run", unfinished, "-n", "--profile", profile], folder)
+        assert (status, fired) == (0, []), said
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["snakemake from the sources", "apertura in the campaign"])
+def test_a_name_that_a_shell_would_run_is_refused_where_a_batch_system_takes_it(unfinished, tmp_path):
+    jobs, root = tmp_path / "jobs", unfinished.rename(tmp_path / "$(touch ran)`touch ran`")
+    jobs.mkdir()
+    path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
+    for words in (
+        [BIN / "apertura", "run", ".", "--profile", "profiles/slurm"],
+        [
+            BIN / "snakemake",
+            "--snakefile",
+            ROOT / "Snakefile",
+            "--directory",
+            root,
+            "--profile",
+            ROOT / "profiles/slurm",
+        ],
+    ):
+        folder = root if "run" in words else tmp_path
+        status, said = run([*words, "--cores", "1"], folder, PATH=path, BATCH_JOBS=str(jobs))
+        assert status != 0
+        assert "a path with '$'" in said
+    assert not any(jobs.iterdir())
+    assert not [*tmp_path.rglob("ran")]
+    assert run([BIN / "apertura", "run", ".", "-n"], root)[0] == 0
+
+
+def text_keys():
+    """Every key of the config that holds free text, as a way to it."""
+    import json
+
+    schema = json.loads(config_schema())
+    found = {}
+
+    def walk(node, way):
+        if "$ref" in node:
+            node = schema["$defs"][node["$ref"].rpartition("/")[2]]
+        for kind in ("anyOf", "oneOf", "allOf"):
+            for one in node.get(kind, []):
+                walk(one, way)
+        if node.get("type") == "string" and not node.keys() & {"enum", "const"}:
+            found[way] = None
+        for name, one in node.get("properties", {}).items():
+            walk(one, (*way, name))
+        for name, one in (("*", node.get("additionalProperties")), (0, node.get("items"))):
+            if isinstance(one, dict):
+                walk(one, (*way, name))
+        for one in node.get("prefixItems", []):
+            walk(one, (*way, 0))
+
+    walk(schema, ())
+    return list(found)
+
+
+def with_text(config, way, text):
+    """Return a config with a text at a key; names that are free are those of the campaign, or x."""
+    document = here = yaml.safe_load(yaml.safe_dump(config))
+    way = [
+        "uav1" if (at, name) == (1, "*") and way[0] == "nodes" else "x" if name == "*" else name
+        for at, name in enumerate(way)
+    ]
+    for name, after in zip(way, [*way[1:], None], strict=True):
+        if after is None:
+            value = text
+        elif after == 0:
+            value = []
+        else:
+            value = {}
+        if isinstance(here, list):
+            here.append(value)
+            here = here[-1]
+        elif after is None:
+            here[name] = text
+        else:
+            here = here.setdefault(name, value)
+    return document
+
+
+IN_ONE_PROCESS = """
+import sys, traceback, yaml
+from pathlib import Path
+from apertura.isolation import leave_working_folder
+leave_working_folder()
+from apertura.check import as_line, problems
+root = Path(sys.argv[1])
+for path in sorted(Path(sys.argv[2]).iterdir()):
+    (root / "config/config.yaml").write_bytes(path.read_bytes())
+    try:
+        lines = [as_line(problem) for problem in problems(root)]
+        print(path.name, "PASSED" if not lines else f"{len(lines)} told", flush=True)
+    except Exception:
+        print(path.name, "TRACEBACK", traceback.format_exc().splitlines()[-1], flush=True)
+"""
+
+
+def checked(root, documents, scratch):
+    """Check a campaign with each of several configs; return what was told of each."""
+    scratch.mkdir()
+    for number, document in enumerate(documents):
+        (scratch / f"{number:04d}").write_text(yaml.safe_dump(document))
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", IN_ONE_PROCESS, root, scratch],
+        cwd=root,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return [line.partition(" ")[2] for line in done.stdout.splitlines()], done.stderr
+
+
+@pytest.mark.slow
+def test_no_text_of_the_config_leads_a_library_out_of_the_folder(unfinished, tmp_path):
+    planted = plant(unfinished)
+    (unfinished / "linked").symlink_to(planted.outside)
+    config = yaml.safe_load((unfinished / "config/config.yaml").read_text())
+    cases = [(way, name) for way in text_keys() for name in hostile_texts(planted)]
+    texts = hostile_texts(planted)
+    with planted.fires() as fired:
+        told, said = checked(
+            unfinished, [with_text(config, way, texts[name]) for way, name in cases], tmp_path / "configs"
+        )
+    assert len(told) == len(cases) > 300
+    assert fired == []
+    assert [(case, line) for case, line in zip(cases, told, strict=True) if "TRACEBACK" in line] == []
+    assert "Warning" not in said
+    passed = {case for case, line in zip(cases, told, strict=True) if line == "PASSED"}
+    assert {way for way, _ in passed} <= {("campaign",), ("nodes", "*", "log", "columns", "*")}
+
+
+@pytest.mark.slow
+def test_text_that_is_only_a_title_is_only_a_title_in_every_product(unfinished):
+    planted = plant(unfinished)
+    texts = hostile_texts(planted)
+    edit_config(unfinished, lambda config: config.update(campaign=texts["format"].replace("&", "")[:110]))
+    with planted.fires() as fired:
+        status, said = run([BIN / "apertura", "run", ".", "--cores", "2"], unfinished)
+    assert fired == []
+    assert status in {0, 2}, said
+
+
+@pytest.mark.parametrize("name", ["PROJ nadgrids", "PROJ init", "PROJ geoidgrids", "PROJ text", "a code of PROJ"])
+def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinished, name):
+    planted = plant(unfinished)
+    edit_config(unfinished, lambda config: config["scene"].update(crs=hostile_texts(planted)[name]))
+    with planted.fires() as fired:
+        said = one_message(*run([BIN / "apertura", "check", "."], unfinished))
+    assert fired == []
+    assert "scene" in said
+
+
+@pytest.mark.parametrize("what", ["config", "raw", "log", "results", "records", "chunk"])
+def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(finished, tmp_path, what):
+    planted = plant(finished)
+    behind = {
+        "config": finished / "config" / "config.yaml",
+        "raw": finished / "raw" / "f01",
+        "log": next((finished / "raw" / "f01").glob("uav1.track.*")),
+        "results": finished / "results" / "f01",
+        "records": finished / ".snakemake",
+        "chunk": finished / "results/f01/uav1-uav1/image.zarr/image/c/0/0",
+    }[what]
+    shutil.move(behind, planted.outside / "moved")
+    behind.symlink_to(planted.outside / "moved")
+    with planted.fires() as fired:
+        for words in (["check", "."], ["run", ".", "-n"], ["step", "image", "f01", "uav1-uav1"]):
+            status, said = run([BIN / "apertura", *words], finished)
+            assert "Traceback" not in said
+            assert status == 2 or "step" in words, said
+    assert fired == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("road", ["apertura, in the campaign", "snakemake, from the sources"])
 @pytest.mark.parametrize(
     "line",
     [
         "__use_yte__: true\n__definitions__:\n  - {code!r}\n",
-        "x: !!python/object/apply:os.system ['touch {marker}']\n",
-        "?__import__('os').system('touch {marker}'): 1\n",
+        "x: !!python/object/apply:os.system ['{shell}']\n",
+        "?__import__('os').system('{shell}'): 1\n",
     ],
     ids=["yte", "python tag", "yte key"],
 )
-def test_code_in_the_config_is_refused_as_a_key_or_a_tag(tiny, tmp_path, road, line):
-    marker = tmp_path / "marker"
-    path = tiny / "config" / "config.yaml"
-    path.write_text(line.format(code=CODE.format(marker=str(marker)), marker=marker) + path.read_text())
-    done = run(road, tiny, tmp_path, "-n")
-    assert done.returncode != 0
-    assert "config/config.yaml" in done.stderr + done.stdout
-    assert "Traceback" not in done.stderr + done.stdout
-    assert not marker.exists()
+def test_code_in_the_config_is_refused_as_a_key_or_a_tag(unfinished, road, line):
+    planted = plant(unfinished)
+    path = unfinished / "config" / "config.yaml"
+    path.write_text(line.format(code=planted.code("config"), shell=planted.shell("config")) + path.read_text())
+    command, folder = ROADS[road]
+    names = {"bin": BIN, "root": ROOT, "campaign": unfinished}
+    with planted.fires() as fired:
+        status, said = run([*shlex.split(command.format(**names)), "-n"], folder.format(**names))
+    assert fired == []
+    assert status != 0
+    assert "config/config.yaml" in said
+    assert "Traceback" not in said
+
+
+def test_a_pickle_in_a_stage_of_version_2_is_not_opened(finished, tmp_path):
+    """A forged result with manifests that agree: zarr's version 2 keeps objects as pickles."""
+    from numcodecs import Pickle
+
+    from apertura.campaign import Campaign
+    from apertura.errors import CampaignError
+    from apertura.store import open_stage
+
+    planted = plant(finished)
+    stage = finished / "results/f01/uav1-uav1/image.zarr"
+    shutil.rmtree(stage / "image")
+    (stage / "zarr.json").unlink()
+    (stage / ".zgroup").write_text('{"zarr_format": 2}')
+    array = zarr.create_array(stage / "image", shape=(1,), dtype=object, zarr_format=2, filters=[Pickle()])
+    array[:] = [type("Run", (), {"__reduce__": lambda _: (exec, (planted.code("pickle"),))})()]
+    manifest = finished / "results/f01/uav1-uav1/image.manifest.json"
+    manifest.write_text(manifest.read_text())
+    with planted.fires() as fired, pytest.raises((CampaignError, FileNotFoundError)):
+        open_stage(Campaign.load(finished).stage("image", "f01", "uav1-uav1"), "image").load()
+    assert fired == []
+
+
+ENVIRONMENT = {
+    "APERTURA_KERNEL": ["/etc/passwd"],
+    "APERTURA_ISA": ["z80"],
+    "PYTHONIOENCODING": ["ascii", "latin-1:strict"],
+    "COLUMNS": ["x", "-1"],
+    "MPLBACKEND": ["nosuch"],
+    "MPLCONFIGDIR": ["/proc/nowhere"],
+    "TMPDIR": ["/nowhere"],
+    "PROJ_DATA": ["/nowhere"],
+    "GDAL_DATA": ["/nowhere"],
+    "NUMBA_NUM_THREADS": ["x"],
+    "OMP_NUM_THREADS": ["x"],
+    "ZARR_ARRAY__ORDER": ["F", "Q"],
+    "DASK_SCHEDULER": ["nosuch"],
+    "DASK_SCHEDULER_ADDRESS": ["tcp://127.0.0.1:9"],
+    "HOME": ["/nowhere"],
+    "TZ": ["nosuch/zone"],
+    "LC_ALL": ["C", "nosuch"],
+    "PATH": ["", "/nowhere"],
+    "SNAKEMAKE_PROFILE": ["nosuch"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in ENVIRONMENT.items() for value in values])
+@pytest.mark.parametrize("words", ["plan .", "run . -n", "step export f01 uav1-uav1"])
+def test_a_setting_of_the_environment_changes_nothing_or_is_one_message(finished, name, value, words):
+    status, said = run([BIN / "apertura", *words.split()], finished, **{name: value})
+    assert "Traceback" not in said
+    assert status in {0, 2}
+    assert status == 0 or len(said.strip().splitlines()) < 6, said
+    assert name != "APERTURA_KERNEL" or (status == 2 and "APERTURA_KERNEL" in said) or words != "plan ."
+
+
+@pytest.mark.slow
+def test_a_setting_of_zarr_changes_no_byte_of_a_stage(unfinished, tmp_path):
+    other = copy_writable(unfinished, tmp_path / "other")
+    for root, order in ((unfinished, "C"), (other, "F")):
+        for words in ("step ingest f01 uav1", "step ingest f01 uav2", "step echo f01 uav1-uav2"):
+            status, said = run([BIN / "apertura", *words.split()], root, ZARR_ARRAY__ORDER=order)
+            assert status == 0, said
+    files = sorted(path.relative_to(other) for path in (other / "results").rglob("*.zarr/**/*") if path.is_file())
+    assert len(files) > 20
+    assert [name for name in files if (other / name).read_bytes() != (unfinished / name).read_bytes()] == []
+
+
+def test_a_working_folder_that_is_gone_is_one_message(tmp_path):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    process = subprocess.run(
+        ["sh", "-c", f"rmdir {folder}; exec {BIN}/apertura check x"],
+        cwd=folder,
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert (process.returncode, process.stderr) == (
+        2,
+        "error: the working folder: No such file or directory. Go to a folder that exists.\n",
+    )

@@ -1,4 +1,7 @@
-"""Physical constants; the only place they are written."""
+"""Physical constants, and codes of registers; the only place they are written."""
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact by definition of the metre)."""
+
+VERTICAL_DATUMS = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
+"""Vertical CRS → the datum that its heights count from, as the config calls it."""

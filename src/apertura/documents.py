@@ -4,7 +4,7 @@ Nothing that a file holds is trusted: sizes, depths and aliases are counted befo
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -213,3 +213,34 @@ def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no number of JSON")
+
+
+CODECS = frozenset({"bytes", "transpose", "zstd", "gzip", "blosc", "crc32c", "sharding_indexed", "vlen-utf8"})
+"""How chunks of zarr may be packed. Others may do anything: that of numcodecs called pickle runs code out of them."""
+
+
+def other_codec(metadata: object) -> str | None:
+    """Return a codec that a document of zarr, version 3, names wherever it stands and that is none of `CODECS`.
+
+    Parameters
+    ----------
+    metadata
+        A ``zarr.json`` as it was read: of an array, or of a group that repeats those of its arrays.
+
+    Examples
+    --------
+    >>> shard = {"name": "sharding_indexed", "configuration": {"codecs": [{"name": "numcodecs.pickle"}]}}
+    >>> other_codec({"codecs": [shard]}), other_codec({"codecs": ["bytes"]}), other_codec({"codecs": 3})
+    ('numcodecs.pickle', None, '3')
+    """
+    listed = metadata if isinstance(metadata, list) else []
+    for key, value in metadata.items() if isinstance(metadata, Mapping) else enumerate(listed):
+        if key in {"codecs", "index_codecs"}:
+            for codec in value if isinstance(value, list) else [value]:
+                name = codec.get("name") if isinstance(codec, Mapping) else codec
+                if name not in CODECS:
+                    return str(name)
+        found = other_codec(value)
+        if found is not None:
+            return found
+    return None

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 SAFE_PATH = "PYTHONSAFEPATH"
-"""Environment variable: Python then imports nothing from the working folder, ``python -m snakemake`` of a job neither."""
+"""Environment variable: Python then imports nothing from the working folder; ``python -m snakemake`` of a job, too."""
 
 _SEARCHED = ("PATH", "PYTHONPATH")
 _left: list[Path] = []
@@ -38,14 +38,18 @@ def isolate() -> None:
     Examples
     --------
     >>> isolate()
-    >>> os.environ["PYTHONSAFEPATH"], all(os.path.isabs(path) for path in sys.path)
+    >>> os.environ["PYTHONSAFEPATH"], all(Path(path).is_absolute() for path in sys.path)
     ('1', True)
     """
     os.environ[SAFE_PATH] = "1"
     for name in _SEARCHED:
         if name in os.environ:
-            os.environ[name] = os.pathsep.join(filter(os.path.isabs, os.environ[name].split(os.pathsep)))
-    sys.path[:] = [path for path in sys.path if os.path.isabs(path)]
+            os.environ[name] = os.pathsep.join(filter(_is_absolute, os.environ[name].split(os.pathsep)))
+    sys.path[:] = filter(_is_absolute, sys.path)
+
+
+def _is_absolute(path: str) -> bool:
+    return Path(path).is_absolute()
 
 
 def given(path: Path) -> Path:

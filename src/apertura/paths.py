@@ -49,7 +49,7 @@ def inside(root: Path, name: str, *, where: object) -> Path:
 def check_shell_name(root: Path) -> None:
     """Raise CampaignError if the path of a campaign holds what a shell would run between double quotes.
 
-    Executors of Snakemake hand commands to a shell: that of Slurm as ``sbatch --wrap="…"``, with the folder's path in them.
+    Executors of Snakemake hand commands with that path to a shell: that of Slurm as ``sbatch --wrap="…"``.
 
     Examples
     --------

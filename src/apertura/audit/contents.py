@@ -10,7 +10,7 @@ from apertura.contracts import STAGES
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.provenance import canonical_json
-from apertura.scene.raster import opened_raster
+from apertura.raster import opened_raster
 from apertura.store import manifest_of, open_stage, read_manifest
 
 SECTIONS = ("geometry", "settings", "inputs", "stages", "code", "software", "flags", "report")

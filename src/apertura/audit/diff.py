@@ -14,7 +14,7 @@ from apertura.audit.pixels import Pixels, Tally, rows_of
 from apertura.audit.tags import picture
 from apertura.errors import CampaignError, shown
 from apertura.export.writing import blocks_of
-from apertura.scene.raster import opened_raster
+from apertura.raster import opened_raster
 from apertura.store import open_stage
 
 _LINES = 20

@@ -8,7 +8,7 @@ from typing import Any
 
 from apertura.documents import undamaged
 from apertura.errors import CampaignError, shown
-from apertura.scene.raster import opened_raster
+from apertura.raster import opened_raster
 
 TAGGED = (".tif", ".png")
 """Suffixes of files that carry tags."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pystac
-import rasterio
 
 from apertura.errors import CampaignError
+from apertura.raster import opened_raster
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 
@@ -94,18 +94,18 @@ def told_by(path: Path) -> Told:
     """
     if path.suffix != ".tif":
         return Told(path.name)
+    expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
     try:
-        with rasterio.open(path, driver="GTiff") as raster:
+        with opened_raster(path, expected=expected, remedy=remedy) as raster:
             bands = [_band(raster, number) for number in range(raster.count)]
             told = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
             inputs = {str(name): str(digest) for name, digest in told.items()}
             return Told(raster.descriptions[0] or path.name, bands, inputs)
-    except (rasterio.RasterioIOError, ValueError, AttributeError) as error:
-        expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
+    except (ValueError, AttributeError) as error:
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
 
 
-def _band(raster: rasterio.DatasetReader, number: int) -> dict[str, Any]:
+def _band(raster: Any, number: int) -> dict[str, Any]:
     dtype, nodata, unit = (of[number] for of in (raster.dtypes, raster.nodatavals, raster.units))
     band: dict[str, Any] = {
         "data_type": {"complex64": "cfloat32", "complex128": "cfloat64"}.get(dtype, dtype),

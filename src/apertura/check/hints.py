@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import ProjError
 
 from apertura.check.inspected import Inspected
 from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
@@ -66,7 +66,7 @@ def _track_places(latitude: float, longitude: float) -> Iterator[tuple[str, Plac
 def _place(crs: str, x: float, y: float) -> Place | None:
     try:
         longitude, latitude = Transformer.from_crs(crs, CRS(crs).geodetic_crs, always_xy=True).transform(x, y)
-    except CRSError:
+    except ProjError:
         return None
     return float(latitude), float(longitude)
 

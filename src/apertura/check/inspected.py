@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import ProjError
 
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
@@ -244,11 +244,12 @@ def in_metres(crs: str) -> bool:
 
     Examples
     --------
-    >>> [in_metres(crs) for crs in ("EPSG:32632", "EPSG:4326", "EPSG:2225", "EPSG:99999")]
-    [True, False, False, False]
+    >>> [in_metres(crs) for crs in ("EPSG:32632", "EPSG:4326", "EPSG:2225", "EPSG:5555", "EPSG:99999")]
+    [True, False, False, False, False]
     """
     try:
         system = CRS(crs)
-    except CRSError:
+    except ProjError:
         return False
-    return system.is_projected and all(axis.unit_name == "metre" for axis in system.axis_info)
+    metres = all(axis.unit_name == "metre" for axis in system.axis_info)
+    return system.is_projected and not system.is_compound and metres

@@ -1,4 +1,4 @@
-"""Links below the results, through which another place would be written; modules, which Snakemake's jobs would import."""
+"""Links below the results, through which another place would be written; modules that Snakemake's jobs would import."""
 
 import os
 from collections.abc import Iterator

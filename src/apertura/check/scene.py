@@ -4,14 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from apertura.check.hints import likely_place
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL, ecef_from_geodetic, projected_from_ecef
 from apertura.scene.auto_grid import utm_crs
-from apertura.scene.map_crs import check_crs
+from apertura.scene.map_crs import check_crs, horizontal_crs
 from apertura.settings import CONFIG
 
 _WHERE = f"{CONFIG}: scene.crs"
@@ -99,14 +98,9 @@ def _other_frame(crs: str) -> CampaignError:
 def _not_in_metres(inspected: Inspected, crs: str) -> CampaignError:
     """Return what is wrong with a CRS wherever it is used, with the UTM zone that would do."""
     try:
-        system = CRS(crs)
-    except CRSError:
-        return CampaignError(
-            f"{crs!r} is unknown to PROJ",
-            where=_WHERE,
-            expected="an EPSG code such as EPSG:32632, auto, or local",
-            remedy="Correct scene.crs.",
-        )
+        system = horizontal_crs(crs)
+    except CampaignError as problem:
+        return CampaignError(problem.found, _WHERE, problem.expected, problem.remedy)
     units = {axis.unit_name for axis in system.axis_info} - {"metre"}
     kind = "counts in degrees" if system.is_geographic else f"counts in {', '.join(sorted(units))}"
     zone = _zone(inspected, degrees=system.is_geographic) or "the UTM zone of the place"

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET  # only written, never parsed
 
-import rasterio
+from rasterio.enums import ColorInterp
 
 from apertura.atomic import write_text
 from apertura.errors import ContractError
 from apertura.export.radiometry import TAG
 from apertura.provenance import canonical_json
+from apertura.raster import opened_raster
 
 _TYPES = {"uint8": "Byte", "float32": "Float32"}
 
@@ -41,7 +42,7 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
+    >>> import numpy as np, rasterio
     >>> from rasterio import Affine
     >>> from apertura.export.cog import write_power
     >>> grid = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {}}
@@ -80,12 +81,12 @@ def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], li
     seen: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
     tags = []
     for path in rasters:
-        with rasterio.open(path) as raster:
+        with opened_raster(path, expected="what the workflow wrote", remedy="Run it again.") as raster:
             grid = {"width": raster.width, "height": raster.height, "transform": raster.transform.to_gdal()}
             kind: dict[str, Any] = {"type": _TYPES.get(raster.dtypes[0]), "NoDataValue": f"{raster.nodata:g}"}
             # Which images were added up stands in the words of a sum: those of the last.
             words = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
-            coloured = raster.colorinterp[0] == rasterio.enums.ColorInterp.palette
+            coloured = raster.colorinterp[0] == ColorInterp.palette
             colours = [colour for _, colour in sorted(raster.colormap(1).items())] if coloured else []
             seen.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, words))
             tags.append(raster.tags().get(TAG, "{}"))

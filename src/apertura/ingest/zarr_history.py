@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.documents import CODECS, other_codec
+from apertura.errors import quoted
 from apertura.ingest.history_layout import EXPECTED, LAYOUT, check_array, check_attributes, history
 from apertura.ingest.isolated import BYTES_PER_BYTE, UnreadableError, read_isolated
 from apertura.ingest.phase_history import joined, refused
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
 SUFFIX = ".zarr"
 
 _EXPECTED = f"a zarr folder, version 3, of {EXPECTED}"
-_CODECS = {"bytes", "transpose", "zstd", "gzip", "blosc", "crc32c", "sharding_indexed"}
-"""Others may do anything: that of numcodecs called pickle runs code out of the chunks."""
 _SPARE_BYTES = 4 << 30
 """Address space for zarr, whose threads and event loop reserve much more than they use."""
 
@@ -34,6 +34,10 @@ def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     folders = folders_of(paths)
     if not folders:
         raise refused("a file, not a folder", paths[0], _EXPECTED)
+    for folder in folders:
+        for path in (folder, *folder.rglob("*")):
+            if path.is_symlink():
+                raise refused("a symbolic link: what it leads to is not read", path, _EXPECTED)
     sizes = [path.stat().st_size for path in paths]
     limits: dict[str, Any] = {"memory_bytes": _SPARE_BYTES + BYTES_PER_BYTE * sum(sizes)}
     try:
@@ -78,25 +82,14 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 def _array(folder: Path, name: str) -> NDArray[Any]:
     import zarr
 
-    others = {*_codecs(_metadata(folder).get("codecs"))} - _CODECS
-    if others:
-        raise ValueError(f"{name} is kept by codec {min(others)!r}, and not by {', '.join(sorted(_CODECS))}")
+    other = other_codec(_metadata(folder))
+    if other is not None:
+        raise ValueError(f"{name} is kept by codec {quoted(other)}, and not by {', '.join(sorted(CODECS))}")
     # by itself: what a group repeats of its arrays' metadata has not been looked at
     array = zarr.open_array(folder, mode="r", zarr_format=3)
     check_array(name, array.shape, np.dtype(array.dtype))
     with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
         return np.asarray(array[...], np.complex64) if name == "transfer" else np.asarray(array[...])
-
-
-def _codecs(listed: object) -> Iterable[str]:
-    """Yield the names of codecs, and of those that they hand on to."""
-    for codec in listed if isinstance(listed, list) else [{}]:
-        name = codec if isinstance(codec, str) else _mapping({"codec": codec}, "codec").get("name")
-        yield str(name)
-        inner = _mapping(codec, "configuration") if isinstance(codec, Mapping) else {}
-        for key in ("codecs", "index_codecs"):
-            if key in inner:
-                yield from _codecs(inner[key])
 
 
 def _metadata(folder: Path) -> Mapping[str, Any]:

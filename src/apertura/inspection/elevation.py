@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from apertura.errors import CampaignError, shown
 from apertura.inspection.report import Report
+from apertura.raster import opened_raster
 from apertura.scene.dem import MOST_POSTS
 from apertura.scene.dem_file import open_dem
-from apertura.scene.raster import opened_raster
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader

@@ -11,7 +11,7 @@ from rasterio.enums import Resampling
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.provenance import sha256_file
-from apertura.scene.raster import opened_raster
+from apertura.raster import opened_raster
 from apertura.store import read_manifest
 
 

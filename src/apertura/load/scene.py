@@ -20,6 +20,7 @@ from apertura.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
 from apertura.scene.dem import COVER_NODES, UncheckedDem
 from apertura.scene.grid import SceneGrid
 from apertura.scene.terrain import FlatGround, GridHeights, Terrain
+from apertura.settings.section import plain_crs
 from apertura.store import manifest_of, open_array, open_document, open_stage, remake
 
 _FARTHEST_M = 1e9
@@ -125,7 +126,7 @@ def settled_scene(campaign: Campaign) -> OpenScene:
         grid, level = document["grid"], FlatGround(_number(document["height_m"]))
         places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
         shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
-        whole = SceneGrid(_text(grid["crs"]), **places, shape=shape, first=first, name=_text(grid["name"]))
+        whole = SceneGrid(plain_crs(_text(grid["crs"])), **places, shape=shape, first=first, name=_text(grid["name"]))
         return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
 
 

@@ -11,9 +11,9 @@ from pyproj.exceptions import ProjError
 
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
+from apertura.raster import opened_raster
 from apertura.scene.geoid_grid import undulation
 from apertura.scene.grid import SceneGrid
-from apertura.scene.raster import opened_raster
 from apertura.scene.terrain import Terrain, bilinear
 
 LATTICE_M = 50.0

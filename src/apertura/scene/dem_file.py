@@ -1,19 +1,23 @@
 """A DEM file opened: where its posts lie and what its heights count from, or what is wrong with it."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 from pyproj import CRS
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import ProjError
 
 from apertura.errors import CampaignError, shown
 from apertura.geometry.geodesy import LOCAL
+from apertura.raster import opened_raster
 from apertura.scene.dem import Dem
 from apertura.scene.geoid import carried_datum, geoid_file, grid_names
 from apertura.scene.grid import SceneGrid
-from apertura.scene.raster import opened_raster
 
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
+_NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
+"""What in a CRS (WKT) leads PROJ to a file other than the grids in its own folders."""
+
 _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
 
 
@@ -94,7 +98,9 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
         )
         try:
             system = CRS.from_user_input(raster.crs) if raster.crs else None
-        except CRSError as error:
+            if system and _NAMES_FILES.search(system.to_wkt()):
+                raise _wrong(path, "a CRS that names a file", "a CRS that is complete in itself, or names a known grid")
+        except ProjError as error:
             raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
     if min(shape) < 2:
         raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")

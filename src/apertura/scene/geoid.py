@@ -9,14 +9,12 @@ from pyproj import CRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.transformer import TransformerGroup
 
+from apertura.constants import VERTICAL_DATUMS
 from apertura.errors import CampaignError
 from apertura.scene.geoid_grid import check_grid
 
 GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
 """Datum → names of its grid of undulations, as PROJ ships them."""
-
-EPSG = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
-"""Vertical CRS → datum."""
 
 _MARKS = {"egm96": ("egm96",), "egm2008": ("egm08", "egm2008")}
 
@@ -88,7 +86,7 @@ def carried_datum(crs: CRS) -> str | None:
     if vertical is None:
         return "ellipsoid" if len(crs.axis_info) == 3 else None
     authority = vertical.to_authority() or ("", "")
-    return EPSG.get(":".join(authority), vertical.name)
+    return VERTICAL_DATUMS.get(":".join(authority), vertical.name)
 
 
 def grid_names(system: CRS) -> list[str]:

@@ -12,7 +12,7 @@ from pyproj import Transformer
 from pyproj.exceptions import ProjError
 
 from apertura.errors import CampaignError, quoted
-from apertura.scene.raster import LARGEST_BLOCK, opened_raster
+from apertura.raster import LARGEST_BLOCK, opened_raster
 from apertura.scene.terrain import bilinear
 
 HIGHEST_M = 150.0

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.enums import TransformDirection
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import ProjError
 
 from apertura.errors import CampaignError
+from apertura.geometry.geodesy import ecef_from_geodetic, projected_from_ecef
 
 MARGIN_DEG = 3.0
 """How far beyond its area of use a projection may be used: half a UTM zone, where distances grow by half a per cent."""
@@ -42,6 +43,36 @@ def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
     return {"units": "m", "axis": side.upper(), "long_name": {"x": "easting", "y": "northing"}[side], **standard}
 
 
+def horizontal_crs(crs: str) -> CRS:
+    """Return a CRS that PROJ knows and that has no heights of its own; raise CampaignError for any other.
+
+    Examples
+    --------
+    >>> horizontal_crs("EPSG:5555")
+    Traceback (most recent call last):
+    ...
+    apertura.errors.CampaignError: scene: crs EPSG:5555 (ETRS89 / UTM zone 32N + DHHN92 height) has heights of ...
+    """
+    try:
+        system = CRS(crs)
+    except ProjError as error:
+        raise CampaignError(
+            f"crs {crs!r} is unknown to PROJ",
+            where=_WHERE,
+            expected="an EPSG code such as EPSG:32632, auto, or local",
+            remedy="Correct scene.crs.",
+        ) from error
+    if system.is_compound:
+        horizontal = system.sub_crs_list[0]
+        raise CampaignError(
+            f"crs {crs} ({system.name}) has heights of its own",
+            where=_WHERE,
+            expected="the horizontal part alone: heights count from what height_datum or dem_datum says",
+            remedy=f"Set scene.crs to {':'.join(horizontal.to_authority() or (horizontal.name,))}.",
+        )
+    return system
+
+
 def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
 
@@ -60,15 +91,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     ...
     apertura.errors.CampaignError: scene: crs EPSG:4326 (WGS 84) is not projected in metres; ...
     """
-    try:
-        system = CRS(crs)
-    except CRSError as error:
-        raise CampaignError(
-            f"crs {crs!r} is unknown to PROJ",
-            where=_WHERE,
-            expected="an EPSG code such as EPSG:32632, auto, or local",
-            remedy="Correct scene.crs.",
-        ) from error
+    system = horizontal_crs(crs)
     if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info):
         raise CampaignError(
             f"crs {crs} ({system.name}) is not projected in metres",
@@ -76,7 +99,16 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
             expected="a projected CRS in metres, such as a UTM zone",
             remedy="Choose another scene.crs.",
         )
-    _check_usable(system, bounds_m)
+    try:
+        _check_usable(system, bounds_m)
+        projected_from_ecef(crs, ecef_from_geodetic(*(np.array(angle) for angle in (0.0, 0.0, 0.0))))
+    except ProjError as error:  # such as a datum that only a grid of shifts leads to
+        raise CampaignError(
+            f"PROJ knows no exact way here from {crs} ({system.name}) to WGS 84",
+            where=_WHERE,
+            expected="a CRS that is defined by an ellipsoid and a shift, or whose grids PROJ finds",
+            remedy="Get its grid with `projsync`, or choose another scene.crs, such as the UTM zone of the place.",
+        ) from error
 
 
 def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
@@ -87,7 +119,8 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
     corners = np.array([[xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax]])
     longitudes, latitudes = inverse.transform(corners[0], corners[1])
     returned = np.array(inverse.transform(longitudes, latitudes, direction=TransformDirection.INVERSE))
-    usable = (np.abs(returned - corners) < RETURN_M).all(axis=0)  # False of what is not finite
+    finite = np.where(np.isfinite(returned), returned, np.nan)
+    usable = (np.abs(finite - corners) < RETURN_M).all(axis=0)  # False of what is not finite
     if area is not None:
         usable &= _near(area.bounds, longitudes, latitudes)
     if usable.all():

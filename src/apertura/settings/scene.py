@@ -1,10 +1,12 @@
 """Section `scene`: the grid of every raster, and the ground under it."""
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from apertura.settings.section import Metres3, Section, Title
+from apertura.constants import VERTICAL_DATUMS
+from apertura.errors import quoted
+from apertura.settings.section import CrsName, Metres3, Section, Title, plain_crs
 
 
 class KnownPoint(Section):
@@ -18,8 +20,10 @@ class KnownPoint(Section):
 class Scene(Section):
     """The campaign's output grid."""
 
-    crs: str = Field(
-        "auto", description="EPSG code, auto (UTM zone of the track) or local (a frame without a place on Earth)"
+    crs: CrsName = Field(
+        "auto",
+        description="authority and code, such as EPSG:32632, auto (UTM zone of the track) or local (a frame without a "
+        "place on Earth)",
     )
     bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
         "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
@@ -68,6 +72,24 @@ class Scene(Section):
                 "heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid"
             )
         return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _heights_of_crs_are_those_stated(cls, values: Any) -> Any:
+        """Take the horizontal part of a compound CRS, whose heights must be those that the datum states."""
+        crs = values.get("crs") if isinstance(values, dict) else None
+        if not isinstance(crs, str) or "+" not in plain_crs(crs):
+            return values
+        horizontal, _, vertical = crs.partition("+")
+        vertical = (vertical if ":" in vertical else f"{horizontal.partition(':')[0]}:{vertical}").upper()
+        key = "height_datum" if values.get("dem") is None else "dem_datum"
+        stated, carried = values.get(key, "ellipsoid"), VERTICAL_DATUMS.get(vertical, vertical)
+        if stated != carried:
+            raise ValueError(
+                f"crs={crs} says heights of {carried}, {key} says {quoted(stated)}: "
+                f"heights count from what {key} says; give crs={horizontal}, and {key} as it is"
+            )
+        return {**values, "crs": horizontal}
 
     @model_validator(mode="after")
     def _bounds_are_pixels(self) -> Self:

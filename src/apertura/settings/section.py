@@ -21,6 +21,8 @@ WAVEFORM_KINDS = (
 )
 """What the key waveform.kind says of itself, whichever kind it is."""
 
+_AUTHORITY = "[A-Za-z][A-Za-z0-9_]{0,31}"
+_CODE = _AUTHORITY + ":[A-Za-z0-9_.-]{1,31}"
 _LONGEST = 64
 _LONGEST_TITLE = 120
 
@@ -52,8 +54,27 @@ def _title(text: str) -> str:
     return text
 
 
+def plain_crs(crs: str) -> str:
+    """Return a CRS that is 'auto', 'local' or authority and code; raise ValueError for any other text.
+
+    Examples
+    --------
+    >>> plain_crs("EPSG:32632"), plain_crs("EPSG:32632+5773")
+    ('EPSG:32632', 'EPSG:32632+5773')
+    """
+    if not re.fullmatch(rf"auto|local|{_CODE}(\+({_AUTHORITY}:)?[0-9]+)?", crs):
+        raise ValueError(
+            f"{quoted(crs)}: only authority and code such as EPSG:32632, auto or local may be used, no text of PROJ, "
+            "which may name files and code elsewhere"
+        )
+    return crs
+
+
 Name = Annotated[str, AfterValidator(_plain_name)]
 """Of a flight or a node."""
+
+CrsName = Annotated[str, AfterValidator(plain_crs)]
+"""A coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""
 
 Title = Annotated[str, AfterValidator(_title)]
 """What people read: a line without what WKT, HTML or a terminal would take for their own."""

@@ -15,6 +15,7 @@ from apertura.load.layer import averaged
 from apertura.load.scene import OpenScene, settled_scene
 from apertura.paths import shipped
 from apertura.provenance import Provenance, sha256_file
+from apertura.raster import opened_raster
 from apertura.report import PAGE, PANELS, PICTURES
 from apertura.report.landing import rst_table, rst_text
 from apertura.report.page import Block, Heading, Paragraph, Picture, Table
@@ -35,7 +36,6 @@ from apertura.report.words import (
     told,
     verdict_row,
 )
-from apertura.scene.raster import opened_raster
 from apertura.steps.stamping import tags_of
 from apertura.store import open_listed, open_stage, read_manifest, record_files
 

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -15,6 +14,7 @@ from apertura.errors import CampaignError
 from apertura.export import product_files
 from apertura.load.scene import settled_scene
 from apertura.quality.point_targets import cut_through, find_peak
+from apertura.raster import opened_raster
 from apertura.scene.grid import SceneGrid
 from apertura.settings import Flight
 from apertura.steps.summary import print_summary
@@ -68,7 +68,7 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
             raise CampaignError(
                 "no such file", where=file, expected="a finished campaign", remedy="Run the workflow first."
             )
-        with rasterio.open(file) as raster:
+        with opened_raster(file, expected="a finished campaign", remedy="Run the workflow again.") as raster:
             image, spacing = raster.read(1), grid.spacing_m
         for number, target in enumerate(targets):
             row, column = map(float, grid.pixel_of(target["x"], target["y"]))

@@ -17,7 +17,7 @@ from apertura.flags import FLAGS
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
-from apertura.scene.raster import opened_raster
+from apertura.raster import opened_raster
 from apertura.store import open_listed, read_manifest, record_files
 from apertura.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
 from apertura.webmap.page import DATA, page_files

@@ -11,10 +11,13 @@ from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 
-from apertura.errors import CampaignError
+from apertura.errors import CampaignError, quoted, shown
 from apertura.focus.engines.native_structs import STRUCTS
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
+
+NAMED_BY = "APERTURA_KERNEL"
+"""Environment variable: another library than the one installed."""
 
 _BUILT = str(files("apertura.focus.engines") / "_backprojection.so")  # found once: calls may be short
 
@@ -127,7 +130,12 @@ def call(function: str, job: ctypes.Structure) -> None:
 
 def library_path() -> Path:
     """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers."""
-    return Path(os.environ.get("APERTURA_KERNEL") or _BUILT)
+    return Path(os.environ.get(NAMED_BY) or _BUILT)
+
+
+def _no_kernel(named: str, found: str) -> CampaignError:
+    where, expected = f"environment variable {NAMED_BY}", "a library built from native/ of this version"
+    return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset it.")
 
 
 def library() -> ctypes.CDLL:
@@ -161,7 +169,10 @@ def kernel_constants() -> dict[str, float]:
 
 @lru_cache
 def _load(path: Path) -> ctypes.CDLL:
-    loaded = ctypes.CDLL(str(path))
+    try:
+        loaded = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise _no_kernel(str(path), shown(error, 200)) from error
     if not hasattr(loaded, "apertura_layout"):
         check_layout({}, path)
     for function in (loaded.apertura_isa, loaded.apertura_layout, loaded.apertura_constants):

@@ -1,0 +1,270 @@
+"""Markers of every kind in a campaign folder: each would leave a trace if it were run, and be seen if it were opened.
+
+Two things tell that a marker fired. What is run makes a file whose name says which marker it was. What is only read (a
+matplotlibrc, a sidecar of GDAL, a file outside the folder) is watched by the kernel (inotify, IN_OPEN).
+"""
+
+import ctypes
+import os
+import pickle
+import select
+import struct
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any
+
+_IN_OPEN, _IN_NONBLOCK = 0x20, 0o4000
+_EVENT = struct.Struct("iIII")
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+SNAKEMAKES_OWN = ".snakemake/pip-deployments"
+"""Where Snakemake looks for modules that it finds nowhere else, relative to the working folder."""
+
+PROFILES = ("default", "slurm", "own", "none")
+SETTINGS = {
+    ".numba_config.yaml": "[",  # an error at least, if it were read
+    "matplotlibrc": "backend: nosuch\n\x00",
+    "setup.cfg": "[tool:pytest]\naddopts = --nosuch\n",
+    "tox.ini": "[pytest]\naddopts = --nosuch\n",
+    "pyproject.toml": "[tool.pytest.ini_options]\naddopts = '--nosuch'\n",
+    "dask.yaml": "scheduler: nosuch\n",
+    "zarr.yaml": "array: {order: F}\n",
+    "gdalrc": "[configoptions]\nGDAL_DRIVER_PATH=.\n",
+    "proj.ini": "network = on\n",
+    ".pdbrc": "!import os\n",
+    ".condarc": "channels: [nosuch]\n",
+    ".netrc": "default login a password b\n",
+    ".git/config": "[core]\nfsmonitor = touch ran\n",
+}
+PROGRAMS = (
+    "apertura",
+    "snakemake",
+    "python",
+    "python3",
+    "bash",
+    "sh",
+    "git",
+    "conda",
+    "mamba",
+    "sacct",
+    "sinfo",
+    "make",
+)
+SIDECARS = (".aux.xml", ".ovr", ".msk", ".vrt", ".rrd", ".prj", ".imd")
+PAGE = ("map/index.html", "map/app.js", "map/app.css", "map/shell.html", "map/shell.js")
+
+
+@dataclass(frozen=True)
+class Planted:
+    """A campaign folder with markers.
+
+    Attributes
+    ----------
+    root
+        The folder.
+    outside
+        A folder beside it, in which nothing may be opened.
+    ran
+        A folder in which what is run leaves a file.
+    watched
+        Files in the campaign that nobody may open.
+    """
+
+    root: Path
+    outside: Path
+    ran: Path
+    watched: tuple[Path, ...]
+
+    def code(self, name: str) -> str:
+        """Return Python that tells that it ran."""
+        return f"import os; os.close(os.open({str(self.ran / name.replace('/', '.'))!r}, os.O_CREAT))"
+
+    def shell(self, name: str) -> str:
+        """Return a command that tells that it ran."""
+        return f"touch {self.ran / name.replace('/', '.')}"
+
+    @contextmanager
+    def fires(self) -> Iterator[list[str]]:
+        """Yield what fired: filled in when the block ends."""
+        fired: list[str] = []
+        before = set(self.ran.iterdir())
+        with opened([*self.watched, self.outside, *self.outside.rglob("*")]) as seen:
+            yield fired
+        fired += sorted(f"ran {path.name}" for path in set(self.ran.iterdir()) - before)
+        fired += sorted(f"opened {path.relative_to(self.root.parent)}" for path in seen)
+
+
+class _Code:
+    def __init__(self, code: str) -> None:
+        self.code = code
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return exec, (self.code,)
+
+
+def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
+    """Lay markers into a campaign folder, wherever a tool that trusts the folder would look for something.
+
+    Parameters
+    ----------
+    root
+        The folder, unfinished or finished.
+    in_snakemakes_own
+        Also where `apertura check` tells that they lie.
+    """
+    outside, ran = root.parent / "outside", root.parent / "ran"
+    for folder in (outside, ran):
+        folder.mkdir(exist_ok=True)
+    planted = Planted(root, outside, ran, ())
+    _outside_files(planted)
+    passive = {**_modules(planted, in_snakemakes_own=in_snakemakes_own), **_workflows(planted)}
+    passive |= SETTINGS | {name: f"#!/bin/sh\n{planted.shell(name)}\n" for name in PROGRAMS}
+    passive |= _sidecars(planted)
+    if (root / "results").is_dir():
+        passive |= {f"results/{name}": f"/* {name} */ location = 'https://evil.example/'" for name in PAGE}
+    for name, content in {**passive, **_pickles(planted)}.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        path.chmod(0o755)
+    return Planted(root, outside, ran, tuple(root / name for name in passive))
+
+
+def _outside_files(planted: Planted) -> None:
+    """Write what hostile texts name: grids, lists of CRS, rasters, archives, all empty of meaning."""
+    for name in ("init", "shift.gsb", "geoid.gtx", "raster.tif", "array.zarr", "archive.zip", "config.yaml", "log.csv"):
+        (planted.outside / name).write_bytes(b"<9> +proj=utm +zone=32 +datum=WGS84 <>\n")
+
+
+def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
+    """Return a module for every name that Python or an installed package may import."""
+    installed = {name for name in packages_distributions() if name.isidentifier()}
+    names = {
+        *sys.stdlib_module_names,
+        *installed,
+        "apertura",
+        "sitecustomize",
+        "usercustomize",
+        "yte",
+        "cupy",
+        "snaphu",
+    }
+    found = {f"{name}.py": planted.code(f"{name}.py") + "\n" for name in names}
+    found |= {"apertura/__init__.py": planted.code("apertura") + "\n", "conftest.py": planted.code("conftest.py")}
+    found |= {
+        "python.pth": planted.code("python.pth") + "\n",
+        "distutils-precedence.pth": planted.code("precedence.pth"),
+    }
+    plugins = (
+        "snakemake_executor_plugin_x",
+        "snakemake_logger_plugin_x",
+        "snakemake_storage_plugin_x",
+        "usercustomize",
+    )
+    if in_snakemakes_own:
+        found |= {f"{SNAKEMAKES_OWN}/{name}.py": planted.code(f"own.{name}") for name in (*plugins, "sitecustomize")}
+    return found
+
+
+def _workflows(planted: Planted) -> Mapping[str, str]:
+    """Return profiles that hold code (YTE), at every name, and workflows."""
+
+    def profile(name: str) -> str:
+        return f"__use_yte__: true\n__definitions__:\n  - {planted.code(name)!r}\ncores: 1\n"
+
+    folders = [*(f"profiles/{name}" for name in PROFILES), *PROFILES, "."]
+    files = ("config.yaml", "config.v8+.yaml", "config.v9+.yaml", "profile.yaml", "profile.v9+.yaml")
+    found = {f"{folder}/{file}": profile(f"{folder}/{file}") for folder in folders for file in files}
+    snakefiles = (
+        "Snakefile",
+        "workflow/Snakefile",
+        "snakefile",
+        "workflow/snakefile",
+        "workflow/profiles/default/Snakefile",
+    )
+    return found | {name: planted.code(name) + "\n" for name in snakefiles}
+
+
+def _sidecars(planted: Planted) -> Mapping[str, str]:
+    """Return files that GDAL reads beside a raster, each naming one outside."""
+    rasters = [path.relative_to(planted.root).as_posix() for path in planted.root.rglob("*.tif")]
+    text = (
+        f"<PAMDataset><SRS>LOCAL_CS[x]</SRS><VRTRasterBand><SourceFilename>{planted.outside / 'raster.tif'}"
+        "</SourceFilename></VRTRasterBand></PAMDataset>"
+    )
+    found = {f"{name}{suffix}": text for name in rasters for suffix in SIDECARS}
+    return found | {
+        f"{name.removesuffix('.tif')}{suffix}": text for name in rasters for suffix in (".tfw", ".wld", ".tab")
+    }
+
+
+def _pickles(planted: Planted) -> Mapping[str, bytes]:
+    """Return records of Snakemake that would run code if they were unpickled."""
+    names = ("iocache/latest.pkl", "metadata/cmVzdWx0cw==", "auxiliary/code.pkl", "scripts/x.py", "incomplete/x")
+    return {f".snakemake/{name}": pickle.dumps(_Code(planted.code(f"pickle {name}"))) for name in names}
+
+
+def hostile_texts(planted: Planted) -> Mapping[str, str]:
+    """Return texts that a library may take for more than a name, by what takes them so."""
+    outside = planted.outside
+    shifted = f"+proj=utm +zone=32 +ellps=bessel +nadgrids={outside}/shift.gsb +units=m"
+    return {
+        "PROJ init": f"+init={outside}/init:9",
+        "PROJ init, bare": f"init={outside}/init:9",
+        "PROJ nadgrids": shifted,
+        "PROJ CRS": f"{shifted} +type=crs",
+        "PROJ geoidgrids": f"+proj=utm +zone=32 +datum=WGS84 +geoidgrids={outside}/geoid.gtx +units=m +type=crs",
+        "PROJ pipeline": f"+proj=pipeline +step +proj=vgridshift +grids={outside}/geoid.gtx",
+        "PROJ list of grids": f"egm96_15.gtx,{outside}/geoid.gtx",
+        "a code of PROJ": "EPSG:32632+5773",
+        "PROJ text": "+proj=utm +zone=32 +ellps=WGS84",
+        "GDAL archive": f"/vsizip/{outside}/archive.zip/raster.tif",
+        "GDAL network": "/vsicurl/http://127.0.0.1:9/raster.tif",
+        "GDAL driver": f"GTIFF_RAW:{outside}/raster.tif",
+        "GDAL directory": f"GTIFF_DIR:1:{outside}/raster.tif",
+        "GDAL document": f"<VRTDataset><SourceFilename>{outside}/raster.tif</SourceFilename></VRTDataset>",
+        "fsspec file": f"file://{outside}/array.zarr",
+        "fsspec chain": f"simplecache::file://{outside}/array.zarr",
+        "fsspec archive": f"zip://*::{outside}/archive.zip",
+        "dask scheduler": "tcp://127.0.0.1:9",
+        "dask function": "dask.multiprocessing.get",
+        "absolute path": f"{outside}/config.yaml",
+        "path up": "../outside/log.csv",
+        "path through a link": "linked/log.csv",
+        "shell": f"$({planted.shell('text')})`{planted.shell('text')}`; {planted.shell('text')}",
+        "format": "{__import__('os').system('" + planted.shell("format") + "')}",
+        "YAML tag": f"!!python/object/apply:os.system ['{planted.shell('tag')}']",
+        "YTE": f"?__import__('os').system('{planted.shell('yte')}')",
+    }
+
+
+@contextmanager
+def opened(paths: list[Path]) -> Iterator[set[Path]]:
+    """Yield which of these files and folders are opened by any process while the block runs, filled in at its end."""
+    watching = _LIBC.inotify_init1(_IN_NONBLOCK)
+    if watching < 0:
+        raise OSError(ctypes.get_errno(), "inotify_init1")
+    try:
+        names = {}
+        for path in dict.fromkeys(paths):
+            number = _LIBC.inotify_add_watch(watching, os.fsencode(path), _IN_OPEN)
+            if number < 0:
+                raise OSError(ctypes.get_errno(), "inotify_add_watch", str(path))
+            names[number] = path
+        seen: set[Path] = set()
+        yield seen
+        while select.select([watching], [], [], 0)[0]:
+            events = os.read(watching, 1 << 16)
+            at = 0
+            while at < len(events):
+                number, mask, _, length = _EVENT.unpack_from(events, at)
+                name = events[at + _EVENT.size : at + _EVENT.size + length].rstrip(b"\0").decode()
+                if mask & _IN_OPEN:
+                    seen.add(names[number] / name if name else names[number])
+                at += _EVENT.size + length
+    finally:
+        os.close(watching)
