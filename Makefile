@@ -80,9 +80,8 @@ attack: $(SETUP)
 	$(BIN)/python benchmarks/kills.py - 100
 	$(BIN)/python benchmarks/mistakes.py build/mistakes --base sample
 
-# A campaign on a Slurm of two nodes on this machine, one job cancelled, one node drained, one killed: 5 minutes.
+# A campaign full of markers on a Slurm of two nodes on this machine, one job cancelled, one node drained, one killed: 10 minutes.
 cluster-test: $(SETUP)
-	$(BIN)/uv pip install --quiet --python $(BIN)/python snakemake-executor-plugin-slurm
 	$(BIN)/python -m tests.cluster
 
 # The crate of a finished campaign by roc-validator, in an environment of its own, and every file by its hash.

@@ -11,9 +11,10 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import apertura
+from apertura import validation
 from apertura.cli import app
 from apertura.errors import CampaignError
-from apertura.settings import Processing, Settings, validated
+from apertura.settings import Processing, Scene, Settings, validated
 from apertura.settings.template import WAVEFORMS, config_schema, config_template, flights_template
 
 ROOT = Path(__file__).parents[1]
@@ -124,3 +125,38 @@ def test_a_wing_that_sees_no_settings_names_no_config_file():
     files = [file for wing in wings for file in (ROOT / "src" / wing.replace(".", "/")).rglob("*.py")]
     assert len(files) > 80
     assert [file for file in files if "config/config.yaml" in file.read_text(encoding="utf-8")] == []
+
+
+def a_scene(asked):
+    return validation.validated(Scene, asked, where="config", expected="a scene")
+
+
+@pytest.mark.parametrize(
+    ("asked", "taken"),
+    [
+        ({"crs": "EPSG:32632"}, "EPSG:32632"),
+        ({"crs": "IGNF:LAMB93"}, "IGNF:LAMB93"),
+        ({"crs": "EPSG:32632+5773", "height_datum": "egm96"}, "EPSG:32632"),
+        ({"crs": "EPSG:32632+EPSG:3855", "dem": "d.tif", "dem_datum": "egm2008"}, "EPSG:32632"),
+    ],
+)
+def test_of_a_compound_crs_pixels_lie_in_the_horizontal_part(asked, taken):
+    assert a_scene(asked).crs == taken
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"crs": "EPSG:32632+5773"}, "says heights of egm96, height_datum says 'ellipsoid'"),
+        ({"crs": "EPSG:32632+7837", "height_datum": "egm96"}, "says heights of EPSG:7837, height_datum says 'egm96'"),
+        ({"crs": "EPSG:32632+3855", "dem": "d.tif", "dem_datum": "egm96"}, "says heights of egm2008, dem_datum says"),
+        ({"crs": "+proj=utm +zone=32"}, "only authority and code such as EPSG:32632"),
+        ({"crs": "+init=/elsewhere/file:9"}, "only authority and code such as EPSG:32632"),
+        ({"crs": "urn:ogc:def:crs:EPSG::32632"}, "only authority and code such as EPSG:32632"),
+        ({"crs": "EPSG:32632+geoidgrids=x"}, "only authority and code such as EPSG:32632"),
+        ({"crs": "EPSG:32632\n"}, "only authority and code such as EPSG:32632"),
+    ],
+)
+def test_heights_of_a_crs_that_are_not_those_stated_and_texts_of_proj_are_refused(asked, told):
+    with pytest.raises(CampaignError, match=re.escape(told)):
+        a_scene(asked)

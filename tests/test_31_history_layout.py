@@ -165,6 +165,14 @@ def test_a_codec_that_may_run_code_is_not_asked(tmp_path):
     assert "time is kept by codec 'evil'" in complaint(lambda: read("zarr", path))
 
 
+def test_what_a_link_in_a_zarr_folder_leads_to_is_not_read(tmp_path):
+    path = write(tmp_path / "b.zarr", arrays())
+    chunk = path / "time/c/0"
+    chunk.rename(tmp_path / "elsewhere")
+    chunk.symlink_to(tmp_path / "elsewhere")
+    assert "b.zarr/time/c/0: a symbolic link" in complaint(lambda: read("zarr", path))
+
+
 def test_a_zarr_folder_of_version_2_is_refused(tmp_path):
     group = zarr.open_group(tmp_path / "b.zarr", mode="w", zarr_format=2, attributes={"frame": "ecef"})
     for name, values in arrays().items():

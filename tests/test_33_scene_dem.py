@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
 from scenes import UTM_GRID
 
@@ -14,7 +14,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import frame_from_map
 from apertura.scene import geoid
-from apertura.scene.dem_file import open_dem
+from apertura.scene.dem_file import NAMES_FILES, open_dem
 from apertura.scene.grid import SceneGrid
 
 
@@ -241,3 +241,10 @@ def test_from_python_a_dem_that_ends_inside_the_scene_is_refused(tmp_path):
     with pytest.raises(CampaignError, match=r"dem\.tif: .* % of the scene lies outside the DEM, to the east"):
         ap.open_dem(path, beyond, datum="ellipsoid")
     assert np.isnan(ap.open_dem(path, beyond.crs, datum="ellipsoid").heights(beyond)).any()
+
+
+@pytest.mark.parametrize("grids", ["nadgrids=/elsewhere/g.gsb", "nadgrids=~/g.gsb", "geoidgrids=../g.gtx"])
+def test_a_crs_that_names_a_file_is_told_from_those_that_name_a_known_grid(grids):
+    assert NAMES_FILES.search(CRS(f"+proj=utm +zone=32 +ellps=bessel +{grids} +units=m +type=crs").to_wkt())
+    for code in ("EPSG:25832", "EPSG:31467", "EPSG:26711", "EPSG:25832+7837", "EPSG:4326+5773", "EPSG:5555"):
+        assert not NAMES_FILES.search(CRS(code).to_wkt())

@@ -1,4 +1,4 @@
-"""The map's server gives the listed files of one campaign to this machine alone; its page brings no text to HTML."""
+"""The map's server gives its own page and the listed files to this machine alone; the page brings no text to HTML."""
 
 import http.client
 import json
@@ -13,21 +13,23 @@ import pytest
 
 from apertura.errors import CampaignError
 from apertura.provenance import sha256_file
-from apertura.webmap.document import Layer, image_entry, map_document
-from apertura.webmap.page import FILES, page_files, page_sha256
-from apertura.webmap.server import PAGE, MapServer
+from apertura.webmap.document import FORMAT, Layer, image_entry, map_document, named_files
+from apertura.webmap.page import FILES, SHELL, page_files
+from apertura.webmap.server import MapServer
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "webmap"
 CONTENT = bytes(range(250)) * 400
 IMAGE = "f01/a-b/db.tif"
+PAGE = {name: name.encode() for name in (*SHELL, *FILES)}
 
 
 @pytest.fixture
 def results(tmp_path):
     """A folder of results beside a secret, with links out of it and a pipe."""
     folder = tmp_path / "campaign" / "results"
-    for name, content in ((IMAGE, CONTENT), (PAGE, b"<!doctype html>"), ("f01/a-b/unlisted.tif", b"x"), ("empty", b"")):
+    planted = [(f"map/{name}", b"planted") for name in PAGE]
+    for name, content in ((IMAGE, CONTENT), ("f01/a-b/unlisted.tif", b"x"), ("empty", b""), *planted):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     secret = tmp_path / "secret"
@@ -40,8 +42,9 @@ def results(tmp_path):
 
 
 @contextmanager
-def serving(folder, files, sha256_of=None):
-    with MapServer(folder, files, sha256_of=sha256_of or (lambda name: sha256_file(folder / name))) as server:
+def serving(folder, files, page=PAGE):
+    """Serve with a list of files as it is at each request, and a page of which each file holds its name."""
+    with MapServer(folder, lambda: files, page=page, sha256_of=lambda name: sha256_file(folder / name)) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
@@ -53,7 +56,8 @@ def serving(folder, files, sha256_of=None):
 
 @pytest.fixture
 def server(results):
-    with serving(results, [IMAGE, PAGE, "empty", "link", "linked/key", "pipe", "gone.tif", "../secret/key"]) as running:
+    files = {name: sha256_file(results / name) for name in (IMAGE, "empty", "link", "linked/key")}
+    with serving(results, {**files, "../secret/key": files["link"], "pipe": "", "gone.tif": ""}) as running:
         yield running
 
 
@@ -139,8 +143,7 @@ def test_a_page_of_another_name_that_leads_here_is_refused(server, host):
     assert (answer.status, CONTENT[:9] in body) == (403, False)
 
 
-def test_one_name_of_this_machine_is_taken_and_two_hosts_are_not(server):
-    assert ask(server, f"/{IMAGE}", Host=f"localhost:{server.server_port}")[0].status == 200
+def test_two_hosts_in_one_request_are_refused(server):
     with socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as plain:
         host = f"Host: 127.0.0.1:{server.server_port}\r\n"
         plain.sendall(f"GET /{IMAGE} HTTP/1.1\r\n{host}{host}\r\n".encode())
@@ -154,28 +157,55 @@ def test_a_map_is_only_read(server, method):
     assert (answer.status, answer.headers["Allow"]) == (405, "GET, HEAD")
 
 
-@pytest.mark.parametrize("target", ["/", f"/{IMAGE}", "/nothing", f"/{IMAGE}?sha256=0"])
-def test_every_answer_forbids_the_browser_all_other_hosts(server, target):
-    answer, _ = ask(server, target)
-    policy = answer.headers["Content-Security-Policy"]
+@pytest.mark.parametrize(("host", "other"), [("127.0.0.1", "localhost"), ("localhost", "127.0.0.1")])
+@pytest.mark.parametrize("target", ["/", "/map/index.html", f"/{IMAGE}", "/nothing", f"/{IMAGE}?sha256=0"])
+def test_every_answer_forbids_the_browser_all_other_hosts(server, target, host, other):
+    answer, _ = ask(server, target, Host=f"{host}:{server.server_port}")
+    policy, ours = answer.headers["Content-Security-Policy"], f"http://{other}:{server.server_port}"
     assert policy.startswith("default-src 'none';")
-    assert not re.search(r"http|\*|unsafe", policy)
+    assert not re.search(r"http|\*|unsafe", policy.replace(f"{ours};", ""))
+    if host == "localhost":
+        assert {f"frame-src {ours}", "frame-ancestors 'none'"} <= set(policy.split("; "))
+        assert answer.headers["Connection-Allowlist"] == f'(response-origin "{ours}")'
+    else:
+        kept = {f"frame-ancestors {ours}", "sandbox allow-scripts allow-same-origin allow-downloads"}
+        assert kept <= set(policy.split("; "))
+        assert answer.headers["Connection-Allowlist"] == "(response-origin)"
     assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert answer.headers["X-DNS-Prefetch-Control"] == "off"
 
 
-def test_the_root_leads_to_the_page(server):
-    answer, _ = ask(server, "/")
-    assert (answer.status, answer.headers["Location"]) == (302, f"/{PAGE}")
+def test_the_page_is_our_own_and_each_part_is_answered_under_its_own_name_alone(server):
+    window = {"/": "shell.html", **{f"/{name}": name for name in SHELL}}
+    page = {f"/map/{name}": name for name in FILES}
+    for host, here, elsewhere in (("localhost", window, page), ("127.0.0.1", page, window)):
+        for target, name in here.items():
+            answer, body = ask(server, target, Host=f"{host}:{server.server_port}")
+            assert (answer.status, body) == (200, name.encode())
+        for target in (elsewhere.keys() - {"/"}) | {"/map/shell.html", "/index.html", "/map/other.js"}:
+            assert ask(server, target, Host=f"{host}:{server.server_port}")[0].status == 404
+    assert ask(server, f"/{IMAGE}", Host=f"localhost:{server.server_port}")[0].status == 404
 
 
-def test_a_file_that_changed_after_the_map_was_made_is_not_shown_as_the_one_that_was_meant(server, results):
+@pytest.mark.parametrize(
+    ("target", "wanted"), [("/", ""), ("/map/", ""), ("/map/index.html", "document"), (f"/{IMAGE}", "document")]
+)
+def test_what_a_reader_opens_beside_the_window_leads_to_it(server, target, wanted):
+    answer, _ = ask(server, target, Sec_Fetch_Dest=wanted)
+    assert (answer.status, answer.headers["Location"]) == (302, server.url)
+    assert server.url == f"http://localhost:{server.server_port}/"
+
+
+def test_a_file_that_is_not_the_one_that_was_meant_is_not_given(server, results):
     meant = sha256_file(results / IMAGE)
-    assert ask(server, f"/{IMAGE}?sha256={meant}")[0].status == 200
+    for target in (f"/{IMAGE}?sha256={meant}", f"/{IMAGE}"):
+        assert ask(server, target)[0].status == 200
+    assert ask(server, f"/{IMAGE}?sha256={'0' * 64}")[0].status == 409
     (results / IMAGE).write_bytes(CONTENT[::-1])
-    answer, body = ask(server, f"/{IMAGE}?sha256={meant}")
-    assert (answer.status, body) == (409, b"changed since the map was made: run the workflow again\n")
-    assert ask(server, f"/{IMAGE}")[0].status == 200
+    for target in (f"/{IMAGE}?sha256={meant}", f"/{IMAGE}?sha256={sha256_file(results / IMAGE)}", f"/{IMAGE}"):
+        answer, body = ask(server, target)
+        assert (answer.status, body) == (409, b"changed since the map was made: run the workflow again\n")
 
 
 def test_a_reader_that_goes_leaves_the_server_silent_and_up(server, capfd):
@@ -189,7 +219,7 @@ def test_a_reader_that_goes_leaves_the_server_silent_and_up(server, capfd):
 
 def test_a_port_that_is_taken_is_one_message(server, results):
     with pytest.raises(CampaignError, match=r"apertura map: port \d+: Address already in use; expected a free port"):
-        MapServer(results, [], sha256_of=str, port=server.server_port)
+        MapServer(results, dict, page={}, sha256_of=str, port=server.server_port)
 
 
 def test_a_name_of_a_stranger_is_encoded_in_every_address():
@@ -201,36 +231,44 @@ def test_a_name_of_a_stranger_is_encoded_in_every_address():
     grid = {"bounds_m": [0, 0, 1, 1], "spacing_m": 1.0, "shape": [1, 1]}
     document = map_document(hostile, grid=grid, crs={}, images=[entry], places=[], coverage_url=None)
     assert json.loads(json.dumps(document))["campaign"] == hostile
+    assert named_files(document) == {f"{hostile}/a-b/{hostile}.tif": "0f"}
+
+
+def test_a_document_names_no_file_without_its_hash_and_none_in_another_format():
+    urls = ["../f01/a-b/db.tif", "https://x/y.tif?sha256=0f", "../f01/%ff.tif?sha256=0f"]
+    document = {"images": [{"layers": [{"url": url} for url in urls]}], "coverage_url": "../coverage.geojson?sha256=0f"}
+    assert named_files({"format": FORMAT, **document}) == {"coverage.geojson": "0f"}
+    assert named_files({"format": FORMAT + 1}) == {}
 
 
 def test_without_a_bundle_the_page_says_how_to_get_one(tmp_path):
     only = page_files(tmp_path)
-    assert list(only) == ["index.html"]
-    assert b"make webmap" in only["index.html"]
-    assert b"<script" not in only["index.html"]
-
-
-def test_another_bundle_is_another_page(tmp_path):
-    for folder in ("one", "other"):
-        (tmp_path / folder).mkdir()
-        for name in FILES:
-            (tmp_path / folder / name).write_text(folder if name == "app.js" else name)
-    assert len({page_sha256(tmp_path / folder) for folder in ("one", "other", "none")}) == 3
-    assert page_files(tmp_path / "one")["app.js"] == b"one"
+    assert list(only) == ["shell.html"]
+    assert b"make webmap" in only["shell.html"]
+    assert b"<script" not in only["shell.html"]
+    with serving(tmp_path, {}, only) as server:
+        answer, body = ask(server, "/", Host=f"localhost:{server.server_port}")
+        assert (answer.status, body) == (200, only["shell.html"])
+    for name in PAGE:
+        (tmp_path / name).write_text(name)
+    assert page_files(tmp_path) == PAGE
 
 
 def test_the_pages_code_writes_text_as_text():
     scripts = {path.name: path.read_text() for path in (SOURCES / "src").glob("*.js")}
-    assert scripts.keys() >= {"app.js", "dom.js", "chart.js"}
+    assert scripts.keys() >= {"app.js", "dom.js", "chart.js", "shell.js"}
     wrong = re.compile(
         r"innerHTML|outerHTML|insertAdjacent|document\.write|\beval\b|new Function|srcdoc|https?://(?!www\.w3\.org/2000/svg)"
     )
     assert {name: wrong.findall(text) for name, text in scripts.items() if wrong.search(text)} == {}
 
 
-def test_the_page_names_no_other_host_and_holds_no_code():
-    page = (SOURCES / "src" / "index.html").read_text()
-    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", page) == ["data:,", "app.css", "app.js"]
+@pytest.mark.parametrize(
+    ("file", "named"), [("index.html", ["data:,", "app.css", "app.js"]), ("shell.html", ["shell.css", "shell.js"])]
+)
+def test_the_page_names_no_other_host_and_holds_no_code(file, named):
+    page = (SOURCES / "src" / file).read_text()
+    assert re.findall(r"(?:src|href)=\"([^\"]*)\"", page) == named
     assert not re.search(r"<script(?! src=)|<style|\son\w+=|style=|https?:", page)
 
 

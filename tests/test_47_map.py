@@ -3,7 +3,9 @@
 import json
 import re
 import threading
+import urllib.error
 import urllib.request
+from contextlib import contextmanager
 
 import pytest
 import rasterio
@@ -16,12 +18,34 @@ from apertura.export import exports_in, product_files
 from apertura.load.map_server import served
 from apertura.provenance import sha256_file
 from apertura.steps.webmap import webmap
-from apertura.webmap.page import page_files
+from apertura.store import record_files
+from apertura.webmap.page import FILES, SHELL
 
 
 @pytest.fixture
 def finished(finished_tiny, tmp_path):
     return Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
+
+
+@contextmanager
+def serving(campaign):
+    """Serve a campaign's map; yield what asks for a file under the name of the data: status and body."""
+    with served(campaign) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+
+        def ask(name):
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{server.server_port}/{name}") as answer:
+                    return answer.status, answer.read()
+            except urllib.error.HTTPError as answer:
+                return answer.code, answer.read()
+
+        try:
+            yield ask
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def document(campaign):
@@ -110,29 +134,113 @@ def test_an_image_that_is_not_as_it_was_written_is_not_shown(finished):
         webmap(finished)
 
 
-def test_without_a_bundle_the_map_is_a_page_that_says_so(finished, monkeypatch, tmp_path):
-    monkeypatch.setattr("apertura.steps.webmap.page_files", lambda: page_files(tmp_path / "nowhere"))
-    assert [path.name for path in webmap(finished)] == ["map.json", "index.html"]
-    assert "make webmap" in (finished.results / "map" / "index.html").read_text()
+@pytest.fixture
+def bundled(monkeypatch):
+    """A page of which each file holds its name, as if it had been bundled."""
+    monkeypatch.setattr(
+        "apertura.load.map_server.page_files", lambda: {name: name.encode() for name in (*SHELL, *FILES)}
+    )
+
+
+def tampered(campaign):
+    """Change one number of `map.json`, and nothing else of the campaign."""
+    found = document(campaign)
+    found["images"][0]["error_db"] -= 1
+    (campaign.results / "map" / "map.json").write_text(json.dumps(found))
+
+
+def test_the_results_hold_what_is_shown_and_no_page(finished_tiny):
+    assert {path.name for path in (finished_tiny.results / "map").iterdir()} == {"map.json", "map.manifest.json"}
 
 
 def test_a_campaign_without_a_map_is_one_message(tiny):
-    with pytest.raises(CampaignError, match=r"map/index\.html: no such file; expected the map of a finished campaign"):
+    with pytest.raises(CampaignError, match=r"map/map\.json: no such file; expected a finished campaign"):
         served(Campaign.load(tiny))
 
 
-def test_the_products_are_served_and_neither_what_they_are_made_from_nor_the_config(finished_tiny):
-    with served(finished_tiny) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            base = server.url.removesuffix("map/index.html")
-            layer = document(finished_tiny)["images"][0]["layers"][0]
-            with urllib.request.urlopen(f"{base}map/{layer['url']}".replace("map/../", "")) as answer:
-                assert answer.read() == (finished_tiny.results / "f01/fused/coherent_db.tif").read_bytes()
-            for name in ("scene.json", "cube.manifest.json", "f01/uav1/raw.manifest.json", "config/config.yaml"):
-                with pytest.raises(urllib.error.HTTPError, match="404"):
-                    urllib.request.urlopen(base + name)
-        finally:
-            server.shutdown()
-            thread.join()
+def test_what_the_map_names_is_served_and_nothing_else(finished_tiny):
+    found = document(finished_tiny)
+    layers = [layer for image in found["images"] for layer in image["layers"]]
+    with serving(finished_tiny) as ask:
+        for url in (*(layer["url"] for layer in layers), found["coverage_url"]):
+            name = url.removeprefix("../").partition("?")[0]
+            there = (200, (finished_tiny.results / name).read_bytes())
+            assert ask(url.removeprefix("../")) == ask(name) == there
+        assert ask("map/map.json") == (200, (finished_tiny.results / "map/map.json").read_bytes())
+        others = (
+            "scene.json",
+            "map/map.manifest.json",
+            "f01/uav1/raw.manifest.json",
+            "config/config.yaml",
+            "coverage.png",
+        )
+        for name in (*others, "f01/uav1-uav1/slc.tif", "f01/uav1-uav1/db.qml", "f01/uav1-uav1/image.json"):
+            assert ask(name)[0] == 404
+
+
+@pytest.mark.usefixtures("bundled")
+def test_a_page_that_came_with_the_results_is_not_served(finished):
+    folder = finished.results / "map"
+    planted = [folder / name for name in (*SHELL, *FILES, "other.js")]
+    for path in planted:
+        path.write_text("planted")
+    record_files(folder / "map.manifest.json", [folder / "map.json", *planted])
+    with serving(finished) as ask:
+        assert {name: ask(f"map/{name}") for name in FILES} == {name: (200, name.encode()) for name in FILES}
+        assert {ask(f"map/{name}")[0] for name in (*SHELL, "other.js")} == {404}
+
+
+def test_a_map_that_is_not_as_it_was_written_is_one_message_at_the_start(finished):
+    tampered(finished)
+    with pytest.raises(CampaignError, match=r"map/map\.json: not as map\.manifest\.json describes it"):
+        served(finished)
+    (finished.results / "map" / "map.manifest.json").write_text("{")
+    with pytest.raises(CampaignError, match=r"map\.manifest\.json: damaged"):
+        served(finished)
+
+
+def test_a_map_that_names_other_files_than_products_does_not_reach_them(finished):
+    found = document(finished)
+    for layer, name in zip(found["images"][0]["layers"], ("scene.json", "../config/config.yaml"), strict=True):
+        layer["url"] = f"../{name}?sha256={sha256_file(finished.results / name)}"
+    path = finished.results / "map" / "map.json"
+    path.write_text(json.dumps(found))
+    record_files(path.with_name("map.manifest.json"), [path])
+    with serving(finished) as ask:
+        assert ask("map/map.json")[0] == 200
+        assert {ask(name)[0] for name in ("scene.json", "../config/config.yaml", "%2e%2e/config/config.yaml")} == {404}
+
+
+@pytest.mark.parametrize("images", [None, [{"layers": [{"url": 3}]}], [{"layers": [{}]}], "x"])
+def test_a_map_of_another_kind_is_one_message(finished, images):
+    path = finished.results / "map" / "map.json"
+    path.write_text(json.dumps({**document(finished), "images": images}))
+    record_files(path.with_name("map.manifest.json"), [path])
+    with pytest.raises(CampaignError, match=r"map\.json: damaged"):
+        served(finished)
+
+
+def test_a_run_beside_the_server_is_taken_up_and_what_is_unfinished_or_changed_is_not_given(finished):
+    layer = document(finished)["images"][1]["layers"][0]
+    raster = finished.results / "f01" / "uav1-uav1" / "db.tif"
+    manifest = finished.results / "map" / "map.manifest.json"
+    as_written = manifest.read_bytes()
+    with serving(finished) as ask:
+        tampered(finished)
+        assert ask("map/map.json") == (409, b"changed since the map was made: run the workflow again\n")
+        manifest.unlink()
+        status, said = ask("map/map.json")
+        assert (status, said.count(b"\n")) == (409, 1)
+        assert b"map.manifest.json: no such file" in said
+        manifest.write_bytes(as_written)
+        assert ask("f01/uav1-uav1/db.tif")[0] == 409  # the map beside it is none that a manifest lists
+        webmap(finished)
+        assert ask("f01/uav1-uav1/db.tif") == (200, raster.read_bytes())
+        raster.write_bytes((finished.results / "f01/uav1-uav2/db.tif").read_bytes())
+        assert ask("f01/uav1-uav1/db.tif")[0] == 409
+        found = document(finished)
+        found["images"][1]["layers"][0]["url"] = layer["url"].replace(layer["sha256"], sha256_file(raster))
+        (finished.results / "map" / "map.json").write_text(json.dumps(found))
+        record_files(manifest, [finished.results / "map" / "map.json"])
+        assert ask("f01/uav1-uav1/db.tif") == (200, raster.read_bytes())
+        assert ask("map/map.json")[0] == 200

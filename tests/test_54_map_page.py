@@ -1,11 +1,15 @@
-"""The map in a browser: what it draws, tells and measures, and that it asks no other host for anything."""
+"""The map in a browser: what it draws, tells and measures, and that nothing in it asks another host for anything."""
 
 import io
 import json
 import signal
+import socket
 import subprocess
 import sys
-from contextlib import contextmanager
+import threading
+import time
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +19,7 @@ from matplotlib.image import imread
 from pyproj import Transformer
 
 from apertura.simulation import preset, simulate
+from apertura.store import record_files
 from apertura.webmap.page import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"
@@ -63,18 +68,22 @@ def browsing(tool, arguments):
 
 @contextmanager
 def shown(browser, address, *, size=(1000, 700), drawn=True):
-    """Yield the page and what it should not do: errors, and requests to other hosts."""
-    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    """Yield the map, in its frame, and what it should not do: errors, and requests to other hosts."""
+    page = browser.new_page()
+    page.set_viewport_size({"width": size[0], "height": size[1]})
     wrong = []
     page.on("console", lambda said: wrong.append(said.text) if said.type in {"error", "warning"} else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    ours = (address.partition("/map/")[0], "data:", "blob:")
+    window = address.partition("#")[0]
+    ours = (window, window.replace("localhost", "127.0.0.1"), "data:", "blob:")
     page.on("request", lambda asked: None if asked.url.startswith(ours) else wrong.append(asked.url))
     page.goto(address)
+    _, frame = page.frames
+    frame.wait_for_url(lambda url: url.startswith(f"{ours[1]}map/index.html"))
     if drawn:
-        page.wait_for_selector("html[data-drawn]", timeout=20_000)
+        frame.wait_for_selector("html[data-drawn]", timeout=20_000)
     try:
-        yield page, wrong
+        yield frame, wrong
     finally:
         page.close()
 
@@ -97,19 +106,27 @@ def browser(tool):
         yield browser
 
 
-def pixels(page):
+def until(frame, true):
+    """Wait for what is true soon: what one page tells the other takes its time."""
+    end = time.monotonic() + 5
+    while not true() and time.monotonic() < end:
+        frame.wait_for_timeout(20)
+    assert true()
+
+
+def pixels(frame):
     """Grey values of the map's picture, as the reader sees it, by a canvas of the test's own."""
-    return np.asarray(imread(io.BytesIO(page.locator("#view").screenshot()))[..., :3])
+    return np.asarray(imread(io.BytesIO(frame.locator("#view").screenshot()))[..., :3])
 
 
 @pytest.mark.parametrize("size", [(1000, 700), (800, 600), (390, 844)])
 def test_the_image_is_drawn_and_no_other_host_is_asked(browser, address, size):
-    with shown(browser, f"{address}#over=", size=size) as (page, wrong):
-        page.wait_for_timeout(300)
-        seen = pixels(page)
+    with shown(browser, f"{address}#over=", size=size) as (frame, wrong):
+        frame.wait_for_timeout(300)
+        seen = pixels(frame)
         assert wrong == []
-        assert page.locator("#notices").inner_text() == ""
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert frame.locator("#notices").inner_text() == ""
+        assert frame.evaluate("document.documentElement.scrollWidth <= innerWidth")
     rows, columns = seen.shape[:2]
     middle = seen[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
     assert middle.max() > 0.9  # the peak is white
@@ -120,20 +137,20 @@ def test_the_image_is_drawn_and_no_other_host_is_asked(browser, address, size):
 def test_a_targets_coordinates_read_from_the_page_are_within_a_pixel_of_the_truth(browser, address, finished, image):
     truth = json.loads((finished.root / "truth.json").read_text())["targets"]
     spacing_m = finished.settings.scene.spacing_m
-    with shown(browser, f"{address}#image={image}") as (page, wrong):
+    with shown(browser, f"{address}#image={image}") as (frame, wrong):
         for number, target in enumerate(truth):
-            row = page.locator("#targets li", has_text=f"target {number}")
+            row = frame.locator("#targets li", has_text=f"target {number}")
             row.locator("button").click()
             peak = row.locator(".peak[data-east]")
             peak.wait_for(timeout=10_000)
             found = [float(peak.get_attribute(f"data-{axis}")) for axis in ("east", "north")]
             assert found == pytest.approx((target["x"], target["y"]), abs=spacing_m / 4)
-        page.wait_for_timeout(500)  # the map has come to the last target
-        box = page.locator("#map").bounding_box()
-        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-        page.locator("#value", has_text="dB").wait_for(timeout=10_000)
-        east, north = (float(word) for word in page.inner_text("#place").split() if word[0].isdigit())
-        latitude, longitude = (float(one.strip(" °NE")) for one in page.inner_text("#geographic").split("°")[:2])
+        frame.wait_for_timeout(500)  # the map has come to the last target
+        box = frame.locator("#map").bounding_box()
+        frame.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        frame.locator("#value", has_text="dB").wait_for(timeout=10_000)
+        east, north = (float(word) for word in frame.inner_text("#place").split() if word[0].isdigit())
+        latitude, longitude = (float(one.strip(" °NE")) for one in frame.inner_text("#geographic").split("°")[:2])
         assert wrong == []
     assert (east, north) == pytest.approx((truth[-1]["x"], truth[-1]["y"]), abs=spacing_m)
     to_wgs84 = Transformer.from_crs("EPSG:32632", "EPSG:4326")
@@ -145,13 +162,13 @@ def test_a_target_is_drawn_where_it_is(browser, address, finished, number):
     target = json.loads((finished.root / "truth.json").read_text())["targets"][number]
     metres, spacing_m = 0.005, finished.settings.scene.spacing_m
     view = f"{target['x']},{target['y']},{metres}"
-    with shown(browser, f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}") as (page, wrong):
-        peak_db = float(page.inner_text("#high-value").split()[0].replace("−", "-"))
+    with shown(browser, f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}") as (frame, wrong):
+        peak_db = float(frame.inner_text("#high-value").split()[0].replace("−", "-"))
     level = peak_db + 20 * np.log10(target["amplitude"]) - 6
     link = f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}&stretch={level},{level + 0.1}"
-    with shown(browser, link) as (page, wrong):
-        page.wait_for_timeout(300)
-        seen = pixels(page).mean(axis=-1) > 0.99
+    with shown(browser, link) as (frame, wrong):
+        frame.wait_for_timeout(300)
+        seen = pixels(frame).mean(axis=-1) > 0.99
         assert wrong == []
     rows, columns = np.nonzero(seen)
     middle = [(size - 1) / 2 for size in seen.shape]
@@ -168,35 +185,63 @@ def test_a_link_shows_what_it_was_taken_from_and_a_wrong_one_shows_the_map(brows
     asked = (
         f"image=f01/uav1-uav2&layer=incidence.tif&stretch=40,60&over=mask&view={middle[0]},{middle[1]},0.01&line={line}"
     )
-    with shown(browser, f"{address}#{asked}") as (page, wrong):
-        page.wait_for_selector("#plot path")
-        assert page.input_value("#image") == "f01/uav1-uav2"
-        assert page.input_value("#layer") == "incidence.tif"
-        assert page.inner_text("#low-value") == "40 deg"
-        assert page.is_checked("#overlays label:nth-child(1) input")
-        assert not page.is_checked("#overlays label:nth-child(2) input")
-        again = page.evaluate("location.hash")
+    with shown(browser, f"{address}#{asked}") as (frame, wrong):
+        frame.wait_for_selector("#plot path")
+        assert frame.input_value("#image") == "f01/uav1-uav2"
+        assert frame.input_value("#layer") == "incidence.tif"
+        assert frame.inner_text("#low-value") == "40 deg"
+        assert frame.is_checked("#overlays label:nth-child(1) input")
+        assert not frame.is_checked("#overlays label:nth-child(2) input")
+        again = frame.evaluate("location.hash")
+        assert frame.page.url == address + again
+        assert frame.page.title() == frame.title() == "tandem_demo · apertura map"
         assert wrong == []
-    with shown(browser, address + again) as (page, _):
-        page.wait_for_selector("#plot path")
-        assert page.evaluate("location.hash") == again
+    with shown(browser, address + again) as (frame, _):
+        frame.wait_for_selector("#plot path")
+        assert frame.evaluate("location.hash") == again
     with shown(browser, f"{address}#image=x&layer=../y&stretch=a,b&view=1,2,-3&line=1,2&over=__proto__") as (
-        page,
+        frame,
         wrong,
     ):
-        assert page.input_value("#layer") == "coherent_db.tif"
+        assert frame.input_value("#layer") == "coherent_db.tif"
         assert wrong == []
+
+
+def test_the_windows_address_shows_something_else_when_it_is_edited_and_goes_back(browser, address):
+    with shown(browser, f"{address}#over=&colours=grey") as (frame, wrong):
+        window = frame.page
+        before, length = window.url, window.evaluate("history.length")
+        frame.select_option("#colours", "inferno")
+        until(frame, lambda: "colours=inferno" in window.url)
+        window.evaluate("location.hash = location.hash.replace('colours=inferno', 'colours=viridis')")
+        until(frame, lambda: frame.input_value("#colours") == "viridis")
+        assert window.evaluate("history.length") == length + 1  # by the edit, and not by what the map tells
+        window.go_back()
+        until(frame, lambda: frame.input_value("#colours") == "inferno")
+        assert window.url == before.replace("colours=grey", "colours=inferno")
+        assert wrong == []
+
+
+def test_the_window_takes_a_permalink_from_its_frame_alone_and_no_more_than_that(browser, address):
+    with shown(browser, address) as (frame, _):
+        window = frame.page
+        frame.evaluate("parent.postMessage({ hash: '//evil.example/x?y', title: '<b>told</b>' }, '*')")
+        until(frame, lambda: window.title() == "<b>told</b>")
+        window.evaluate("postMessage({ hash: '#own', title: 'own' }, '*')")
+        frame.wait_for_timeout(200)
+        assert window.title() == "<b>told</b>"
+        assert window.url == f"{address}#/evil.example/x?y"
 
 
 def test_the_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
-    with shown(browser, f"{address}#over=") as (page, wrong):
-        page.click("#draw")
-        box = page.locator("#map").bounding_box()
+    with shown(browser, f"{address}#over=") as (frame, wrong):
+        frame.click("#draw")
+        box = frame.locator("#map").bounding_box()
         for share in (0.35, 0.65):
-            page.mouse.click(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
-        page.wait_for_selector("#plot path.cut")
-        with page.expect_download() as download:
-            page.click("#csv")
+            frame.page.mouse.click(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+        frame.wait_for_selector("#plot path.cut")
+        with frame.page.expect_download() as download:
+            frame.click("#csv")
         header, *rows = Path(download.value.path()).read_text().splitlines()
         assert wrong == []
     assert header == "distance_m,easting_m,northing_m,longitude_deg,latitude_deg,value_db"
@@ -207,19 +252,20 @@ def test_the_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
 
 
 def test_the_map_is_moved_and_read_by_keys_alone(browser, address):
-    with shown(browser, address) as (page, wrong):
-        page.keyboard.press("Tab")
-        page.keyboard.press("Enter")  # to the map
-        assert page.evaluate("document.activeElement.id") == "map"
-        before = page.evaluate("location.hash")
-        page.keyboard.press("ArrowRight")
-        page.keyboard.press("+")
-        page.locator("#value", has_text="dB").wait_for(timeout=10_000)
-        assert page.is_visible("#cross")
-        assert page.evaluate("location.hash") != before
-        page.focus("#low")
-        page.keyboard.press("ArrowRight")
-        assert page.inner_text("#low-value") == page.inner_text("#ramp-low")
+    with shown(browser, address) as (frame, wrong):
+        frame.page.keyboard.press("Tab")
+        until(frame, lambda: frame.evaluate("document.hasFocus() && document.activeElement.id") == "skip")
+        frame.page.keyboard.press("Enter")  # to the map
+        until(frame, lambda: frame.evaluate("document.activeElement.id") == "map")
+        before = frame.evaluate("location.hash")
+        frame.page.keyboard.press("ArrowRight")
+        frame.page.keyboard.press("+")
+        frame.locator("#value", has_text="dB").wait_for(timeout=10_000)
+        assert frame.is_visible("#cross")
+        assert frame.evaluate("location.hash") != before
+        frame.focus("#low")
+        frame.page.keyboard.press("ArrowRight")
+        assert frame.inner_text("#low-value") == frame.inner_text("#ramp-low")
         assert wrong == []
 
 
@@ -234,12 +280,13 @@ def test_text_of_strangers_stays_text(browser, finished, tmp_path):
     image["layers"][0] |= {"title": HOSTILE, "unit": HOSTILE}
     found["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
     path.write_text(json.dumps(found))
-    with serving(root) as address, shown(browser, address) as (page, wrong):
-        page.wait_for_timeout(300)
-        assert page.inner_text("#campaign") == HOSTILE
-        assert page.inner_text("#flags dt") == HOSTILE
-        assert page.locator("img, body script").count() == 0
-        assert page.title() != "hacked"
+    record_files(path.with_name("map.manifest.json"), [path])
+    with serving(root) as address, shown(browser, address) as (frame, wrong):
+        frame.wait_for_timeout(300)
+        assert frame.inner_text("#campaign") == HOSTILE
+        assert frame.inner_text("#flags dt") == HOSTILE
+        assert frame.locator("img, body script").count() == 0
+        assert frame.title() == frame.page.title() == f"{HOSTILE} · apertura map"
         assert wrong == []
 
 
@@ -247,18 +294,168 @@ def test_an_image_that_changed_after_the_map_was_made_is_told_and_not_shown(brow
     root = copy_writable(finished.root, tmp_path / "campaign")
     path = root / "results" / "f01" / "fused" / "coherent_db.tif"
     path.with_name("noncoherent_db.tif").replace(path)
-    with serving(root) as address, shown(browser, address, drawn=False) as (page, _):
-        page.locator("#notices", has_text="changed since the map was made").wait_for(timeout=10_000)
-
-
-def test_a_page_opened_as_a_file_says_how_to_open_it(browser, finished):
-    with shown(browser, (finished.results / "map" / "index.html").as_uri(), drawn=False) as (page, _):
-        page.locator("#notices", has_text="apertura map CAMPAIGN").wait_for(timeout=5_000)
+    with serving(root) as address, shown(browser, address, drawn=False) as (frame, _):
+        frame.locator("#notices", has_text="changed since the map was made").wait_for(timeout=10_000)
 
 
 def test_without_webgl_the_page_says_so_and_still_tells_values(tool, address):
-    with browsing(tool, NO_GL) as browser, shown(browser, address) as (page, wrong):
-        assert "no WebGL" in page.inner_text("#notices")
-        page.locator("#targets button").first.click()
-        page.wait_for_selector("#targets .peak[data-east]", timeout=10_000)
+    with browsing(tool, NO_GL) as browser, shown(browser, address) as (frame, wrong):
+        assert "no WebGL" in frame.inner_text("#notices")
+        frame.locator("#targets button").first.click()
+        frame.wait_for_selector("#targets .peak[data-east]", timeout=10_000)
         assert wrong == []
+
+
+NAVIGATIONS = {
+    "location": "location = url",
+    "top": "top.location = url",
+    "parent": "parent.location = url",
+    "window": "open(url)",
+    "link": "add('a', { href: url }).click()",
+    "link to top": "add('a', { href: url, target: '_top' }).click()",
+    "link to a new window": "add('a', { href: url, target: '_blank' }).click()",
+    "download": "add('a', { href: url, download: 'x' }).click()",
+    "meta": "add('meta', { httpEquiv: 'refresh', content: `0;url=${url}` })",
+    "form": "add('form', { action: url, method: 'post' }).submit()",
+    "form to top": "add('form', { action: url, target: '_top' }).submit()",
+}
+REQUESTS = {
+    "fetch": "fetch(url, { mode: 'no-cors' }).catch(() => {})",
+    "XMLHttpRequest": "const asked = new XMLHttpRequest(); asked.open('GET', url); asked.send()",
+    "image": "new Image().src = url",
+    "WebSocket": "new WebSocket(url.replace('http', 'ws'))",
+    "EventSource": "new EventSource(url)",
+    "beacon": "navigator.sendBeacon(url, 'x')",
+    "ping": "add('a', { href: '#x', ping: url }).click()",
+    "prefetch": "add('link', { rel: 'prefetch', href: url })",
+    "preload": "add('link', { rel: 'preload', as: 'image', href: url })",
+    "stylesheet": "add('link', { rel: 'stylesheet', href: url })",
+    "style": "add('link', { rel: 'stylesheet', href: `data:text/css,@import '${url}'` })",
+    "script": "add('script', { src: url })",
+    "frame": "add('iframe', { src: url })",
+    "frame that is led": "add('iframe', {}).contentWindow.location = url",
+    "video": "add('video', { src: url })",
+    "worker": "new Worker(URL.createObjectURL(new Blob([`importScripts('${url}')`])))",
+    "WebRTC": "const urls = url.replace(/http:..(.*).x/, 'stun:$1');"
+    "const peer = new RTCPeerConnection({ iceServers: [{ urls }] }); peer.createDataChannel('x');"
+    "peer.createOffer().then((offer) => peer.setLocalDescription(offer))",
+}
+ADD = "const add = (name, with_) => document.body.appendChild(Object.assign(document.createElement(name), with_));"
+
+
+class Listener(ThreadingHTTPServer):
+    """A port of this machine, what connects to it or sends to it, and what is asked of it: an empty page."""
+
+    daemon_threads = True
+
+    def __init__(self):
+        super().__init__(("127.0.0.1", 0), Answer)
+        self.connections, self.requests = [], []
+        self.url = f"http://127.0.0.1:{self.server_port}/x"
+        self.datagrams = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.datagrams.bind(("127.0.0.1", self.server_port))
+
+    def verify_request(self, _, asker):
+        self.connections.append(asker)
+        return True
+
+    def heard(self):
+        with suppress(BlockingIOError):
+            self.connections.append(self.datagrams.recv(9, socket.MSG_DONTWAIT))
+        return self.connections
+
+    def handle_error(self, *_):
+        """Say nothing of whoever connects and asks for nothing."""
+
+
+class Answer(BaseHTTPRequestHandler):
+    timeout = 5
+
+    def do_GET(self):
+        self.server.requests.append(self.requestline)
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+
+    do_POST = do_GET
+
+    def log_message(self, *_):
+        """Say nothing."""
+
+
+@contextmanager
+def listening():
+    with Listener() as listener:
+        thread = threading.Thread(target=listener.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield listener
+        finally:
+            listener.shutdown()
+            thread.join()
+            listener.datagrams.close()
+
+
+def attack(frame, code, url):
+    """Run code in a page as the page's own; whether it throws, or ends the page, is all the same."""
+    from playwright.sync_api import Error
+
+    with suppress(Error):
+        frame.evaluate(f"(url) => {{ {ADD} {code}; }}", url)
+
+
+@pytest.mark.parametrize("code", [pytest.param(code, id=name) for name, code in (NAVIGATIONS | REQUESTS).items()])
+def test_nothing_in_the_map_reaches_another_server(browser, address, code):
+    if int(browser.version.partition(".")[0]) < 152:
+        pytest.skip("this Chromium knows no connection allowlist")
+    with listening() as plain, listening() as other, browser.new_context() as context:
+        page = context.new_page()
+        page.goto(plain.url)
+        attack(page.main_frame, code, other.url)
+        until(page, other.heard)  # where nothing hinders it
+    with listening() as other, browser.new_context() as context, shown(context, address) as (frame, _):
+        window = frame.page
+        until(frame, lambda: "#image=" in window.url)
+        before = window.url
+        attack(frame, code, other.url)
+        window.wait_for_timeout(500)
+        assert (other.heard(), other.requests) == ([], [])
+        assert (window.url, context.pages) == (before, [window])
+
+
+@pytest.fixture(scope="module")
+def older(tool):
+    """A browser that knows no connection allowlist."""
+    with browsing(tool, (*SOFTWARE_GL, "--disable-features=ConnectionAllowlists")) as browser:
+        yield browser
+
+
+@pytest.mark.parametrize("code", [pytest.param(code, id=name) for name, code in NAVIGATIONS.items()])
+def test_the_map_leads_nowhere_in_a_browser_that_knows_no_connection_allowlist(older, address, code):
+    with listening() as other, older.new_context() as context, shown(context, address) as (frame, _):
+        window = frame.page
+        until(frame, lambda: "#image=" in window.url)
+        before = window.url
+        attack(frame, code, other.url)
+        window.wait_for_timeout(500)
+        assert other.requests == []
+        assert (window.url, context.pages) == (before, [window])
+
+
+def test_the_map_does_not_see_the_window_around_it(browser, address):
+    with shown(browser, address) as (frame, _):
+        seen = "try { parent.document.title } catch (error) { return error.name } return 'seen'"
+        assert frame.evaluate(f"() => {{ {seen} }}") == "SecurityError"
+
+
+def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to_the_map(browser, finished, tmp_path):
+    root = copy_writable(finished.root, tmp_path / "campaign")
+    for name in ("index.html", "shell.html", "app.js", "shell.js", "app.css"):
+        (root / "results" / "map" / name).write_text("document.title='hacked'")
+    with serving(root) as address:
+        page = browser.new_page()
+        page.goto(f"{address.replace('localhost', '127.0.0.1')}map/index.html#colours=inferno")
+        page.frame_locator("iframe").locator("html[data-drawn]").wait_for(state="attached", timeout=20_000)
+        until(page, lambda: page.url.startswith(f"{address}#image=") and "colours=inferno" in page.url)
+        assert page.title() == "tandem_demo · apertura map"
+        page.close()

@@ -1,4 +1,5 @@
-// Bundles the map's page into the package: index.html, app.js and app.css, which name no other host.
+// Bundles the map's page and the window around it into the package: index.html, app.js, app.css and shell.*, which name
+// no other host.
 // `node build.mjs [folder]`; without a folder, into src/apertura/webmap/page.
 import { build } from 'esbuild';
 import { copyFile, mkdir, rename, rm } from 'node:fs/promises';
@@ -12,17 +13,17 @@ const beside = `${folder}.wip`;
 await rm(beside, { recursive: true, force: true });
 await mkdir(beside, { recursive: true });
 await build({
-  entryPoints: [join(here, 'src/app.js')],
-  outfile: join(beside, 'app.js'),
+  entryPoints: [join(here, 'src/app.js'), join(here, 'src/shell.js')],
+  outdir: beside,
   absWorkingDir: here,
   bundle: true,
   minify: true,
-  format: 'iife', // a module would not even load from file://, where the page has to say what to do
+  format: 'iife',
   target: 'es2022',
   charset: 'utf8',
   legalComments: 'inline', // the licences of what is bundled go with it
   logLevel: 'warning',
 });
-await copyFile(join(here, 'src/index.html'), join(beside, 'index.html'));
+for (const page of ['index.html', 'shell.html']) await copyFile(join(here, 'src', page), join(beside, page));
 await rm(folder, { recursive: true, force: true });
 await rename(beside, folder);

@@ -143,6 +143,8 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def _synchronise(path: Path) -> None:
+    if path.is_symlink():  # none of ours, nor what it leads to
+        return
     descriptor = os.open(path, os.O_RDONLY)
     with naming(path):
         try:

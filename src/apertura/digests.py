@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from apertura.atomic import write_json
 from apertura.errors import CampaignError
+from apertura.paths import inside
 from apertura.provenance import canonical_json, code_sha256, hashes_of_file, sha256_text
 
 _KEPT = Path("results/.hashes")
@@ -41,9 +42,9 @@ def digest_of(
     Raises
     ------
     CampaignError
-        If the file is not there, or changes while it is read.
+        If the file is not there, is reached through a link, or changes while it is read.
     """
-    path = root / name
+    path = inside(root, name, where=root)
     state = _state(path)
     algorithms = list(dict.fromkeys(["sha256", algorithm]))
     if state["size"] < _SMALL:
@@ -82,7 +83,7 @@ class Sources:
     @classmethod
     def of(cls, root: Path, names: Iterable[str]) -> "Sources":
         """Hash some files; raise CampaignError if one is not there."""
-        states = {name: _state(root / name) for name in sorted(set(names))}
+        states = {name: _state(inside(root, name, where=root)) for name in sorted(set(names))}
         return cls(root, {name: digest_of(root, name) for name in states}, states)
 
     def unchanged(self) -> dict[str, str]:

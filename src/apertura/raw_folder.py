@@ -33,20 +33,20 @@ class RawFolder:
         if isinstance(self.settings.waveform, SampledWaveform):
             recorded = {path.suffix: path for path in self.recording_files(flight, node)}
             return {**recorded, "track": self.track_file(flight, node)}
-        folder = self.root / "raw" / flight
+        folder = self.flight_folder(flight)
         files = self.history_files(flight, node)
         history = {f"history.{path.relative_to(folder).as_posix()}": path for path in files}
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
     def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
         """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
-        files = recording_files(self.root / "raw" / flight, node)
+        files = recording_files(self.flight_folder(flight), node)
         return tuple(self._raw_file(flight, node, path.name) for path in files)
 
     def history_files(self, flight: str, node: str) -> list[Path]:
         """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
         suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
-        folder = self.root / "raw" / flight
+        folder = self.flight_folder(flight)
         named = [path for path in sorted(folder.glob(f"{node}*{suffix}")) if path.name[len(node)] == "."]
         found = [file for path in named if not _is_log(path, node) for file in _files(path)]
         own = [path.relative_to(folder).as_posix() for path in found]
@@ -61,16 +61,16 @@ class RawFolder:
 
     def logged(self, flight: str, node: str) -> bool:
         """Return whether a flight log of a node lies there."""
-        return any((self.root / "raw" / flight).glob(f"{node}.track.*"))
+        return any((self.flight_folder(flight)).glob(f"{node}.track.*"))
 
     def track_file(self, flight: str, node: str) -> Path:
         """Return the one raw/<flight>/<node>.track.* file."""
-        logs = sorted((self.root / "raw" / flight).glob(f"{node}.track.*"))
+        logs = sorted((self.flight_folder(flight)).glob(f"{node}.track.*"))
         if len(logs) == 1:
             return self._recorded(flight, logs[0].name)
         raise CampaignError(
             f"{len(logs)} track files {[path.name for path in logs]}",
-            where=self.root / "raw" / flight / f"{node}.track.*",
+            where=self.flight_folder(flight) / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
             remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
         )
@@ -83,6 +83,10 @@ class RawFolder:
         """Return the phase history that a node of a pair recorded, as its format and the config say."""
         described = self.settings.waveform.model_dump()
         return read_phase_history(described["format"], self.history_files(flight, node), pair=pair, described=described)
+
+    def flight_folder(self, flight: str) -> Path:
+        """Return raw/<flight>, which is no link: not even its names are read through one."""
+        return inside(self.root, f"raw/{flight}", where=self.root)
 
     def _recorded(self, flight: str, name: str) -> Path:
         return inside(self.root, f"raw/{flight}/{name}", where=self.root)

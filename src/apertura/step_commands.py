@@ -71,7 +71,7 @@ def coverage(campaign: Directory = HERE) -> None:
 
 @app.command("map")
 def step_map(campaign: Directory = HERE) -> None:
-    """Write the page that shows every image in a browser, map/index.html."""
+    """Write what `apertura map` shows of every image in a browser, map/map.json."""
     _run("apertura.steps.webmap:webmap", campaign)
 
 

@@ -41,7 +41,6 @@ SETTINGS = {
     ".git/config": "[core]\nfsmonitor = touch ran\n",
 }
 PROGRAMS = (
-    "apertura",
     "snakemake",
     "python",
     "python3",
@@ -98,7 +97,9 @@ class Planted:
         fired += sorted(f"opened {path.relative_to(self.root.parent)}" for path in seen)
 
 
-class _Code:
+class Code:
+    """What runs Python when it is unpickled."""
+
     def __init__(self, code: str) -> None:
         self.code = code
 
@@ -205,7 +206,7 @@ def _sidecars(planted: Planted) -> Mapping[str, str]:
 def _pickles(planted: Planted) -> Mapping[str, bytes]:
     """Return records of Snakemake that would run code if they were unpickled."""
     names = ("iocache/latest.pkl", "metadata/cmVzdWx0cw==", "auxiliary/code.pkl", "scripts/x.py", "incomplete/x")
-    return {f".snakemake/{name}": pickle.dumps(_Code(planted.code(f"pickle {name}"))) for name in names}
+    return {f".snakemake/{name}": pickle.dumps(Code(planted.code(f"pickle {name}"))) for name in names}
 
 
 def hostile_texts(planted: Planted) -> Mapping[str, str]:

@@ -3,12 +3,14 @@
     python -m tests.cluster [FOLDER]
 
 Simulates the campaign, runs a copy of it here and one on the cluster by ``profiles/slurm``, disturbs that, and compares
-every product byte for byte. Says what is missing, and does nothing, where Slurm is not installed. Ends with an error
-where the run fails or the bytes differ.
+every product byte for byte. The one on the cluster holds a marker of every kind (`tests.attack.planted`), and the run
+is typed in it: none may fire. Says what is missing, and does nothing, where Slurm is not installed. Ends with an error
+where the run fails, a marker fires or the bytes differ.
 """
 
 import importlib.util
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -19,6 +21,7 @@ from pathlib import Path
 
 import yaml
 
+from tests.attack.planted import plant
 from tests.cluster import slurm
 
 ROOT = Path(__file__).parents[2]
@@ -33,13 +36,18 @@ def main() -> None:
     if reason:
         print(f"no cluster test: {reason}")
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # daemons are ended on the way out
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
         campaign = simulated(folder)
         expected = products(here(Path(shutil.copytree(campaign, folder / "here"))))
-        with slurm.running(folder / "slurm"):
-            made = products(disturbed(Path(shutil.copytree(campaign, folder / "there")), folder))
+        planted = plant(Path(shutil.copytree(campaign, folder / "there")))
+        with slurm.running(folder / "slurm"), planted.fires() as fired:
+            made = products(disturbed(planted.root, folder))
         report(folder / "slurm" / "jobs.log")
+    if fired:
+        sys.exit(f"{len(fired)} markers in the campaign folder fired: {', '.join(fired[:5])}")
+    print(f"{len(planted.watched)} markers in the campaign folder, none fired", flush=True)
     differ = sorted(str(name) for name in made.keys() | expected.keys() if made.get(name) != expected.get(name))
     if differ:
         sys.exit(f"{len(differ)} of {len(expected)} files differ: {', '.join(differ[:5])}")
@@ -72,7 +80,7 @@ def disturbed(root: Path, folder: Path) -> Path:
     command = [APERTURA, "run", root, "--cores", "2", "--profile", ROOT / "profiles" / "slurm"]
     command += ["--set-scatter", "tiles=2", "--latency-wait", "5"]
     with log.open("w") as said:
-        run = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+        run = subprocess.Popen(command, cwd=root, stdout=said, stderr=subprocess.STDOUT)
     try:
         for disturb in (cancel_a_job, drain_a_node, kill_a_node):
             done = disturb(folder / "slurm", run.poll)

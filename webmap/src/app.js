@@ -206,10 +206,6 @@ class Page {
 }
 
 async function start() {
-  if (location.protocol === 'file:') {
-    notice('A browser reads no image from a folder opened like this: type `apertura map CAMPAIGN`, and open the address that it prints.');
-    return;
-  }
   if (!canDraw()) notice('This browser has no WebGL, with which images are drawn; values, places and tracks are still told.');
   const answer = await fetch('map.json');
   if (!answer.ok) throw new Error(`map.json: ${(await answer.text()).trim()}`);

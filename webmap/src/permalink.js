@@ -20,11 +20,13 @@ export function read(hash) {
   };
 }
 
-/** Put what is shown into the address; the browser's history does not grow. */
+/** Put what is shown into the address, and tell the window around the map; the browser's history does not grow. */
 export function write({ image, layer, colours, stretch, over, view, line }, decimals) {
   const fixed = (values, more = 0) => values.map((value) => Number(value.toFixed(decimals + more))).join(',');
   const asked = new URLSearchParams({ image, layer, colours, stretch: stretch.join(','), over: over.join(',') });
   asked.set('view', `${fixed(view.slice(0, 2))},${Number(view[2].toPrecision(4))}`);
   if (line) asked.set('line', fixed(line.flat()));
   history.replaceState(null, '', `#${asked.toString().replaceAll('%2C', ',').replaceAll('%2F', '/')}`);
+  const said = { hash: location.hash, title: document.title };
+  if (parent !== window) parent.postMessage(said, `${location.protocol}//localhost:${location.port}`);
 }

@@ -148,12 +148,11 @@ rule mosaic:
         "apertura step mosaic > {log} 2>&1"
 
 
-# What the package can show a browser is part of what the map is made from: a page bundled later makes it again.
 rule map:
     input:
         lambda wildcards: result_of(campaign, "map").sources,
     output:
-        [f"results/map/{file}" for file in (DATA, *page_files())],
+        f"results/{MAP}",
         "results/map/map.manifest.json",
     log:
         "results/logs/map.log",

@@ -11,6 +11,7 @@ import numpy as np
 from apertura.audit.contents import EXPECTED, REMEDY, SECTIONS, sections_of
 from apertura.audit.links import shortened
 from apertura.audit.pixels import Pixels, Tally, rows_of
+from apertura.audit.products import unlinked
 from apertura.audit.tags import picture
 from apertura.errors import CampaignError, shown
 from apertura.export.writing import blocks_of
@@ -36,7 +37,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     CampaignError
         If one is not there or not readable, or they are of two kinds.
     """
-    for path in (first, second):
+    for path in map(unlinked, (first, second)):
         if not path.exists():
             raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:

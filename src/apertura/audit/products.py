@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from apertura.errors import CampaignError
+from apertura.paths import inside
 from apertura.provenance import sha256_file
 from apertura.settings import CONFIG
 from apertura.store import manifest_of, read_manifest
@@ -52,7 +53,7 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
     """
     if path.is_dir() and ((path / CONFIG).is_file() or (path / "results").is_dir()):
         return Product(path)
-    results = next((folder for folder in path.parents if folder.name == "results"), None)
+    results = next((folder for folder in unlinked(path).parents if folder.name == "results"), None)
     if campaign is not None and not path.is_relative_to(campaign / "results") and path.is_file():
         return Product(campaign, _listing(campaign / "results", path, sha256=sha256_file(path)), path)
     product = Product(results.parent, _manifest(results, path), path) if results is not None else Product(path.parent)
@@ -66,6 +67,12 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
     if path.is_dir() and not product.manifest:
         raise CampaignError("a folder that is no result", path, _EXPECTED, "Name one of its files.")
     return product
+
+
+def unlinked(path: Path) -> Path:
+    """Return a path; raise CampaignError if it leads through a link of the campaign that it lies in."""
+    results = next((folder for folder in path.parents if folder.name == "results"), None)
+    return path if results is None else inside(results.parent, path.relative_to(results.parent).as_posix(), where=path)
 
 
 def _manifest(results: Path, path: Path) -> str:

@@ -17,6 +17,9 @@ from apertura.paths import inside
 from apertura.store import read_manifest
 from apertura.workflow import run_workflow
 
+_WHOLE = ("config", "raw")
+"""Folders of a campaign that are inputs with all that is in them."""
+
 _LINES = 8
 _LONGEST = 400
 
@@ -55,7 +58,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
     if not wanted:
         raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
-    with _scratch(product.root, keep) as again:
+    with _scratch(campaign, keep) as again:
         status = run_workflow(again, cores, *(["all", *filter(on_demand, wanted)] if whole else wanted))
         if status:
             return status
@@ -81,31 +84,32 @@ def _found(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str])
 
 
 @contextmanager
-def _scratch(root: Path, keep: Path | None) -> Iterator[Path]:
+def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
     """Yield a campaign folder with the same inputs and no results."""
+    root = campaign.root
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="apertura-reproduce-") as folder:
-            yield _with_inputs(root, Path(folder, root.name), link=True)
+            yield _with_inputs(campaign, Path(folder, root.name), link=True)
         return
     if keep.is_relative_to(root) or keep.is_symlink() or (keep.exists() and not keep.is_dir()):
         raise CampaignError("cannot be made again there", keep, "a new folder outside the campaign", "Name another.")
     if keep.is_dir() and any(keep.iterdir()):
         raise CampaignError("not empty", keep, "a new folder", "Name another; nothing was changed.")
-    yield _with_inputs(root, keep, link=False)
+    yield _with_inputs(campaign, keep, link=False)
 
 
-def _with_inputs(root: Path, target: Path, *, link: bool) -> Path:
-    """Fill a folder with a campaign's files but its results; recordings as hard links where that is possible.
+def _with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
+    """Fill a folder with what a campaign's results are made from; recordings as hard links where that is possible.
 
     What stays is copied: who edits it later must not edit the recordings of the campaign.
     """
-    for folder, folders, files in os.walk(root):
-        here = Path(folder).relative_to(root)
-        folders[:] = [name for name in folders if here.parts or not (name == "results" or name.startswith("."))]
-        (target / here).mkdir(parents=True, exist_ok=True)
-        for path in (Path(folder, name) for name in files):
-            if not path.is_symlink() and path.is_file():
-                _put(path, target / here / path.name, link=link and here.parts[:1] == ("raw",))
+    sources = {source for _, result in results_of(campaign) for source in result.sources}
+    named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_WHOLE}]
+    for path in sorted({*named, *(path for folder in _WHOLE for path in (campaign.root / folder).rglob("*"))}):
+        if path.is_file() and not path.is_symlink():
+            here = path.relative_to(campaign.root)
+            (target / here).parent.mkdir(parents=True, exist_ok=True)
+            _put(path, target / here, link=link and here.parts[0] == "raw")
     return target
 
 

@@ -39,7 +39,7 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
     ...
     apertura.errors.CampaignError: nowhere/ro-crate-metadata.json: no such file; expected an RO-Crate ...
     """
-    crate = root / CRATE
+    crate = inside(root, CRATE, where=root)
     document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_CRATE)
     with undamaged(crate, expected=_EXPECTED, remedy=DAMAGED):
         told = [_place(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]

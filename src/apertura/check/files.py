@@ -48,7 +48,7 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
         try:
-            promised = recording_files(campaign.root / "raw" / flight.name, node)
+            promised = recording_files(campaign.flight_folder(flight.name), node)
         except CampaignError as problem:  # metadata that name files
             yield problem
             promised = ()

@@ -14,12 +14,11 @@ from apertura.campaign import Campaign
 from apertura.catalog import CATALOG, CRATE
 from apertura.digests import Result, digest_of
 from apertura.errors import CampaignError
-from apertura.export import COVERAGE, PHASE_HISTORY, exports_in
+from apertura.export import COVERAGE, MAP, PHASE_HISTORY, exports_in
 from apertura.lineage import results_of
 from apertura.paths import inside
 from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest
-from apertura.webmap.page import DATA, FILES
 
 _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
@@ -43,7 +42,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     stale: dict[str, str] = {}
     code = cache(code_of)  # the same for every flight and pair
     for name, result in results_of(campaign):
-        path = campaign.root / result.manifest
+        path = inside(campaign.root, result.manifest, where=campaign.root)
         if not path.is_file():
             if any((path.parent / file).is_file() for file in _PRODUCTS.get(name, ())):
                 stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
@@ -143,7 +142,7 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
     """Return manifest → what of a result is not as it was written, of those that are there; every byte is read."""
     damaged = {}
     for _, result in results_of(campaign):
-        path = campaign.root / result.manifest
+        path = inside(campaign.root, result.manifest, where=campaign.root)
         if path.is_file():
             try:
                 files = damaged_files(path)
@@ -162,7 +161,7 @@ _PRODUCTS = {
     "cphd": (PHASE_HISTORY,),
     "stac": (f"stac/{CATALOG}",),
     "ro_crate": (CRATE,),
-    "map": (DATA, *FILES),
+    "map": (Path(MAP).name,),
     **{
         name: tuple(row.file for row in exports_in(kind))
         for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()

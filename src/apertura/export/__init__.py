@@ -137,8 +137,8 @@ COVERAGE = ("coverage.png", "coverage.geojson")
 MOSAICS = "mosaic"
 """Folder of the rasters of all flights."""
 
-MAP = "map/index.html"
-"""The page that shows all of them in a browser."""
+MAP = "map/map.json"
+"""What `apertura map` shows of all of them in a browser."""
 
 
 def exports_in(folder: str) -> Iterator[Export]:

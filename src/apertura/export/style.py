@@ -19,6 +19,7 @@ from apertura.atomic import write_text
 from apertura.errors import ContractError
 from apertura.export.layers import CLASSES, OUTSIDE
 from apertura.export.radiometry import TAG
+from apertura.raster import ISOLATED
 
 _DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 _VERSION = "3.22"
@@ -56,7 +57,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     ...     [line.strip() for line in path.read_text().splitlines() if "Value>" in line]
     ['<minValue>-17.0</minValue>', '<maxValue>32.0</maxValue>']
     """
-    with rasterio.open(_beside(path)) as raster:
+    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
         about = json.loads(raster.tags().get(TAG, "{}"))
     top, below = about.get("peak_db"), about.get("noise_floor_re_peak_db")
     if top is None or below is None:
@@ -70,7 +71,7 @@ def write_linear_style(path: Path, *_: object, **__: object) -> None:
     Parameters as `write_db_style`. A style of their own also keeps QGIS from measuring the raster, and from
     writing what it measured into a mosaic or beside an image.
     """
-    with rasterio.open(_beside(path)) as raster:
+    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
         values = _few(raster)
     largest = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
     _write(path, _grey(0.0, float(f"{largest / 10 or 1.0:.3g}")))
@@ -95,7 +96,7 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
 
     Parameters as `write_db_style`.
     """
-    with rasterio.open(_beside(path)) as raster:
+    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
         values, unit = _few(raster), raster.units[0]
     low, high = _round_ends(values[np.isfinite(values)])
     told = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}

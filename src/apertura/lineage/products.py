@@ -6,7 +6,6 @@ from apertura.campaign import Campaign
 from apertura.digests import Result
 from apertura.lineage.stages import ground, heights, image, seen
 from apertura.settings import SampledWaveform
-from apertura.webmap.page import page_sha256
 
 STUDY = "study"
 """Folder of what is measured when it is asked for."""
@@ -97,7 +96,7 @@ def _map(campaign: Campaign) -> Result:
     truth = ["truth.json"] if (campaign.root / "truth.json").is_file() else []
     known = {key: campaign.values.get(key) for key in ("campaign", "calibration")}
     known["reference_points"] = campaign.values["scene"]["reference_points"]
-    return Result(campaign.manifest("map", "map"), (*made, *truth), {**known, "page": page_sha256()})
+    return Result(campaign.manifest("map", "map"), (*made, *truth), known)
 
 
 def _pictures(campaign: Campaign, flight: str, pair: str) -> Result:

@@ -1,15 +1,21 @@
 """The map of a finished campaign, ready to be served."""
 
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import lru_cache
+
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
-from apertura.errors import CampaignError
-from apertura.export import COVERAGE, product_files
-from apertura.webmap.page import DATA, FILES
-from apertura.webmap.server import PAGE, MapServer
+from apertura.documents import undamaged
+from apertura.export import MAP, product_files
+from apertura.store import manifest_of, open_listed, read_manifest
+from apertura.webmap.document import named_files
+from apertura.webmap.page import page_files
+from apertura.webmap.server import MapServer
 
 
 def served(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server of the campaign's products and of nothing else.
+    """Return a server of the campaign's map, of the products that it names and of nothing else.
 
     Parameters
     ----------
@@ -21,14 +27,38 @@ def served(campaign: Campaign, *, port: int = 0) -> MapServer:
     Raises
     ------
     CampaignError
-        If there is no map, or the port is taken.
+        If there is no map, it is not as it was written, or the port is taken.
     """
-    folder, root = campaign.results, campaign.root
-    if not campaign.result(PAGE).is_file():
-        raise CampaignError(
-            "no such file", campaign.result(PAGE), "the map of a finished campaign", f"`apertura run {root}` makes it."
-        )
-    products = product_files({flight.name: flight.pairs for flight in campaign.image_flights})
-    files = {*products, *COVERAGE, *(f"map/{name}" for name in (DATA, *FILES))}
-    results = folder.relative_to(root).as_posix()
-    return MapServer(folder, files, sha256_of=lambda name: digest_of(root, f"{results}/{name}"), port=port)
+    files = _listing(campaign)
+    files()
+    results = campaign.relative(campaign.results)
+
+    def sha256_of(name: str) -> str:
+        return digest_of(campaign.root, f"{results}/{name}")
+
+    return MapServer(campaign.results, files, page=page_files(), sha256_of=sha256_of, port=port)
+
+
+def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
+    """Return what gives file of the results → sha256: `map.json` by its manifest, and what that names.
+
+    Both are read again when the manifest is another: the workflow ran meanwhile.
+    """
+    products = frozenset(product_files({flight.name: flight.pairs for flight in campaign.image_flights}))
+
+    @lru_cache(maxsize=1)
+    def listed(*_: int) -> Mapping[str, str]:
+        path = campaign.result(MAP)
+        manifest = manifest_of(path)
+        document = open_listed(path, manifest)
+        with undamaged(path, expected="the map of a finished campaign", remedy="Run the workflow again."):
+            named = {name: sha256 for name, sha256 in named_files(document).items() if name in products}
+        return {**named, MAP: read_manifest(manifest)["files"][path.name]}
+
+    def listed_now() -> Mapping[str, str]:
+        with suppress(OSError):
+            state = manifest_of(campaign.result(MAP)).stat()
+            return listed(state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        return listed()
+
+    return listed_now

@@ -78,7 +78,7 @@ def _megabytes(campaign: Campaign, flight: str = "", of: str = "") -> float:
     """Return how much was recorded of a node, or by the nodes of a pair; 0 of what the campaign does not have."""
     flown = {each.name for each in campaign.flights} & {flight}
     nodes = campaign.settings.nodes.keys() & set(of.split("-"))
-    files = [path for name in flown for node in nodes for path in (campaign.root / "raw" / name).glob(f"{node}.*")]
+    files = [path for name in flown for node in nodes for path in campaign.flight_folder(name).glob(f"{node}.*")]
     return sum(path.stat().st_size for path in files) / 1e6
 
 

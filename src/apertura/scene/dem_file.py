@@ -15,7 +15,7 @@ from apertura.scene.geoid import carried_datum, geoid_file, grid_names
 from apertura.scene.grid import SceneGrid
 
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
-_NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
+NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
 """What in a CRS (WKT) leads PROJ to a file other than the grids in its own folders."""
 
 _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
@@ -98,7 +98,7 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
         )
         try:
             system = CRS.from_user_input(raster.crs) if raster.crs else None
-            if system and _NAMES_FILES.search(system.to_wkt()):
+            if system and NAMES_FILES.search(system.to_wkt()):
                 raise _wrong(path, "a CRS that names a file", "a CRS that is complete in itself, or names a known grid")
         except ProjError as error:
             raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error

@@ -146,5 +146,6 @@ def _near(
     """Return which places lie within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
     west, south, east, north = area_deg
     width = (east - west) % 360 or 360.0
+    longitude = np.where(np.isfinite(longitude), longitude, np.nan)  # nowhere: near nothing
     inside = (longitude - west + MARGIN_DEG) % 360 <= width + 2 * MARGIN_DEG
     return np.asarray(inside & (latitude >= south - MARGIN_DEG) & (latitude <= north + MARGIN_DEG))

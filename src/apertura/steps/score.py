@@ -13,6 +13,7 @@ from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
 from apertura.export import product_files
 from apertura.load.scene import settled_scene
+from apertura.paths import inside
 from apertura.quality.point_targets import cut_through, find_peak
 from apertura.raster import opened_raster
 from apertura.scene.grid import SceneGrid
@@ -50,7 +51,7 @@ def score(campaign: Campaign) -> list[Finding]:
     CampaignError
         If the campaign has no truth.json or no results.
     """
-    path = campaign.root / "truth.json"
+    path = inside(campaign.root, "truth.json", where=campaign.root)
     expected, remedy = "true target places", "Only simulated campaigns have them."
     document = read_json(path, expected=expected, remedy=remedy)
     with undamaged(path, expected=expected, remedy=remedy):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from apertura.campaign import Campaign
 from apertura.documents import undamaged
 from apertura.errors import shown
+from apertura.export import MAP
 from apertura.flags import FLAGS
 from apertura.lineage import INTERFEROMETRY
 from apertura.store import open_listed
@@ -75,7 +76,7 @@ def print_products(campaign: Campaign) -> None:
             print(f"  {campaign.relative(path)}  in a GIS, with its deviation beside it")
     if len(flights) > _MOST_FLIGHTS:
         print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
-    if campaign.result("map", "index.html").is_file():
+    if campaign.result(MAP).is_file():
         print(f"  all of them on a map: apertura map {shlex.quote(str(campaign.root))}")
 
 

@@ -1,4 +1,4 @@
-"""Rule `map`: a page for a browser with every image of the campaign, and what it shows."""
+"""Rule `map`: what a browser shows of every image of the campaign."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -7,30 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from apertura.atomic import write_beside, write_json
+from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.digests import digest_of
 from apertura.documents import read_json, undamaged
 from apertura.errors import CampaignError
-from apertura.export import COVERAGE, Export, exports_in
+from apertura.export import COVERAGE, MAP, Export, exports_in
 from apertura.flags import FLAGS
 from apertura.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.lineage import result_of
 from apertura.load.scene import OpenScene, settled_scene
+from apertura.paths import inside
 from apertura.raster import opened_raster
 from apertura.store import open_listed, read_manifest, record_files
 from apertura.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
-from apertura.webmap.page import DATA, page_files
-
-FOLDER = "map"
-"""Of the results, in which the page lies."""
 
 _FEW = 512  # places along a raster's longer side that its range of values is taken from
 _MOST_TARGETS = 1000
 
 
 def webmap(campaign: Campaign) -> list[Path]:
-    """Write results/map: the page and `map.json`; return their paths."""
+    """Write results/map/map.json; return its path."""
     lineage = result_of(campaign, "map").begin(campaign.root, [__name__])
     scene = settled_scene(campaign)
     images, places = [], [*_stated(campaign)]
@@ -51,13 +48,10 @@ def webmap(campaign: Campaign) -> list[Path]:
         coverage_url=None if scene.grid.crs == LOCAL else _coverage_url(campaign),
         notes=notes,
     )
-    written = [campaign.result(FOLDER, DATA)]
-    write_json(written[0], document)
-    for name, content in page_files().items():
-        written.append(campaign.result(FOLDER, name))
-        write_beside(written[-1], content)
-    record_files(campaign.root / lineage.result.manifest, written, lineage)
-    return written
+    path = campaign.result(MAP)
+    write_json(path, document)
+    record_files(campaign.root / lineage.result.manifest, [path], lineage)
+    return [path]
 
 
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
@@ -162,7 +156,7 @@ def _stated(campaign: Campaign) -> list[Place]:
 
 def _true(campaign: Campaign, scene: OpenScene, notes: list[str]) -> list[Place]:
     """Return the targets of a simulation, numbered as `apertura score` does; what cannot be read becomes a note."""
-    path = campaign.root / "truth.json"
+    path = inside(campaign.root, "truth.json", where=campaign.root)
     if not path.is_file():
         return []
     try:

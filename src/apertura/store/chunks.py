@@ -53,17 +53,28 @@ class StageStore(LocalStore):
         super().__init__(folder, read_only=read_only)
         self._sha256 = sha256 or {}
 
+    def _unlinked(self, key: str) -> str:
+        """Return a name in the folder; raise the error of damage if it leads through a link, which we never write."""
+        way = self.root
+        for part in key.split("/"):
+            way /= part
+            if way.is_symlink():
+                raise damaged(self.root, key)
+        return key
+
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
         """Return a file of the folder; `CampaignError` if it is a chunk and not what was written."""
-        return self._checked(key, await super().get(key, prototype, byte_range), byte_range)
+        return self._checked(key, await super().get(self._unlinked(key), prototype, byte_range), byte_range)
 
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
         """As `get`."""
-        return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
+        return self._checked(
+            key, super().get_sync(self._unlinked(key), prototype=prototype, byte_range=byte_range), byte_range
+        )
 
     async def set(self, key: str, value: Buffer) -> None:
         """Write a file of the folder."""

@@ -71,6 +71,8 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         If it is no manifest.
     """
     expected, remedy = "a manifest as the workflow wrote it", f"Delete {manifest} and run the workflow again."
+    if manifest.is_symlink():
+        raise CampaignError("a symbolic link", manifest, expected, remedy)
     document = read_json(manifest, expected=expected, remedy=remedy)
     with undamaged(manifest, expected=expected, remedy=remedy):
         for hashes in (document["files"], document.get("sources", {})):

@@ -74,7 +74,8 @@ def _take(lock: IO[str], folder: Path, wip: Path) -> None:
     manifest_of(folder).unlink(missing_ok=True)
     if folder.is_dir() and not wip.exists():
         lock.seek(0)
-        if lock.read() == canonical_json(sha256_tree(folder)):
+        linked = any(path.is_symlink() for path in folder.rglob("*"))  # none of ours: not even hashed
+        if not linked and lock.read() == canonical_json(sha256_tree(folder)):
             folder.rename(wip)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from apertura.atomic import replacement
+from apertura.errors import CampaignError
 
 Row = TypeVar("Row")
 
@@ -44,6 +45,11 @@ def _record(row: Any, digits: int | None) -> Mapping[str, object]:
 def read_table(path: Path, kind: type[Row]) -> list[Row]:
     """Return the rows of a file of `write_table`, each a dataclass `kind` with fields of str, int and float.
 
+    Raises
+    ------
+    CampaignError
+        If it is not there.
+
     Examples
     --------
     >>> from dataclasses import dataclass
@@ -57,6 +63,8 @@ def read_table(path: Path, kind: type[Row]) -> list[Row]:
     ...     read_table(Path(folder) / "losses.csv", Loss)
     [Loss(cause='timing', loss_db=1.5)]
     """
+    if not path.is_file():
+        raise CampaignError("no such file", path, "the rows of a study", "Run the command that writes it first.")
     types = get_type_hints(kind)
     convert = {field.name: types[field.name] for field in fields(kind)}  # type: ignore[arg-type]
     with path.open(encoding="utf-8", newline="") as stream:

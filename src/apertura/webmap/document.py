@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 from urllib.parse import quote
 
+from apertura.webmap.requests import asked_file
+
 FORMAT = 1
 """Of `map.json`; the page refuses another."""
 
@@ -118,6 +120,27 @@ def url_of(file: str, sha256: str) -> str:
     '../f%201/a-b/db.tif?sha256=0f'
     """
     return f"../{quote(file)}?sha256={sha256}"
+
+
+def named_files(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return file of the results → sha256, of those that a `map.json` names; none where no page reads its format.
+
+    Parameters
+    ----------
+    document
+        Of `map_document`.
+
+    Examples
+    --------
+    >>> layer = {"url": url_of("f 1/a-b/db.tif", "0f")}
+    >>> named_files({"format": FORMAT, "images": [{"layers": [layer]}], "coverage_url": None})
+    {'f 1/a-b/db.tif': '0f'}
+    """
+    if document["format"] != FORMAT:
+        return {}
+    urls = [layer["url"] for image in document["images"] for layer in image["layers"]]
+    asked = (asked_file(url.removeprefix("..")) for url in (*urls, document["coverage_url"]) if url is not None)
+    return {name: sha256 for name, sha256 in asked if sha256 is not None}
 
 
 def map_document(

@@ -4,7 +4,10 @@ import re
 from urllib.parse import parse_qs, unquote, urlsplit
 
 LOOPBACK = "127.0.0.1"
-"""The only address that the map is served on."""
+"""The only address that is listened on, and the name under which the map and its data are answered."""
+
+WINDOW = "localhost"
+"""The name under which the window around the map is answered: to a browser, another origin."""
 
 _RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
 
@@ -13,8 +16,8 @@ class UnsatisfiableRangeError(ValueError):
     """No byte of the file is asked for."""
 
 
-def is_own_host(hosts: list[str], port: int) -> bool:
-    """Return whether a request names this server: a page of another name that leads here (DNS rebinding) does not.
+def own_host(hosts: list[str], port: int) -> str | None:
+    """Return which name of this server a request says; None for another that leads here (DNS rebinding).
 
     Parameters
     ----------
@@ -25,10 +28,11 @@ def is_own_host(hosts: list[str], port: int) -> bool:
 
     Examples
     --------
-    >>> is_own_host(["localhost:8000"], 8000), is_own_host(["evil.example:8000"], 8000), is_own_host([], 8000)
-    (True, False, False)
+    >>> own_host(["Localhost:8000"], 8000), own_host(["evil.example:8000"], 8000), own_host([], 8000)
+    ('localhost', None, None)
     """
-    return len(hosts) == 1 and hosts[0].lower() in {f"{name}:{port}" for name in (LOOPBACK, "localhost")}
+    names = {f"{name}:{port}": name for name in (LOOPBACK, WINDOW)}
+    return names.get(hosts[0].lower()) if len(hosts) == 1 else None
 
 
 def asked_file(target: str) -> tuple[str, str | None]:

@@ -1,35 +1,24 @@
-"""The results of one campaign on this machine alone: the files that are listed, by ranges of bytes, read only."""
+"""The map of one campaign on this machine alone: our page, and files that are listed with their hashes; read only."""
 
 import os
 import stat
 import sys
 import webbrowser
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from apertura.errors import CampaignError
 from apertura.paths import inside
 from apertura.signals import Interrupted
-from apertura.webmap.requests import LOOPBACK, UnsatisfiableRangeError, asked_bytes, asked_file, is_own_host
+from apertura.webmap.page import FILES, SHELL
+from apertura.webmap.policy import headers_of
+from apertura.webmap.requests import LOOPBACK, WINDOW, UnsatisfiableRangeError, asked_bytes, asked_file, own_host
 
-PAGE = "map/index.html"
-"""Where a browser begins."""
-
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-    "worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-_HEADERS = {
-    "Content-Security-Policy": _POLICY,
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-cache",
-}
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -37,23 +26,25 @@ _TYPES = {
     ".json": "application/json",
     ".geojson": "application/geo+json",
     ".tif": "image/tiff",
-    ".png": "image/png",
 }
 _AT_ONCE = 1 << 16
 _IDLE_S = 60.0
 
 
 class MapServer(ThreadingHTTPServer):
-    """A server of some files of a folder.
+    """A server of a page and of some files of a folder.
 
     Parameters
     ----------
     folder
         The results.
     files
-        Names below it that are served, with slashes; no other is.
+        Gives the names below it that are served, with slashes, and the hash that each has to have; no other file is.
+        Asked for every request; CampaignError where nobody knows.
+    page
+        Of `apertura.webmap.page.page_files`.
     sha256_of
-        Gives the hash of a file as it is now; asked where a request says which one it means.
+        Gives the hash of a file as it is now.
     port
         To listen on; 0 for a free one.
 
@@ -64,26 +55,35 @@ class MapServer(ThreadingHTTPServer):
 
     Examples
     --------
-    >>> with MapServer(Path("results"), ["map/index.html"], sha256_of=str) as server:
-    ...     server.url.startswith("http://127.0.0.1:")
+    >>> with MapServer(Path("results"), dict, page={}, sha256_of=str) as server:
+    ...     server.url.startswith("http://localhost:")
     True
     """
 
     daemon_threads = True
 
-    def __init__(self, folder: Path, files: Collection[str], *, sha256_of: Callable[[str], str], port: int = 0) -> None:
-        self.folder, self.files, self.sha256_of = folder, frozenset(files), sha256_of
+    def __init__(
+        self,
+        folder: Path,
+        files: Callable[[], Mapping[str, str]],
+        *,
+        page: Mapping[str, bytes],
+        sha256_of: Callable[[str], str],
+        port: int = 0,
+    ) -> None:
+        self.folder, self.files, self.sha256_of = folder, files, sha256_of
+        self.pages = {
+            WINDOW: {name: content for name, content in page.items() if name in SHELL},
+            LOOPBACK: {f"map/{name}": content for name, content in page.items() if name in FILES},
+        }
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
             raise CampaignError(
                 f"port {port}: {error.strerror}", "apertura map", "a free port", "Choose another --port, or none."
             ) from error
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return f"http://{LOOPBACK}:{self.server_port}/{PAGE}"
+        self.url = f"http://{WINDOW}:{self.server_port}/"
+        self.headers = headers_of(self.server_port)
 
     def show(self, *, in_browser: bool = False) -> None:
         """Print the address, open it if that is wanted, and serve until a signal ends it."""
@@ -107,6 +107,7 @@ class _Handler(BaseHTTPRequestHandler):
     error_content_type = "text/plain; charset=utf-8"
     error_message_format = "%(code)d %(message)s\n"
     server: MapServer
+    host = LOOPBACK
 
     def do_GET(self) -> None:
         self._answer()
@@ -125,19 +126,35 @@ class _Handler(BaseHTTPRequestHandler):
         self._say(HTTPStatus.METHOD_NOT_ALLOWED, "the map is only read", Allow="GET, HEAD")
 
     def _answer(self) -> None:
-        if not is_own_host(self.headers.get_all("Host", []), self.server.server_port):
+        host = own_host(self.headers.get_all("Host", []), self.server.server_port)
+        if host is None:
             self._say(HTTPStatus.FORBIDDEN, "this server has another name")
             return
-        name, expected = asked_file(self.path)
-        if name == "" and self.path == "/":
-            self._say(HTTPStatus.FOUND, "the map", Location=f"/{PAGE}")
+        self.host = host
+        opened = self.path in {"/", "/map/"} or self.headers.get("Sec-Fetch-Dest") == "document"
+        if opened and host == LOOPBACK:  # by a reader, and not as the frame
+            self._say(HTTPStatus.FOUND, "the map", Location=self.server.url)
             return
-        file = self._opened(name) if name in self.server.files else None
+        name, expected = (SHELL[0], None) if self.path == "/" else asked_file(self.path)
+        if name in self.server.pages[host]:
+            self._send(BytesIO(self.server.pages[host][name]), name)
+        elif host == LOOPBACK:
+            self._answer_file(name, expected)
+        else:
+            self._say(HTTPStatus.NOT_FOUND, "only the window around the map")
+
+    def _answer_file(self, name: str, expected: str | None) -> None:
+        try:
+            sha256 = self.server.files().get(name)
+        except CampaignError as error:
+            self._say(HTTPStatus.CONFLICT, str(error))
+            return
+        file = None if sha256 is None else self._opened(name)
         if file is None:
             self._say(HTTPStatus.NOT_FOUND, "no product of this campaign")
             return
         with file:
-            if expected is not None and not self._is(file, name, expected):
+            if expected not in {None, sha256} or not self._is(file, name, sha256):
                 self._say(HTTPStatus.CONFLICT, "changed since the map was made: run the workflow again")
                 return
             self._send(file, name)
@@ -152,7 +169,7 @@ class _Handler(BaseHTTPRequestHandler):
             file.close()
         return None
 
-    def _is(self, file: BinaryIO, name: str, sha256: str) -> bool:
+    def _is(self, file: BinaryIO, name: str, sha256: str | None) -> bool:
         """Return whether an open file has the hash; products are replaced as a whole, so it is asked of its path."""
         with suppress(OSError, CampaignError):
             same = self.server.sha256_of(name) == sha256
@@ -160,7 +177,7 @@ class _Handler(BaseHTTPRequestHandler):
         return False
 
     def _send(self, file: BinaryIO, name: str) -> None:
-        size = os.fstat(file.fileno()).st_size
+        size = file.seek(0, os.SEEK_END)
         try:
             part = asked_bytes(self.headers.get("Range"), size)
         except UnsatisfiableRangeError:
@@ -196,7 +213,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def end_headers(self) -> None:
-        for name, value in _HEADERS.items():
+        for name, value in self.server.headers[self.host].items():
             self.send_header(name, value)
         super().end_headers()
 
