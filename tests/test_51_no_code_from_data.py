@@ -116,6 +116,10 @@ PART = "--until profile"
 SOON = "--set-scatter tiles=1 --latency-wait 2 --slurm-init-seconds-before-status-checks 1"
 
 
+def slow(*cases):
+    return [pytest.param(case, marks=pytest.mark.slow) for case in cases]
+
+
 def leaves():
     """Every command there is, as it is typed."""
     commands = get_command(app).commands
@@ -185,7 +189,7 @@ def test_a_marker_that_is_run_or_opened_is_seen(unfinished, tmp_path):
 
 
 def every_command():
-    return [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in leaves()]
+    return [*QUICK, *slow(*(name for name in leaves() if name not in QUICK))]
 
 
 def test_every_command_is_tried():
@@ -267,17 +271,19 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
     "words",
     [
         "--profile profiles/own",
-        "--profile=./profiles/slurm",
-        "--profile {campaign}/profiles/slurm",
-        "--prof {campaign}/profiles/slurm",
-        "--profile {campaign}/../campaign/profiles/slurm/config.yaml",
         "--profile {linked}",
-        "--workflow-profile {campaign}/profiles/default",
-        "--workflow-profile=profiles/none",
-        "--configfile {campaign}/config.yaml",
-        "--snakefile Snakefile",
-        "-s {campaign}/Snakefile",
-        "--jobscript {campaign}/bash",
+        *slow(
+            "--profile=./profiles/slurm",
+            "--profile {campaign}/profiles/slurm",
+            "--prof {campaign}/profiles/slurm",
+            "--profile {campaign}/../campaign/profiles/slurm/config.yaml",
+            "--workflow-profile {campaign}/profiles/default",
+            "--workflow-profile=profiles/none",
+            "--configfile {campaign}/config.yaml",
+            "--snakefile Snakefile",
+            "-s {campaign}/Snakefile",
+            "--jobscript {campaign}/bash",
+        ),
     ],
 )
 def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, words):
@@ -438,7 +444,9 @@ def test_text_that_is_only_a_title_is_only_a_title_in_every_product(unfinished):
     assert status in {0, 2}, said
 
 
-@pytest.mark.parametrize("name", ["PROJ nadgrids", "PROJ init", "PROJ geoidgrids", "PROJ text", "a code of PROJ"])
+@pytest.mark.parametrize(
+    "name", ["PROJ nadgrids", *slow("PROJ init", "PROJ geoidgrids", "PROJ text", "a code of PROJ")]
+)
 def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinished, name):
     planted = plant(unfinished)
     edit_config(unfinished, lambda config: config["scene"].update(crs=hostile_texts(planted)[name]))
@@ -448,7 +456,7 @@ def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinishe
     assert "scene" in said
 
 
-@pytest.mark.parametrize("what", ["config", "raw", "log", "results", "records", "chunk"])
+@pytest.mark.parametrize("what", ["chunk", *slow("config", "raw", "log", "results", "records")])
 def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(finished, tmp_path, what):
     planted = plant(finished)
     behind = {

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from apertura.errors import CampaignError
-from apertura.paths import inside
 from apertura.provenance import sha256_file
 from apertura.settings import CONFIG
 from apertura.store import manifest_of, read_manifest
@@ -72,7 +71,10 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
 def unlinked(path: Path) -> Path:
     """Return a path; raise CampaignError if it leads through a link of the campaign that it lies in."""
     results = next((folder for folder in path.parents if folder.name == "results"), None)
-    return path if results is None else inside(results.parent, path.relative_to(results.parent).as_posix(), where=path)
+    for way in (path, *path.parents) if results is not None else ():
+        if way.is_relative_to(results) and way.is_symlink():
+            raise CampaignError("a symbolic link", way, "what the workflow wrote", "Name what it leads to.")
+    return path
 
 
 def _manifest(results: Path, path: Path) -> str:
