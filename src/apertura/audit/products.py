@@ -71,8 +71,8 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
 def unlinked(path: Path) -> Path:
     """Return a path; raise CampaignError if it leads through a link of the campaign that it lies in."""
     results = next((folder for folder in path.parents if folder.name == "results"), None)
-    for way in (path, *path.parents) if results is not None else ():
-        if way.is_relative_to(results) and way.is_symlink():
+    for way in (path, *path.parents):
+        if results is not None and way.is_relative_to(results) and way.is_symlink():
             raise CampaignError("a symbolic link", way, "what the workflow wrote", "Name what it leads to.")
     return path
 
