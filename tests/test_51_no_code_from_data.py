@@ -389,7 +389,7 @@ UNUSED = {
     ("nodes", "*", "log", "body"),
     ("processing", "scheduler"),
 }
-"""Keys that take any text: a title, what other formats of logs need, and what counts only if the environment says it."""
+"""Keys that take any text: a title, what other formats of logs need, what counts only if the environment says it."""
 
 IN_ONE_PROCESS = """
 import sys, traceback, yaml
