@@ -24,7 +24,7 @@ WAYS = [pytest.param(True, marks=compiled, id="compiled"), pytest.param(False, i
 def way(request, monkeypatch):
     """Both ways in which contributions are computed, one after the other."""
     if not request.param:
-        monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+        monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
 
 
 def exact(block: slice) -> np.ndarray:
@@ -63,7 +63,7 @@ def test_every_instruction_set_adds_what_numpy_adds(isa, monkeypatch):
     monkeypatch.setenv("APERTURA_ISA", isa)
     weights = np.random.default_rng(1).uniform(0, 1, PULSES)
     fast = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     slow = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
     assert decibels(fast - slow, slow) < -115
 

@@ -99,7 +99,7 @@ def test_a_device_is_taken_for_large_images_and_not_for_small_ones(monkeypatch):
 def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
     """Nor where it alone would come near an accuracy: what costs more than the double sum is worth nothing."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     monkeypatch.setattr(cuda, "available", lambda: True)
     job = planning_job()
     (double_sum,) = load_engine("reference").candidates(job, pulses=300, asked={})

@@ -36,7 +36,7 @@ STEP_M = 1e-4
 def way(request, monkeypatch):
     """Both ways in which gradients are computed, one after the other."""
     if not request.param:
-        monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+        monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
 
 
 def added(profiles):
@@ -120,7 +120,7 @@ def test_every_instruction_set_gives_what_numpy_gives(isa, monkeypatch):
     monkeypatch.setattr("apertura.focus.echoes._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
     monkeypatch.setattr("apertura.focus.echoes._VALUES_AT_ONCE", 33 * 50)
     fast = path_gradient(PROFILES, PLACES, slope, beams=beams)
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     slow = path_gradient(PROFILES, PLACES, slope, beams=beams)
     for side in (*SIDES, "path_m"):
         one, other = getattr(fast, side), getattr(slow, side)

@@ -23,7 +23,7 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch):
 
 
 def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     assert not native.available()
     with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
         native.instruction_set()

@@ -134,7 +134,7 @@ def test_an_accuracy_beyond_every_table_is_left_to_the_double_sum():
 def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was_not(monkeypatch):
     assert plan(shape=(100, 100)).engine == "native"
     assert plan(shape=(4000, 4000), overrides={"presum": 1}).engine == "tree"
-    monkeypatch.setenv("APERTURA_KERNEL", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     assert plan().engine == "numba"
     with pytest.raises(CampaignError, match=r"cannot run here.* a C\+\+ compiler"):
         plan(overrides={"engine": "native"})

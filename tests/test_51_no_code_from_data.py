@@ -78,7 +78,7 @@ TYPED = {
 }
 """Command → what is typed in the campaign folder, where that is more than the command."""
 
-MAY_REFUSE = {"align", "step calibrate", "step interferogram", "step page", "step whole-chart"}
+MAY_REFUSE = {"align", "step calibrate", "step interferogram", "step page"}
 """Commands that ask for what such a campaign does not have."""
 
 QUICK = ("check", "init", "plan", "step scene")
@@ -283,18 +283,53 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
             "--configfile {campaign}/config.yaml",
             "--snakefile Snakefile",
             "-s {campaign}/Snakefile",
+            "-s{campaign}/Snakefile",
+            "-ns{campaign}/Snakefile",
+            "-ns {campaign}/Snakefile",
+            "--sn {campaign}/Snakefile",
+            "--pro {campaign}/profiles/slurm",
+            "--wo={campaign}/profiles/slurm",
             "--jobscript {campaign}/bash",
+            "--jobsc {campaign}/bash",
+            "--profile leads_out/slurm",
+            "--profile {campaign}/none/../leads_out/slurm",
         ),
     ],
 )
 def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, words):
     planted, linked = plant(unfinished), tmp_path / "linked"
     linked.symlink_to(unfinished / "profiles" / "slurm")
+    shutil.copytree(unfinished / "profiles", tmp_path / "profiles")
+    (unfinished / "leads_out").symlink_to(tmp_path / "profiles")
     words = shlex.split(words.format(campaign=unfinished, linked=linked))
     with planted.fires() as fired:
         said = one_message(*run([BIN / "apertura", "run", ".", "-n", *words], unfinished))
     assert fired == []
     assert "lies in the campaign folder" in said
+
+
+def test_a_profile_of_the_environment_is_one_of_the_command_line(unfinished):
+    planted = plant(unfinished)
+    with planted.fires() as fired:
+        said = one_message(*run([BIN / "apertura", "run", ".", "-n"], unfinished, SNAKEMAKE_PROFILE="./profiles/slurm"))
+    assert fired == []
+    assert "SNAKEMAKE_PROFILE ./profiles/slurm lies in the campaign folder" in said
+
+
+@pytest.mark.parametrize("option", ["--trust-io-cache", *slow("--tr")])
+def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
+    planted, cache = plant(unfinished), unfinished / ".snakemake" / "iocache"
+    cache.mkdir(parents=True, exist_ok=True)
+    (cache / "latest.pkl").write_bytes(pickle.dumps(Code(planted.code("iocache"))))
+    with planted.fires() as fired:
+        said = one_message(*run([BIN / "apertura", "run", ".", "-n", option], unfinished))
+    assert fired == []
+    assert "reads a pickle of the campaign folder" in said
+
+
+def test_a_short_option_of_snakemake_reaches_it_letter_for_letter(unfinished):
+    _, said = run([BIN / "apertura", "run", ".", "-s/review/quiet"], unfinished)
+    assert "/review/quiet" in said
 
 
 def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere_are_found(unfinished, tmp_path):
@@ -566,7 +601,7 @@ def with_sum(text):
 
 
 ENVIRONMENT = {
-    "APERTURA_KERNEL": ["/etc/passwd"],
+    "APERTURA_KERNEL": ["/etc/passwd", "/nowhere/_backprojection.so", "_backprojection.so"],
     "APERTURA_ISA": ["z80"],
     "PYTHONIOENCODING": ["ascii", "latin-1:strict"],
     "COLUMNS": ["x", "-1"],
@@ -589,7 +624,7 @@ ENVIRONMENT = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in ENVIRONMENT.items() for value in values])
-@pytest.mark.parametrize("words", ["plan .", "run . -n"])
+@pytest.mark.parametrize("words", ["plan .", "run . -n", "step pictures f01 uav1-uav2"])
 def test_a_setting_of_the_environment_changes_nothing_or_is_one_message(finished, name, value, words):
     status, said = run([BIN / "apertura", *words.split()], finished, **{name: value})
     assert "Traceback" not in said

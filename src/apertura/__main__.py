@@ -2,10 +2,19 @@
 
 import os
 import sys
+from pathlib import Path
+from typing import NoReturn
 
 from apertura.isolation import leave_working_folder
 
-_ENCODING = "PYTHONIOENCODING"
+_ENCODING, _BACKEND = "PYTHONIOENCODING", "MPLBACKEND"
+_PROJ = ("PROJ_DATA", "PROJ_LIB")
+"""Environment variables: folders of PROJ's tables, for pyproj and for GDAL."""
+
+
+def _refuse(message: str) -> NoReturn:
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 def main() -> None:
@@ -13,12 +22,16 @@ def main() -> None:
     try:
         leave_working_folder()
     except OSError as error:
-        print(f"error: the working folder: {error.strerror}. Go to a folder that exists.", file=sys.stderr)
-        sys.exit(2)
+        _refuse(f"the working folder: {error.strerror}. Go to a folder that exists.")
+    for name in _PROJ:
+        folders = list(filter(None, os.environ.get(name, "").split(os.pathsep)))
+        if folders and not any(Path(folder, "proj.db").is_file() for folder in folders):
+            _refuse(f"environment variable {name}: no proj.db in {os.pathsep.join(folders)}. Unset it.")
     # What a terminal cannot show is escaped, here and in every step: names and signs of others are no reason to fail.
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     os.environ[_ENCODING] = f"{os.environ.get(_ENCODING, '').partition(':')[0]}:backslashreplace"
+    os.environ[_BACKEND] = "agg"  # pictures are files; a backend of the caller's may be none that is here
     from apertura.cli import main as run
 
     run()

@@ -7,9 +7,10 @@ import os
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from apertura import __version__, product_commands, raw_commands
 from apertura.atlas.commands import app as study
@@ -42,6 +43,16 @@ HERE = Path()
 ALL_CORES = os.cpu_count() or 1
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are not known go to snakemake."""
+
+
+class _PassesOn(TyperCommand):
+    """A command whose unknown options go to snakemake."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take options and values apart: of `-sFILE`, click would take each letter that is an option of ours."""
+        from apertura.workflow import apart
+
+        return super().parse_args(ctx, [word for one in args for word in apart(one)])
 
 
 def _opened(campaign: Path) -> "Campaign":
@@ -109,7 +120,7 @@ def _options(
     pass
 
 
-@app.command(context_settings=PASS_ON)
+@app.command(cls=_PassesOn, context_settings=PASS_ON)
 def run(
     context: typer.Context,
     campaign: CampaignFolder,

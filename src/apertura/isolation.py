@@ -6,6 +6,7 @@ one.
 """
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -76,4 +77,5 @@ def as_typed(text: object) -> str:
     >>> as_typed(Path.cwd() / "campaign" / "results"), as_typed(f"{Path.cwd()}/a: no such file")
     ('campaign/results', 'a: no such file')
     """
-    return str(text).replace(f"{started()}{os.sep}", "")
+    folder = str(started())
+    return str(text) if folder == os.sep else re.sub(rf"(?<![\w./-]){re.escape(folder)}{os.sep}", "", str(text))

@@ -38,8 +38,15 @@ _LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
-_HOLDS_CODE = ("--prof", "--workflow-p", "--configf", "--snakefile", "-s", "--jobscript", "--js")
-"""How options of snakemake begin that name files which it takes code from; it knows them by their beginnings, too."""
+_HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
+"""Options of snakemake that name files which it takes code from; it knows them by their beginnings, too."""
+_HOLDS_NONE = ("--config", "--jobs")
+_PICKLED = "--trust-io-cache"
+"""Option of snakemake: read what it knows of the folder's files from a pickle in that folder."""
+_SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
+"""Short options that take no value, `-s`, which is `--snakefile`, and its value where it is written without a space."""
+_PROFILE = "SNAKEMAKE_PROFILE"
+"""Environment variable: the profile where the command line names none."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _LOG = "snakemake.log"
 
@@ -107,6 +114,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     """
     elsewhere = _runs_elsewhere(arguments)
     options = code_from_outside(root, arguments)
+    if _PROFILE in os.environ:
+        os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
     if elsewhere:
         check_shell_name(root.absolute())
     if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
@@ -217,14 +226,41 @@ def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
     >>> options[:2], Path(options[2]) == shipped() / "profiles" / "slurm"
     (['-n', '--profile'], True)
     """
-    found = [word for one in arguments for word in (one.split("=", 1) if one.startswith("--") else [one])]
+    found = [word for one in arguments for word in apart(one)]
     option = ""
     for at, word in enumerate(found):
         if word.startswith("-"):
             option = word
-        elif option.startswith(_HOLDS_CODE):
+            _refuse_pickled(option)
+        elif _SHORT.fullmatch(option) or (
+            option not in _HOLDS_NONE and any(name.startswith(option) for name in _HOLDS_CODE)
+        ):
             found[at] = _whole(root, option, word)
     return found
+
+
+def apart(argument: str) -> list[str]:
+    """Return an option and its value, where they are written as one word.
+
+    Examples
+    --------
+    >>> apart("--profile=mine"), apart("-np"), apart("-nsmine")
+    (['--profile', 'mine'], ['-np'], ['-ns', 'mine'])
+    """
+    short = _SHORT.fullmatch(argument)
+    if short:
+        return [word for word in short.groups() if word]
+    return argument.split("=", 1) if argument.startswith("--") else [argument]
+
+
+def _refuse_pickled(option: str) -> None:
+    if len(option) > len("--t") and _PICKLED.startswith(option):
+        raise CampaignError(
+            f"{option}: Snakemake then reads a pickle of the campaign folder, which may hold code",
+            "apertura run",
+            "options that take data alone from the folder",
+            "Leave it out.",
+        )
 
 
 def _whole(root: Path, option: str, name: str) -> str:
@@ -234,7 +270,8 @@ def _whole(root: Path, option: str, name: str) -> str:
         return str(ours)
     if not theirs.exists():
         return name
-    if any(way.is_relative_to(root.resolve()) for way in (theirs.resolve(), theirs.parent.resolve())):
+    typed = Path(os.path.normpath(theirs))  # through a link in the folder, too: who makes that says where it leads
+    if any(way.resolve().is_relative_to(root.resolve()) for way in (theirs, typed, *typed.parents)):
         raise CampaignError(
             f"{option} {name} lies in the campaign folder",
             "apertura run",
@@ -247,7 +284,7 @@ def _whole(root: Path, option: str, name: str) -> str:
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
     """Return whether steps run on other machines than this one."""
     named = any(argument.startswith(("--exec", "--prof", "-e")) for argument in arguments)
-    return named or "SNAKEMAKE_PROFILE" in os.environ
+    return named or _PROFILE in os.environ
 
 
 def _supervised(

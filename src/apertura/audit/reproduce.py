@@ -89,19 +89,28 @@ def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
     root = campaign.root
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="apertura-reproduce-") as folder:
-            yield _with_inputs(campaign, Path(folder, root.name), link=True)
+            yield with_inputs(campaign, Path(folder, root.name), link=True)
         return
     if keep.is_relative_to(root) or keep.is_symlink() or (keep.exists() and not keep.is_dir()):
         raise CampaignError("cannot be made again there", keep, "a new folder outside the campaign", "Name another.")
     if keep.is_dir() and any(keep.iterdir()):
         raise CampaignError("not empty", keep, "a new folder", "Name another; nothing was changed.")
-    yield _with_inputs(campaign, keep, link=False)
+    yield with_inputs(campaign, keep, link=False)
 
 
-def _with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
-    """Fill a folder with what a campaign's results are made from; recordings as hard links where that is possible.
+def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
+    """Fill a folder with what a campaign's results are made from; return it.
 
     What stays is copied: who edits it later must not edit the recordings of the campaign.
+
+    Parameters
+    ----------
+    campaign
+        Of whose folder plain files are taken: those of config/ and raw/, and others that its configuration names.
+    target
+        The folder, made where it is missing.
+    link
+        Give recordings as hard links where that is possible.
     """
     sources = {source for _, result in results_of(campaign) for source in result.sources}
     named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_WHOLE}]

@@ -129,12 +129,24 @@ def call(function: str, job: ctypes.Structure) -> None:
 
 
 def library_path() -> Path:
-    """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers."""
-    return Path(os.environ.get(NAMED_BY) or _BUILT)
+    """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers.
+
+    Raises
+    ------
+    CampaignError
+        If APERTURA_KERNEL names no file, or a relative path: every process has a working folder of its own.
+    """
+    named = os.environ.get(NAMED_BY)
+    if not named:
+        return Path(_BUILT)
+    if not (Path(named).is_absolute() and Path(named).is_file()):
+        raise _no_kernel(named, "no such file" if Path(named).is_absolute() else "a relative path")
+    return Path(named)
 
 
 def _no_kernel(named: str, found: str) -> CampaignError:
-    where, expected = f"environment variable {NAMED_BY}", "a library built from native/ of this version"
+    where = f"environment variable {NAMED_BY}"
+    expected = "the whole path of a library built from native/ of this version"
     return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset it.")
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from apertura.audit.reproduce import with_inputs
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.lineage import STUDY, result_of
@@ -61,7 +62,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
         is not counted, opens libraries and files.
     """
     lineage = result_of(campaign, "whole").begin(campaign.root, [__name__])
-    work = campaign.result(STUDY) / "whole"
+    work = with_inputs(campaign, campaign.result(STUDY) / "whole", link=False)
     choices = {
         name: _chosen(campaign, work, changes) for name, changes in _SETTINGS.items() if _applies(campaign, name)
     }
@@ -92,16 +93,7 @@ def _applies(campaign: Campaign, name: str) -> bool:
 
 
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
-    """Return the campaign with changed settings, its inputs copied into another folder: no link leads out of one."""
-    work.mkdir(parents=True, exist_ok=True)
-    for path in campaign.root.resolve().iterdir():
-        if (
-            path.is_dir()
-            and not path.name.startswith(".")
-            and path.name != "results"
-            and not (work / path.name).exists()
-        ):
-            shutil.copytree(path, work / path.name, copy_function=shutil.copyfile)
+    """Return the campaign with changed settings, in another folder."""
     processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
     return replace(campaign, root=work, settings=campaign.settings.model_copy(update={"processing": processing}))
 
