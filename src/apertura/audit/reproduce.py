@@ -1,7 +1,5 @@
 """`apertura reproduce`: a product made again from the raw samples elsewhere, and compared byte for byte."""
 
-import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -12,13 +10,11 @@ from apertura.audit.products import find_product
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError, shown
 from apertura.lineage import on_demand, results_of
+from apertura.lineage.inputs import with_inputs
 from apertura.lock import holder
 from apertura.paths import inside
 from apertura.store import read_manifest
 from apertura.workflow import run_workflow
-
-_WHOLE = ("config", "raw")
-"""Folders of a campaign that are inputs with all that is in them."""
 
 _LINES = 8
 _LONGEST = 400
@@ -96,38 +92,6 @@ def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
     if keep.is_dir() and any(keep.iterdir()):
         raise CampaignError("not empty", keep, "a new folder", "Name another; nothing was changed.")
     yield with_inputs(campaign, keep, link=False)
-
-
-def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
-    """Fill a folder with what a campaign's results are made from; return it.
-
-    What stays is copied: who edits it later must not edit the recordings of the campaign.
-
-    Parameters
-    ----------
-    campaign
-        Of whose folder plain files are taken: those of config/ and raw/, and others that its configuration names.
-    target
-        The folder, made where it is missing.
-    link
-        Give recordings as hard links where that is possible.
-    """
-    sources = {source for _, result in results_of(campaign) for source in result.sources}
-    named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_WHOLE}]
-    for path in sorted({*named, *(path for folder in _WHOLE for path in (campaign.root / folder).rglob("*"))}):
-        if path.is_file() and not path.is_symlink():
-            here = path.relative_to(campaign.root)
-            (target / here).parent.mkdir(parents=True, exist_ok=True)
-            _put(path, target / here, link=link and here.parts[0] == "raw")
-    return target
-
-
-def _put(path: Path, target: Path, *, link: bool) -> None:
-    if link:
-        with suppress(OSError):  # another disk, or a file of somebody else's
-            os.link(path, target)
-            return
-    shutil.copy2(path, target)
 
 
 def compared(root: Path, again: Path, manifest: str) -> list[str]:

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from apertura.audit.reproduce import with_inputs
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.lineage import STUDY, result_of
+from apertura.lineage.inputs import with_inputs
 from apertura.settings import Flight, SampledWaveform
 from apertura.steps import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene, terrain
 from apertura.store import record_files
