@@ -332,6 +332,13 @@ def test_a_short_option_of_snakemake_reaches_it_letter_for_letter(unfinished):
     assert "/review/quiet" in said
 
 
+def test_a_target_that_is_there_stays_the_name_that_rules_know(finished):
+    target = "results/f01/uav1-uav1/export.manifest.json"
+    for words in ([target, "-n"], ["-n", "--", target]):
+        status, said = run([BIN / "apertura", "run", ".", *words], finished)
+        assert status == 0, said
+
+
 def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere_are_found(unfinished, tmp_path):
     planted, own = plant(unfinished), tmp_path / "elsewhere" / "mine"
     own.mkdir(parents=True)

@@ -232,9 +232,7 @@ def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
         if word.startswith("-"):
             option = word
             _refuse_pickled(option)
-        elif _SHORT.fullmatch(option) or (
-            option not in _HOLDS_NONE and any(name.startswith(option) for name in _HOLDS_CODE)
-        ):
+        elif _holds_code(option):
             found[at] = _whole(root, option, word)
     return found
 
@@ -251,6 +249,13 @@ def apart(argument: str) -> list[str]:
     if short:
         return [word for word in short.groups() if word]
     return argument.split("=", 1) if argument.startswith("--") else [argument]
+
+
+def _holds_code(option: str) -> bool:
+    """Return whether the value of an option, perhaps abbreviated, is a file that snakemake takes code from."""
+    if not option.startswith("--"):
+        return _SHORT.fullmatch(option) is not None
+    return option not in ("--", *_HOLDS_NONE) and any(name.startswith(option) for name in _HOLDS_CODE)
 
 
 def _refuse_pickled(option: str) -> None:
