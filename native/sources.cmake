@@ -1,11 +1,19 @@
-# Writes the sha256 of the kernel's sources to OUTPUT, for the hash of the code that makes images.
+# Writes the sha256 of what the compiler reads of the kernel's sources to OUTPUT, for the hash of the code that makes
+# images: comments and empty lines do not count.
 file(GLOB sources ${FOLDER}/native/*.cpp ${FOLDER}/native/*.hpp)
 list(SORT sources)
 list(APPEND sources ${FOLDER}/CMakeLists.txt)
 set(digests "")
 foreach(source IN LISTS sources)
-  file(SHA256 ${source} digest)
+  file(READ ${source} text)
   get_filename_component(name ${source} NAME)
+  if(name STREQUAL "CMakeLists.txt")
+    string(REGEX REPLACE "#[^\n]*" "" text "${text}")
+  else()
+    string(REGEX REPLACE "//[^\n]*" "" text "${text}")
+  endif()
+  string(REGEX REPLACE "[ \t]*\n[ \t\n]*" "\n" text "${text}")
+  string(SHA256 digest "${text}")
   string(APPEND digests "${digest}  ${name}\n")
 endforeach()
 file(WRITE ${OUTPUT} "${digests}")

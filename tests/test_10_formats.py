@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, TRACKS, read_track
+from apertura.ingest import read_track
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import LogOptions
+from apertura.ingest.names import PHASE_HISTORIES, TRACKS
 from apertura.ingest.real_samples import EDGE, SETTLING
 from apertura.ingest.sample_layout import SampleLayout
 from apertura.ingest.sigmf_collection import Collection

@@ -14,8 +14,9 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.contracts import check
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import RECORDERS, TRACKS, LogFormat, open_recording, read_phase_history, read_track
+from apertura.ingest import open_recording, read_phase_history, read_track
 from apertura.ingest.beam_pattern import read_beam_pattern
+from apertura.ingest.names import RECORDERS, TRACKS, LogFormat
 from apertura.ingest.recording import Captures, Recording
 from apertura.ingest.sample_file import SampleFile
 from apertura.ingest.track import make_track

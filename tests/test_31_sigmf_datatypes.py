@@ -15,7 +15,8 @@ from apertura.check.recordings import check_recordings
 from apertura.contracts import check
 from apertura.echo.captures import SATURATED_SHARE, Saturation
 from apertura.errors import CampaignError
-from apertura.ingest import open_recording, recording_files
+from apertura.ingest import open_recording
+from apertura.ingest.names import recording_files
 from apertura.ingest.real_samples import EDGE, SETTLING, Mixing
 from apertura.ingest.sample_file import SampleFile
 from apertura.ingest.sample_layout import SampleLayout

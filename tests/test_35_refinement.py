@@ -1,5 +1,6 @@
 """Tracks refined by the image itself."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from apertura.focus.engines import reference
 from apertura.focus.inputs import PhaseHistory
 from apertura.geometry.aperture import Aperture
 from apertura.geometry.track_correction import TrackCorrection
+from apertura.quality.path_errors import autocorrelation
 from apertura.refinement.candidates import LEAST_RATIO, bright_places
 from apertura.refinement.evidence import range_shifts
 from apertura.refinement.gauge import effects
@@ -19,6 +21,7 @@ from apertura.refinement.objective import Sharpness
 from apertura.refinement.prior import NodePrior, Prior
 from apertura.refinement.refine import Search, refine
 from apertura.scene.terrain import FlatGround
+from apertura.settings import Node
 from apertura.study.refinement.cases import case
 from apertura.study.refinement.measures import judge
 from apertura.study.refinement.scenes import GRID
@@ -98,9 +101,23 @@ def test_the_prior_has_the_variance_and_the_lasting_that_the_log_states():
     prior = NodePrior.of(TrackErrors((0.01, 0.02, 0.03), correlation_s=2.0), knots, axes)
     tracks = prior.tracks(np.random.default_rng(3).standard_normal((40, prior.size))) @ axes.T
     assert tracks.std(axis=(0, 1)) == pytest.approx([0.01, 0.02, 0.03], rel=0.03)
-    lags = {lag: (tracks[:, :-lag] * tracks[:, lag:]).mean(axis=(0, 1)) / tracks.var(axis=(0, 1)) for lag in (10, 20)}
+    lags = {
+        lag: (tracks[:, :-lag] * tracks[:, lag:]).mean(axis=(0, 1)) / tracks.var(axis=(0, 1)) for lag in (10, 13, 20)
+    }
     assert lags[10] == pytest.approx(np.full(3, 0.5), abs=0.04)
     assert lags[20] == pytest.approx(np.zeros(3), abs=0.04)
+    for lag, known in lags.items():  # the budget and the prior take the same errors
+        assert known == pytest.approx(np.full(3, autocorrelation(np.array(0.1 * lag), 2.0)), abs=0.04)
+
+
+def test_position_correlation_s_is_described_as_it_is_taken():
+    """A user who knows when errors have fallen to 1/e finds the length to state: 1/0.63 of that."""
+    described = Node.model_fields["position_correlation_s"].description
+    share = 1 - 1 / np.e
+    assert float(re.search(r"to zero there, to 1/e at ([0-9.]+) of it", described)[1]) == pytest.approx(
+        share, abs=0.005
+    )
+    assert autocorrelation(np.array([share, 1.0]), 1.0) == pytest.approx([1 / np.e, 0.0])
 
 
 @pytest.mark.parametrize("drift_m", [0.0, 0.05])

@@ -10,11 +10,11 @@ import yaml
 from folders import copy_writable
 
 from apertura.campaign import Campaign
-from apertura.check import stale
 from apertura.check.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.digests import Sources, digest_of
 from apertura.errors import CampaignError
 from apertura.lineage import ON_DEMAND, results_of
+from apertura.lineage.code import modules_of
 from apertura.lock import hold
 from apertura.steps.summary import print_summary
 
@@ -145,8 +145,10 @@ def test_a_setting_makes_stale_what_it_matters_to(finished, change, expected, sp
 
 
 def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
-    known = stale.code_of
-    monkeypatch.setattr(stale, "code_of", lambda result: "0" if result == "profile" else known(result))
+    def other(campaign, result, *where):
+        return ("apertura.constants",) if result == "profile" else modules_of(campaign, result, *where)
+
+    monkeypatch.setattr("apertura.lineage.modules_of", other)
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
     assert not {"raw", "track", "echo", "scene"} & names(found)

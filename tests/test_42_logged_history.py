@@ -10,7 +10,7 @@ from apertura.campaign import Campaign
 from apertura.check import problems
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
-from apertura.ingest import PHASE_HISTORIES, HistoryFormat
+from apertura.ingest.names import PHASE_HISTORIES, HistoryFormat
 from apertura.store import open_stage
 
 CRS = "EPSG:32632"

@@ -19,9 +19,8 @@ from apertura.catalog.crate_check import changed_files
 from apertura.catalog.validation import stac_problems
 from apertura.environment import lock_sha256, software
 from apertura.errors import CampaignError
-from apertura.lineage import RESULTS, on_demand, places_of, results_of
+from apertura.lineage import RESULTS, on_demand, places_of, result_of, results_of
 from apertura.provenance import sha256_file
-from apertura.steps.code import code_of
 from apertura.steps.jobs import job_of
 from apertura.steps.ro_crate import ro_crate
 from apertura.steps.stac import stac
@@ -116,11 +115,11 @@ def test_recordings_and_config_are_named_by_their_hashes(finished_tiny, told):
     assert all(one["sha256"] == sha256_file(finished_tiny.root / name) for name, one in inputs.items())
 
 
-def test_every_job_says_its_command_parameters_code_sources_and_results(told):
+def test_every_job_says_its_command_parameters_code_sources_and_results(told, finished_tiny):
     job = told["#job/image/f01/uav1-uav2"]
     assert job["name"] == "apertura step image f01 uav1-uav2"
     tool = told[job["instrument"]["@id"]]
-    assert tool["identifier"] == f"sha256:{code_of('image')}"
+    assert tool["identifier"] == f"sha256:{result_of(finished_tiny, 'image', 'f01', 'uav1-uav2').code_sha256}"
     assert {"f01/uav1-uav2/profile.manifest.json", "f01/refined_track.manifest.json"} < set(ids(job["object"]))
     settings = [told[one] for one in ids(job["object"]) if one.startswith("#setting/")]
     assert {one["name"]: one["value"] for one in settings}["accuracy_db"] == "auto"
@@ -148,7 +147,8 @@ def test_a_product_made_by_other_code_or_settings_says_so(finished):
     graph = json.loads((finished / "results" / CRATE).read_text())["@graph"]
     described = {one["@id"]: one["description"] for one in graph if one["@id"].startswith("#job/")}
     said = described["#job/layers/f01/uav1-uav2"]
-    assert f"made by other code than is installed now, which is {code_of('layers')}" in said
+    installed = result_of(Campaign.load(finished), "layers", "f01", "uav1-uav2").code_sha256
+    assert f"made by other code than is installed now, which is {installed}" in said
     assert f"made under other settings than these, of sha256 {'1' * 64}" in said
     assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
     assert described["#job/echo/f01/uav1-uav2"] == "As the code and settings of today would make it."

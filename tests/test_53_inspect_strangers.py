@@ -11,7 +11,7 @@ import pytest
 from folders import SHARED, copy_writable
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
+from apertura.ingest.names import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
 from apertura.inspection.command import inspect_path
 from apertura.inspection.look import look
 

@@ -1,6 +1,5 @@
 """`apertura verify` on what strangers, older versions and editors leave: one line for each link, and no harm."""
 
-import functools
 import shutil
 import subprocess
 import sys
@@ -12,14 +11,6 @@ from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
 from apertura.audit.verify import print_verified, verify
 from apertura.provenance import canonical_json, sha256_file
-from apertura.steps.code import code_of
-
-CODE_OF = functools.cache(code_of)
-
-
-@pytest.fixture(autouse=True)
-def code_is_hashed_once(monkeypatch):
-    monkeypatch.setattr("apertura.audit.chain.code_of", CODE_OF)
 
 
 @pytest.fixture

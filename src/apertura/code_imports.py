@@ -1,4 +1,8 @@
-"""Which modules a module can run: its imports, however deep, read from their sources, and compiled code beside them."""
+"""Which code a module can run: the modules that it imports, however deep, and what of their text is run.
+
+An import counts wherever it stands, also inside a function. What only describes code, comments and docstrings, does not
+count, nor do modules that decide no value of a result (`WITHOUT_EFFECT`).
+"""
 
 import functools
 import importlib.util
@@ -9,10 +13,26 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent
 
+WITHOUT_EFFECT = (
+    "apertura.errors",  # what a message says: a step that raised one has no result
+    "apertura.progress",  # lines of a log
+    "apertura.isolation",  # where a process may look for code
+    "apertura.signals",  # how a process ends
+    "apertura.lineage",  # sources, settings and code of a result: a manifest records each, for itself
+    "apertura.digests",  # their hashes
+)
+"""Modules, and those below them, that no result's code hash holds: nothing that they compute is in a result."""
+
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
 _NAME = re.compile(r"[\w.]+")
 _TYPING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTILINE)  # never run
-_ROW = re.compile(r"[\"'](apertura(?:\.\w+)+):\w+[\"']")  # a row that names a function, imported when it is used
+_CALLED = re.compile(r"\(\s*[\"'](apertura(?:\.\w+)+):\w+[\"']")  # f("module:function"): f imports and calls it
+_TEXT_OR_COMMENT = re.compile(
+    r'(?P<text>[A-Za-z]{0,2}(?:"""(?:\\.|[^\\])*?"""|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'))|(?P<comment>#[^\n]*)',
+    re.DOTALL,
+)
+_GOES_ON = frozenset("([{,=+-*/%|&<>\\")
+"""What ends a line whose statement goes on: a text on the next line is a value, and no docstring."""
 
 
 def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[str, Path]:
@@ -31,7 +51,7 @@ def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[s
     while waiting:
         name = waiting.pop()
         path = _source(name, package) if _is_ours(name) else _source_outside(name) if name in outside else None
-        if path is None or name in closure:
+        if path is None or name in closure or _has_no_effect(name):
             continue
         closure[name] = path
         waiting += _imports(path.read_text(encoding="utf-8"))
@@ -40,6 +60,10 @@ def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[s
 
 def _is_ours(name: str) -> bool:
     return name.split(".", maxsplit=1)[0] == PACKAGE.name
+
+
+def _has_no_effect(name: str) -> bool:
+    return any(name == one or name.startswith(f"{one}.") for one in WITHOUT_EFFECT)
 
 
 def _source(name: str, package: Path) -> Path | None:
@@ -62,7 +86,35 @@ def _imports(source: str) -> tuple[str, ...]:
     for module, members, modules in _IMPORT.findall(_TYPING.sub("", source)):
         names += [module, *(f"{module}.{member}" for member in _NAME.findall(members))] if module else []
         names += _NAME.findall(modules)
-    return tuple(name for name in [*names, *_ROW.findall(source)] if _is_ours(name))
+    return tuple(name for name in [*names, *_CALLED.findall(source)] if _is_ours(name))
+
+
+@functools.cache
+def without_description(source: str) -> str:
+    r"""Return a Python source without its comments and empty lines, docstrings as ellipses.
+
+    Examples
+    --------
+    >>> without_description('def two():\n    \"\"\"Return it.\"\"\"\n\n    return 2  # always\n')
+    'def two():\n    ...\n    return 2'
+    """
+    kept: list[str] = []
+    ends, at = "", 0  # the last character of code, and how far the source is read
+    for found in _TEXT_OR_COMMENT.finditer(source):
+        between = source[at : found.start()]
+        kept.append(between)
+        ends = between.rstrip()[-1:] or ends
+        at = found.end()
+        if found["comment"]:
+            continue
+        begins = between.rstrip(" \t").endswith("\n") or not "".join(kept).strip()
+        if begins and found[0].startswith('"""') and ends not in _GOES_ON and source[at : at + 1] in {"\n", ""}:
+            kept.append("...")
+        else:
+            kept.append(found[0].replace("\n", "\0"))  # lines of a text are no lines of code
+        ends = '"'
+    lines = (line.rstrip() for line in "".join([*kept, source[at:]]).split("\n"))
+    return "\n".join(line for line in lines if line).replace("\0", "\n")
 
 
 def built_from(closure: Mapping[str, Path], package: Path) -> list[Path]:

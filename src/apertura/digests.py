@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -132,6 +133,11 @@ def _changed(path: Path) -> CampaignError:
     )
 
 
+@cache
+def _code_sha256(modules: tuple[str, ...]) -> str:
+    return code_sha256(*modules)  # the same for every flight and pair
+
+
 @dataclass(frozen=True)
 class Result:
     """What one rule writes.
@@ -144,20 +150,28 @@ class Result:
         What it is made from: files, and manifests of other results, relative to the campaign folder.
     settings
         What of the config matters to it.
+    modules
+        Modules whose import closure is the code that makes it, as `apertura.lineage.result_of` knows them.
     """
 
     manifest: str
     sources: tuple[str, ...]
     settings: Mapping[str, Any]
+    modules: tuple[str, ...] = ()
 
     @property
     def settings_sha256(self) -> str:
         """Hash of the settings, as the manifest records it."""
         return sha256_text(canonical_json(self.settings))
 
-    def begin(self, root: Path, modules: Sequence[str], *, further: Sequence[str] = ()) -> "Lineage":
-        """Hash what it is made from, and `further` files that reading it names; code is what `modules` import."""
-        return Lineage(self, Sources.of(root, (*self.sources, *further)), tuple(modules))
+    @property
+    def code_sha256(self) -> str:
+        """Hash of the code that makes it, as the manifest records it."""
+        return _code_sha256(self.modules)
+
+    def begin(self, root: Path, *, further: Sequence[str] = ()) -> "Lineage":
+        """Hash what it is made from, and `further` files that reading it names."""
+        return Lineage(self, Sources.of(root, (*self.sources, *further)))
 
 
 @dataclass(frozen=True)
@@ -166,7 +180,11 @@ class Lineage:
 
     result: Result
     sources: Sources
-    modules: tuple[str, ...]
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Modules whose import closure makes the result."""
+        return self.result.modules
 
     def record(self) -> dict[str, Any]:
         """Return what the manifest says of where the result comes from.
@@ -176,5 +194,5 @@ class Lineage:
         CampaignError
             If a source has changed since it was hashed.
         """
-        made_by = {"settings": self.result.settings_sha256, "code": code_sha256(*self.modules)}
+        made_by = {"settings": self.result.settings_sha256, "code": self.result.code_sha256}
         return {"sources": self.sources.unchanged(), **made_by}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from apertura import __version__
-from apertura.code_imports import PACKAGE, built_from, import_closure
+from apertura.code_imports import PACKAGE, built_from, import_closure, without_description
 
 _READ_BYTES = 1 << 20
 
@@ -153,9 +153,9 @@ def sha256_tree(folder: Path) -> dict[str, str]:
 def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     """Return the hash of the source of `modules` and of every apertura module they import, however deep.
 
-    A stage's hash therefore changes when, and only when, code it can run has changed. Compiled code counts by
-    what it was built from: each ``*.sha256`` that was installed beside one of the modules. Modules that the row of a
-    table names as a string, ``module:function``, count as imported.
+    A stage's hash therefore changes when, and only when, code it can run has changed: not with a comment or a
+    docstring. Compiled code counts by what it was built from: each ``*.sha256`` that was installed beside one of the
+    modules. Of tables whose rows name functions, ``module:function``, `modules` holds those that are called.
 
     Parameters
     ----------
@@ -173,7 +173,8 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     digest = hashlib.sha256()
     closure = import_closure(modules, package=package)
     for name, path in sorted(closure.items()):
-        digest.update(f"{name}\0{sha256_file(path)}\n".encode())
+        run = without_description(path.read_text(encoding="utf-8")).split("\n")
+        digest.update("\n".join([f"{name}\0", *(line for line in run if line.strip() != "..."), ""]).encode())
     for path in built_from(closure, package):
         digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
     return digest.hexdigest()

@@ -2,15 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, log_suffixes, read_phase_history, read_track, recording_files
+from apertura.ingest.names import PHASE_HISTORIES, log_suffixes, recording_files
 from apertura.paths import inside
 from apertura.settings import FLIGHTS, SampledWaveform, Settings
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -74,15 +70,6 @@ class RawFolder:
             expected=f"exactly one flight log of node {node}",
             remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
         )
-
-    def read_log(self, flight: str, node: str) -> "xr.Dataset":
-        """Return the `track` stage of a node's flight log."""
-        return read_track(self.track_file(flight, node), node=node, options=self.settings.nodes[node].log.options)
-
-    def read_history(self, flight: str, node: str, *, pair: str) -> "xr.Dataset":
-        """Return the phase history that a node of a pair recorded, as its format and the config say."""
-        described = self.settings.waveform.model_dump()
-        return read_phase_history(described["format"], self.history_files(flight, node), pair=pair, described=described)
 
     def flight_folder(self, flight: str) -> Path:
         """Return raw/<flight>, which is no link: not even its names are read through one."""

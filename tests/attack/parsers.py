@@ -19,7 +19,6 @@ from apertura.ingest import (
     phase_history,
     px4_ulog,
     read_track,
-    recording_files,
     ulog_fields,
     zarr_history,
 )
@@ -27,6 +26,7 @@ from apertura.ingest.afrl import joined
 from apertura.ingest.beam_pattern import read_beam_pattern
 from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
 from apertura.ingest.mat_fields import read_fields
+from apertura.ingest.names import recording_files
 from apertura.ingest.pulson import read_pulson
 from apertura.ingest.sigmf_collection import check_listed
 from apertura.load.results import OpenCampaign, assessment_of

@@ -16,7 +16,7 @@ rule stac:
         runtime=asked["stac"].runtime,
     params:
         settings=lambda wildcards: result_of(campaign, "stac").settings,
-        code=code_of("stac"),
+        code=lambda _: result_of(campaign, "stac").code_sha256,
     message:
         "describing every image in a catalog"
     shell:
@@ -42,7 +42,7 @@ rule ro_crate:
         runtime=asked["ro_crate"].runtime,
     params:
         settings=lambda wildcards: result_of(campaign, "ro_crate").settings,
-        code=code_of("ro_crate"),
+        code=lambda _: result_of(campaign, "ro_crate").code_sha256,
     message:
         "telling the whole run as an RO-Crate"
     shell:

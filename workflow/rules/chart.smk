@@ -21,7 +21,7 @@ rule speed_accuracy:
         mem_mb=asked["speed_accuracy"].mem_mb,
         runtime=asked["speed_accuracy"].runtime,
     params:
-        code=code_of("speed_accuracy"),
+        code=lambda _: result_of(campaign, "speed_accuracy").code_sha256,
         charted=" ".join(charted(campaign)),
     message:
         "timing and measuring every engine and setting"
@@ -49,7 +49,7 @@ rule whole_chart:
         runtime=asked["whole_chart"].runtime,
     params:
         settings=lambda _: campaign.values,
-        code=code_of("whole"),
+        code=lambda _: result_of(campaign, "whole").code_sha256,
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"
     shell:

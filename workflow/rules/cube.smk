@@ -14,7 +14,7 @@ rule cube:
         mem_mb=asked["cube"].mem_mb,
         runtime=asked["cube"].runtime,
     params:
-        code=code_of("cube"),
+        code=lambda _: result_of(campaign, "cube").code_sha256,
     message:
         "stacking and adding up every image"
     shell:

@@ -15,7 +15,7 @@ rule echo:
         runtime=asked["echo"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("echo", wildcards.pair, flight=wildcards.flight),
-        code=code_of("echo"),
+        code=lambda wildcards: result_of(campaign, "echo", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: calibrating {wildcards.pair}"
     shell:
@@ -40,7 +40,7 @@ rule calibrate:
         runtime=asked["calibrate"].runtime,
     params:
         settings=lambda _: campaign.relevant("calibration"),
-        code=code_of("calibration"),
+        code=lambda wildcards: result_of(campaign, "calibration", wildcards.flight).code_sha256,
     message:
         "{wildcards.flight}: estimating path offsets from the reflector"
     shell:
@@ -64,7 +64,7 @@ rule profile:
         runtime=asked["profile"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("profile", wildcards.pair),
-        code=code_of("profile"),
+        code=lambda wildcards: result_of(campaign, "profile", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: compressing {wildcards.pair} in range"
     shell:

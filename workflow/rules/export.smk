@@ -28,7 +28,7 @@ rule export:
         runtime=asked["export"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("export"),
+        code=lambda wildcards: result_of(campaign, "export", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
@@ -54,7 +54,7 @@ rule cphd:
         runtime=asked["cphd"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("cphd"),
+        code=lambda wildcards: result_of(campaign, "cphd", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: writing the phase history of {wildcards.pair}"
     shell:
@@ -90,7 +90,7 @@ rule export_fused:
         runtime=asked["export_fused"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("fused"),
+        code=lambda wildcards: result_of(campaign, "fused", wildcards.flight).code_sha256,
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:
@@ -116,7 +116,7 @@ rule coverage:
         runtime=asked["coverage"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("coverage"),
+        code=lambda _: result_of(campaign, "coverage").code_sha256,
     message:
         "drawing what the flights cover"
     shell:
@@ -141,7 +141,7 @@ rule mosaic:
         runtime=asked["mosaic"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("mosaic"),
+        code=lambda _: result_of(campaign, "mosaic").code_sha256,
     message:
         "laying the files of all flights upon one another"
     shell:
@@ -166,7 +166,7 @@ rule map:
         runtime=asked["map"].runtime,
     params:
         settings=lambda _: result_of(campaign, "map").settings,
-        code=code_of("map"),
+        code=lambda _: result_of(campaign, "map").code_sha256,
     message:
         "making the map"
     shell:

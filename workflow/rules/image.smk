@@ -21,7 +21,7 @@ rule scene:
         runtime=asked["scene"].runtime,
     params:
         settings=lambda _: result_of(campaign, "scene").settings,
-        code=code_of("scene"),
+        code=lambda _: result_of(campaign, "scene").code_sha256,
     message:
         "settling the campaign's grid"
     shell:
@@ -45,7 +45,7 @@ rule terrain:
         runtime=asked["terrain"].runtime,
     params:
         settings=lambda _: campaign.relevant("terrain"),
-        code=code_of("terrain"),
+        code=lambda _: result_of(campaign, "terrain").code_sha256,
     message:
         "bringing the DEM onto the campaign's grid"
     shell:
@@ -70,7 +70,7 @@ rule layers:
         runtime=asked["layers"].runtime,
     params:
         settings=lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).settings,
-        code=code_of("layers"),
+        code=lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: how {wildcards.pair} sees the scene"
     shell:
@@ -94,7 +94,7 @@ rule refine:
         runtime=asked["refine"].runtime,
     params:
         settings=lambda _: campaign.relevant("refined_track"),
-        code=code_of("refined_track"),
+        code=lambda wildcards: result_of(campaign, "refined_track", wildcards.flight).code_sha256,
     message:
         "{wildcards.flight}: refining the tracks of its nodes where that pays"
     shell:
@@ -118,7 +118,7 @@ rule tiles:
         runtime=asked["tiles"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_of("image"),
+        code=lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -148,7 +148,7 @@ rule image:
         runtime=asked["image"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=code_of("image"),
+        code=lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:
@@ -173,7 +173,7 @@ rule assess:
         runtime=asked["assess"].runtime,
     params:
         settings=lambda _: campaign.relevant("assess"),
-        code=code_of("assessment"),
+        code=lambda wildcards: result_of(campaign, "assessment", wildcards.flight).code_sha256,
     message:
         "{wildcards.flight}: comparing the images with each other"
     shell:

@@ -20,7 +20,9 @@ rule ingest:
         runtime=asked["ingest"].runtime,
     params:
         settings=lambda wildcards: campaign.relevant("raw") | campaign.log_settings(wildcards.node),
-        code=code_of("raw"),
+        code=lambda wildcards: [
+            result_of(campaign, part, wildcards.flight, wildcards.node).code_sha256 for part in ("raw", "track")
+        ],
     message:
         "{wildcards.flight}: reading the recording and flight log of {wildcards.node}"
     shell:

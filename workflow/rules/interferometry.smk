@@ -31,7 +31,7 @@ rule interferogram:
         runtime=asked["interferogram"].runtime,
     params:
         settings=lambda _: campaign.relevant("interferogram"),
-        code=code_of("interferogram"),
+        code=lambda wildcards: result_of(campaign, "interferogram", wildcards.two).code_sha256,
     message:
         "{wildcards.two}: comparing two images in phase"
     shell:

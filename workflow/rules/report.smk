@@ -25,7 +25,7 @@ rule pictures:
         runtime=asked["pictures"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("pictures"),
+        code=lambda wildcards: result_of(campaign, "pictures", wildcards.flight, wildcards.pair).code_sha256,
     message:
         "{wildcards.flight}: drawing {wildcards.pair} for the report"
     shell:
@@ -61,7 +61,7 @@ rule page:
         runtime=asked["page"].runtime,
     params:
         settings=lambda _: campaign.settings.campaign,
-        code=code_of("page"),
+        code=lambda wildcards: result_of(campaign, "page", wildcards.flight).code_sha256,
     message:
         "{wildcards.flight}: writing the page of the report"
     shell:

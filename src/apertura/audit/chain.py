@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,9 @@ from apertura.audit.versions import other_versions
 from apertura.campaign import Campaign
 from apertura.digests import Result
 from apertura.errors import CampaignError
-from apertura.lineage import RESULTS, on_demand, results_of
+from apertura.lineage import on_demand, results_of
 from apertura.paths import inside
 from apertura.settings import CONFIG
-from apertura.steps.code import code_of
 from apertura.store import read_manifest
 
 
@@ -42,11 +40,10 @@ class Chain:
         self._inputs: dict[str, dict[str, str]] = {}
         self._leaves: set[str] = set()
         self._waiting: list[str] = []
-        self._code = cache(code_of)
-        self._rows: dict[str, tuple[str, Result]] = {}
+        self._rows: dict[str, Result] = {}
         try:
-            for name, result in results_of(Campaign.load(root)):
-                self._rows[result.manifest] = name, result
+            for _, result in results_of(Campaign.load(root)):
+                self._rows[result.manifest] = result
             self._promised = True
         except CampaignError as error:  # what its manifests say can be compared all the same
             self._promised = False
@@ -144,15 +141,14 @@ class Chain:
 
     def _made_by(self, manifest: str, recorded: Mapping[str, Any]) -> None:
         """Compare code and settings with those of now."""
-        key, result = self._rows.get(manifest, (_key(manifest), None))
-        if key in RESULTS:
-            now, was, link = self._code(key), str(recorded["code"]), self.links.of(f"code of {manifest}")
-            if was != now:
-                link.add("changed", f"{shortened(now)} is installed, {shortened(was)} made it")
-        if result is None:
+        result = self._rows.get(manifest)
+        if result is None:  # where the config cannot be read, nobody knows which formats and so which code it asks for
             if self._promised:
                 self.links.of(manifest).add("changed", "the config promises no such result")
             return
+        now, was, link = result.code_sha256, str(recorded["code"]), self.links.of(f"code of {manifest}")
+        if was != now:
+            link.add("changed", f"{shortened(now)} is installed, {shortened(was)} made it")
         settings = self.links.of(f"settings of {manifest}")
         if recorded["settings"] != result.settings_sha256:
             settings.add("changed", f"{CONFIG} or a table beside it says otherwise now")

@@ -9,7 +9,7 @@ from pathlib import Path
 from apertura.campaign import Campaign
 from apertura.check.inspected import Inspected
 from apertura.errors import CampaignError
-from apertura.ingest import recording_files
+from apertura.ingest.names import recording_files
 from apertura.paths import inside
 from apertura.settings import CONFIG, FLIGHTS, Flight, SampledWaveform
 

@@ -14,7 +14,8 @@ from pyproj.exceptions import ProjError
 from apertura.campaign import Campaign
 from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL, geodetic_from_ecef
-from apertura.ingest import PHASE_HISTORIES, open_recording, read_track
+from apertura.ingest import open_recording, read_track
+from apertura.ingest.names import PHASE_HISTORIES
 from apertura.settings import SampledWaveform
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ import re
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from apertura.errors import CampaignError
 from apertura.export import COVERAGE, MAP, PHASE_HISTORY, exports_in
 from apertura.lineage import results_of
 from apertura.paths import inside
-from apertura.steps.code import code_of
 from apertura.store import damaged_files, read_manifest
 
 _ONLY_LOOKS = (
@@ -40,7 +38,6 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
         Read every file, also where its state is that of a hash taken before.
     """
     stale: dict[str, str] = {}
-    code = cache(code_of)  # the same for every flight and pair
     for name, result in results_of(campaign):
         path = inside(campaign.root, result.manifest, where=campaign.root)
         if not path.is_file():
@@ -48,7 +45,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
                 stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
             continue
         try:
-            reasons = list(_reasons(campaign.root, code(name), result, read_manifest(path), paranoid=paranoid))
+            reasons = list(_reasons(campaign.root, result, read_manifest(path), paranoid=paranoid))
         except CampaignError:
             reasons = ["its manifest is damaged"]
         if reasons or not stale.keys().isdisjoint(result.sources):
@@ -170,7 +167,7 @@ _PRODUCTS = {
 """Result → the files that people open."""
 
 
-def _reasons(root: Path, code: str, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
+def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not {"sources", "settings", "code"} <= recorded.keys():
         yield "it does not say what it was made from"
         return
@@ -185,7 +182,7 @@ def _reasons(root: Path, code: str, result: Result, recorded: Mapping[str, Any],
             yield f"{source} has changed"
     if recorded["settings"] != result.settings_sha256:
         yield "its settings have changed"
-    if recorded["code"] != code:
+    if recorded["code"] != result.code_sha256:
         yield "its code has changed"
 
 

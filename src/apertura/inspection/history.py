@@ -8,7 +8,8 @@ import numpy as np
 
 from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.errors import CampaignError
-from apertura.ingest import PHASE_HISTORIES, log_suffixes, read_phase_history
+from apertura.ingest import read_phase_history
+from apertura.ingest.names import PHASE_HISTORIES, log_suffixes
 from apertura.inspection.log import bounds
 from apertura.inspection.recording import LOST
 from apertura.inspection.report import Report
@@ -33,7 +34,7 @@ def history_report(here: Path, files: Sequence[Path], kind: str, beside: Surroun
     files
         It and the one beside that belongs to it, or all of the folder.
     kind
-        A key of `apertura.ingest.PHASE_HISTORIES`.
+        A key of `apertura.ingest.names.PHASE_HISTORIES`.
     beside
         Where they lie.
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from apertura.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.geometry.track_checks import LONG_GAP, check_track
-from apertura.ingest import log_format, log_suffixes, read_track
+from apertura.ingest import read_track
+from apertura.ingest.names import log_format, log_suffixes
 from apertura.ingest.track import FIXES
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import NODE, Surroundings

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from apertura.errors import CampaignError, explained, quoted, shown
-from apertura.ingest import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
+from apertura.ingest.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import Surroundings, retries, surroundings
 

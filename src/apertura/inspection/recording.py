@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.errors import CampaignError
-from apertura.ingest import log_suffixes, open_recording, read_track
+from apertura.ingest import open_recording, read_track
+from apertura.ingest.names import log_suffixes
 from apertura.inspection.report import Report
 from apertura.inspection.surroundings import NODE, Surroundings
 from apertura.inspection.timing import own_clock, timing, utc
@@ -31,7 +32,7 @@ def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
     Parameters
     ----------
     files
-        In the order of a row of `apertura.ingest.RECORDERS`.
+        In the order of a row of `apertura.ingest.names.RECORDERS`.
     beside
         Where they lie.
 

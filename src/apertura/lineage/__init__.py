@@ -1,13 +1,15 @@
 """What every result is made from: files, other results, settings. Rules, steps and checks ask here.
 
 A result is what one rule writes. Its manifest, written last, names its files and what they were made from; another
-file, setting or code (`apertura.steps.code`) makes it stale, whatever the times of files say.
+file, setting or code (`apertura.lineage.code`) makes it stale, whatever the times of files say.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 from apertura.campaign import Campaign
 from apertura.digests import Result
+from apertura.lineage.code import modules_of
 from apertura.lineage.products import INTERFEROMETRY, PRODUCTS, STUDY, charted
 from apertura.lineage.stages import STAGES
 from apertura.paths import shipped
@@ -55,7 +57,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         (calibration, refined_track, assessment, fused, page), a name of `interferometry.pairs` (interferogram),
         nothing (the others).
     """
-    return RESULTS[result](campaign, *where)
+    return replace(RESULTS[result](campaign, *where), modules=modules_of(campaign, result, *where))
 
 
 def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:

@@ -13,6 +13,7 @@ from apertura.constants import SPEED_OF_LIGHT_M_S
 from apertura.geometry.phase_centres import attitude_axes, phase_centres, position_spline
 from apertura.geometry.track_checks import CheckedTrack, check_track
 from apertura.ingest.track import FIXES
+from apertura.load.reading import read_log
 from apertura.settings import Node
 
 Times = NDArray[np.datetime64]
@@ -111,7 +112,7 @@ class NodeLog:
 def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLog:
     """Return where a node was by its log as it lies in raw/; `wave_m` is the shortest wavelength."""
     file = str(campaign.track_file(flight, node))
-    return NodeLog(node, campaign.node(flight, node), campaign.read_log(flight, node), file, wave_m)
+    return NodeLog(node, campaign.node(flight, node), read_log(campaign, flight, node), file, wave_m)
 
 
 def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:

@@ -12,6 +12,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.geodesy import LOCAL
 from apertura.load.node_log import raw_log, shortest_wave
 from apertura.load.positions import place, stated_error
+from apertura.load.reading import read_history
 from apertura.settings import CONFIG
 
 
@@ -25,7 +26,7 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         frame than theirs.
     """
     tx, rx = pair.split("-")
-    history = campaign.read_history(flight, rx, pair=pair)
+    history = read_history(campaign, flight, rx, pair=pair)
     history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
     logged, placed = campaign.logged(flight, tx), "tx_position" in history
     if logged == placed:

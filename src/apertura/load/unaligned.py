@@ -12,6 +12,7 @@ from apertura.errors import CampaignError
 from apertura.geometry.aperture import Aperture
 from apertura.ingest.times import FIRST
 from apertura.load.node_log import NodeLog, raw_log, shortest_wave
+from apertura.load.reading import read_history
 from apertura.refinement.motion import Logged, Recorded
 from apertura.settings import SampledWaveform
 from apertura.store import manifest_of, open_stage
@@ -91,7 +92,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns
         applied_ppm = clock.drift_ppm
     else:
-        history = _some(campaign.read_history(flight, node, pair=f"{node}-{node}"))
+        history = _some(read_history(campaign, flight, node, pair=f"{node}-{node}"))
         off_m = 0.0
     times = history.time.values
     log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))

@@ -14,6 +14,7 @@ from apertura.campaign_files import DATATYPES, new_folder, write_config, write_c
 from apertura.errors import CampaignError
 from apertura.ingest import open_recording
 from apertura.ingest.times import outside, utc_times
+from apertura.load.reading import read_log
 from apertura.load.transmitted import transmitted
 from apertura.settings import SampledWaveform, validated
 
@@ -244,7 +245,7 @@ def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> N
             stem, given = campaign.root / "raw" / flight.name / node, flights[flight.name].nodes[node]
             if not np.array_equal(recording.captures.time, _times(given.time_utc, stem, "time_utc")):
                 raise _wrong(stem, "time tags that did not come back", "those given")
-            campaign.read_log(flight.name, node)
+            read_log(campaign, flight.name, node)
 
 
 def _wrong(where: object, found: str, expected: str) -> CampaignError:

@@ -10,6 +10,36 @@ from apertura.geometry.aperture import Aperture
 _MOST_PULSES = 200
 
 
+def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
+    """Return how alike errors of position are so far apart in time: what `position_correlation_s` means everywhere.
+
+    Parameters
+    ----------
+    lag_s
+        Any shape, float64, seconds; not negative.
+    correlation_s
+        How long an error lasts, seconds: the length of the moving average that makes it from white noise; 0: each
+        epoch errs for itself.
+
+    Returns
+    -------
+    ndarray
+        As `lag_s`; 1 at once, falling in a straight line to 0 at `correlation_s`.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 3.
+
+    Examples
+    --------
+    >>> autocorrelation(np.array([0.0, 0.5, 1.0, 2.0]), 1.0)
+    array([1. , 0.5, 0. , 0. ])
+    """
+    if correlation_s <= 0:
+        return (lag_s == 0).astype(np.float64)
+    return np.clip(1 - lag_s / correlation_s, 0, None)
+
+
 @dataclass(frozen=True)
 class Effect:
     """What an error does to the image of a point.
@@ -141,8 +171,8 @@ class PointPaths:
         Parameters
         ----------
         *parts
-            Standard deviation at each pulse, (pulse,) float64 metres, and how long an error lasts, seconds: its
-            autocorrelation falls linearly to zero over this.
+            Standard deviation at each pulse, (pulse,) float64 metres, and how long an error lasts, seconds, as
+            `autocorrelation` takes it.
 
         Notes
         -----
@@ -151,8 +181,7 @@ class PointPaths:
         lag = np.abs(np.subtract.outer(self.time_s, self.time_s))
         covariance = np.zeros_like(lag)
         for std_m, correlation_s in parts:
-            shape = np.clip(1 - lag / correlation_s, 0, None) if correlation_s > 0 else (lag == 0).astype(float)
-            covariance += shape * np.multiply.outer(std_m, std_m)
+            covariance += autocorrelation(lag, correlation_s) * np.multiply.outer(std_m, std_m)
         ground = self.gradient[:, :2]
         inverse = np.linalg.pinv(ground)
         keep = np.eye(len(ground)) - ground @ inverse

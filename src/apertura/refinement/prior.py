@@ -32,7 +32,8 @@ class NodePrior:
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 10. The autocorrelation of such noise falls linearly to zero over w knots.
+    Source: docs/theory/autofocus.md, eq. 10. Such noise has the autocorrelation of
+    `apertura.quality.path_errors.autocorrelation` over w knots.
 
     Examples
     --------

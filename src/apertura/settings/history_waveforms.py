@@ -4,7 +4,7 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from apertura.ingest import PHASE_HISTORIES
+from apertura.ingest.names import PHASE_HISTORIES
 from apertura.settings.section import WAVEFORM_KINDS, Section
 
 _MOST_SAMPLES = 1_000_000

@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from apertura.ingest import TRACKS
 from apertura.ingest.log_options import LogOptions
+from apertura.ingest.names import TRACKS
 from apertura.settings.section import Section
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]

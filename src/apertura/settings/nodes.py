@@ -91,7 +91,10 @@ class Node(Section):
         "or [north, east, up]; null: nobody knows",
     )
     position_correlation_s: float = Field(
-        1.0, gt=0, description="how long an error of position lasts: where its autocorrelation has fallen to 1/e, s"
+        1.0,
+        gt=0,
+        description="how long an error of position lasts, as white noise after a moving average so long: its "
+        "autocorrelation falls in a straight line to zero there, to 1/e at 0.63 of it, s",
     )
     position_drift_m: float = Field(
         0.0,

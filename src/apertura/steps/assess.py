@@ -13,7 +13,7 @@ from apertura.lineage import result_of
 from apertura.load.agreement import agreement_of, agreement_report, comparable, shows_points_of
 from apertura.load.refined import open_refined
 from apertura.load.scene import settled_scene
-from apertura.provenance import chained_sha256, code_sha256
+from apertura.provenance import chained_sha256
 from apertura.quality.agreement import Agreement
 from apertura.steps.suspect import hypotheses, hypothesis_line
 from apertura.store import open_stage, save_document
@@ -28,7 +28,7 @@ _SURE_SNR_DB = 20.0
 
 def assess(campaign: Campaign, flight: str) -> Path:
     """Write results/<flight>/assessment.json: how the pairs agree, what to look at, what the coherent sum holds."""
-    lineage = result_of(campaign, "assessment", flight).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "assessment", flight).begin(campaign.root)
     pairs, grid = campaign.flight(flight).pairs, settled_scene(campaign).grid
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
@@ -63,7 +63,9 @@ def assess(campaign: Campaign, flight: str) -> Path:
         "hypotheses": named,
         "pairs": {pair: {"agreement": agreement_report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
         "fusion": fusion.report,
-        "code_sha256": chained_sha256(code_sha256(__name__), [image.attrs["code_sha256"] for image in images.values()]),
+        "code_sha256": chained_sha256(
+            lineage.result.code_sha256, [image.attrs["code_sha256"] for image in images.values()]
+        ),
     }
     path = campaign.result(flight, "assessment.json")
     save_document(path, report, lineage)

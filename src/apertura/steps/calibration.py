@@ -14,7 +14,7 @@ from apertura.geometry.aperture import Aperture
 from apertura.geometry.geodesy import frame_from_map
 from apertura.imaging.stages import Rows
 from apertura.lineage import result_of
-from apertura.provenance import canonical_json, chained_sha256, code_sha256
+from apertura.provenance import canonical_json, chained_sha256
 from apertura.quality.measures import coherence_factor
 from apertura.settings import Calibration
 from apertura.store import open_document, open_stage, remake, save_document
@@ -28,7 +28,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
     CampaignError
         If config/config.yaml has no calibration section, or no reflector stands out.
     """
-    asked, lineage = _asked(campaign), result_of(campaign, "calibration", flight).begin(campaign.root, [__name__])
+    asked, lineage = _asked(campaign), result_of(campaign, "calibration", flight).begin(campaign.root)
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(asked.reflector_m), "pairs": {}}
     codes = []
     for pair in campaign.flight(flight).pairs:
@@ -37,7 +37,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
         report["pairs"][pair] = _pair(campaign, echo, asked, where=f"flight {flight}, pair {pair}") | {
             "inputs": echo.attrs["inputs"]
         }
-    report["code_sha256"] = chained_sha256(code_sha256(__name__), codes)
+    report["code_sha256"] = chained_sha256(lineage.result.code_sha256, codes)
     path = campaign.result(flight, "calibration.json")
     save_document(path, report, lineage)
     return path

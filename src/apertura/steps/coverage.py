@@ -27,14 +27,14 @@ _VERTICES = 400  # of a track
 
 def coverage(campaign: Campaign) -> list[Path]:
     """Write results/coverage.png and results/coverage.geojson; return their paths."""
-    lineage = result_of(campaign, "coverage").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "coverage").begin(campaign.root)
     scene = settled_scene(campaign)
     covered = [
         _covered(campaign, flight.name, pair, scene.grid) for flight in campaign.image_flights for pair in flight.pairs
     ]
     transform = transform_of(scene.grid, covered[0].looks)
     picture, features = written = [campaign.result(name) for name in COVERAGE]
-    tags = tags_of(Provenance.of([__name__], settings=scene.spec, inputs=scene.inputs), lineage)
+    tags = tags_of(Provenance.of(lineage.modules, settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
     write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
     found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)

@@ -28,9 +28,9 @@ _NULL_ISLAND = (0.0, 0.0, 0.0)
 
 def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/phase_history.cphd."""
-    lineage = result_of(campaign, "cphd", flight, pair).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "cphd", flight, pair).begin(campaign.root)
     echo, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), settled_scene(campaign)
-    collection = _collection(campaign, flight, echo, scene, tags_of(Provenance.of([__name__], [echo]), lineage))
+    collection = _collection(campaign, flight, echo, scene, tags_of(Provenance.of(lineage.modules, [echo]), lineage))
     path = campaign.result(flight, pair, PHASE_HISTORY)
     if collection.swath_s[1] <= 0:
         raise CampaignError(

@@ -34,7 +34,7 @@ def cube(campaign: Campaign) -> Path:
 
     Tile by tile; a tile that no pulse of a pair sees is not stored and reads as NaN, as in its image.
     """
-    flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root, [__name__])
+    flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
         (flight.name, pair): open_stage(campaign.stage("image", flight.name, pair), "image")
         for flight in flights
@@ -49,7 +49,7 @@ def cube(campaign: Campaign) -> Path:
         empty = stamped(
             described,
             "cube",
-            modules=[__name__],
+            modules=lineage.modules,
             parents={"/".join(name): image for name, image in images.items()},
             settings={"fusion": {name: one["fusion"] for name, one in assessed.items()}},
         )

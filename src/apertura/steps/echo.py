@@ -20,7 +20,7 @@ from apertura.store import finish, write_blocks, writing
 
 def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/echo.zarr."""
-    lineage = result_of(campaign, "echo", flight, pair).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "echo", flight, pair).begin(campaign.root)
     waveform = campaign.settings.waveform
     parents: list[xr.Dataset] = []
     calibration = calibrated(campaign, flight, pair)
@@ -40,7 +40,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         inputs = merged(inputs, calibration["inputs"])
     relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
-    how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": relevant, "inputs": inputs}
+    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
     stage = stamped(formed.promised, "echo", **how)
     with writing(folder) as wip:
         write_blocks(wip, stage, "transfer", formed.blocks())

@@ -12,12 +12,12 @@ from rasterio import Affine
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.digests import Lineage
-from apertura.export import export_modules, write_exports
+from apertura.export import write_exports
 from apertura.export.radiometry import ECHO, Radiometry, of_sums
 from apertura.lineage import result_of
 from apertura.load.results import assessment_of
 from apertura.load.scene import settled_scene
-from apertura.provenance import Provenance, canonical_json, chained_sha256, code_sha256
+from apertura.provenance import Provenance, canonical_json, chained_sha256
 from apertura.quality.fused import Amplitude
 from apertura.quality.measures import Raster, survey
 from apertura.quality.point_targets import find_peak
@@ -30,8 +30,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     """Write the products of one pair, or of 'fused', and image.json; return their paths."""
     if pair == "fused":
         return export_fused(campaign, flight)
-    modules = [__name__, *export_modules("pair")]
-    lineage = result_of(campaign, "export", flight, pair).begin(campaign.root, modules)
+    lineage = result_of(campaign, "export", flight, pair).begin(campaign.root)
     image = open_stage(campaign.stage("image", flight, pair), "image")
     assessed = assessment_of(campaign, flight)
     agreed, quality = assessed["pairs"][pair], image.attrs["quality"]
@@ -43,7 +42,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "flags": {**image.attrs["flags"], **agreed["flags"]},
         "radiometry": {"image": ECHO.measured(peak, quality["noise_floor_db"]).report},
     }
-    origin = _with_code(Provenance.of(modules, [image]), assessed)
+    origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
     folder = campaign.result(flight, pair)
     written = write_exports(
         "pair",
@@ -59,7 +58,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     """Write the products of the sums of a flight's pairs, and image.json; return their paths."""
-    lineage = result_of(campaign, "fused", flight).begin(campaign.root, [__name__, *export_modules("fused")])
+    lineage = result_of(campaign, "fused", flight).begin(campaign.root)
     cube = open_stage(campaign.stage("cube"), "cube")
     index = cube.attrs["flights"].index(flight)
     sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
@@ -90,7 +89,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         {**sums, "magnitude": cube.magnitude[index]},
         radiometry=report["radiometry"],
         titles={source: f"{name} · {words}" for source, words in titles.items()},
-        tags=tags_of(_fused_provenance(cube, images, assessed), lineage) | _quality_tags(report),
+        tags=tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | _quality_tags(report),
         **_georeference(grid),
     )
     return _finish(folder, written, {"flight": flight, "pairs": list(pairs), **report}, lineage)
@@ -113,14 +112,15 @@ def _with_code(origin: Provenance, assessed: Mapping[str, Any]) -> Provenance:
     return replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
 
 
-def _fused_provenance(cube: xr.Dataset, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]) -> Provenance:
+def _fused_provenance(
+    lineage: Lineage, cube: xr.Dataset, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]
+) -> Provenance:
     """Return settings and inputs of the flight's own pairs, each apart, and the code that made the cube and its files.
 
     The cube stands on every flight; a file of one flight does not.
     """
-    modules = [__name__, *export_modules("fused")]
-    origin = Provenance.of(modules, images, settings={"fusion": assessed["fusion"]})
-    return replace(origin, code_sha256=chained_sha256(code_sha256(*modules), [cube.attrs["code_sha256"]]))
+    origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
+    return replace(origin, code_sha256=chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]]))
 
 
 def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Radiometry]:

@@ -11,7 +11,7 @@ import xarray as xr
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
 from apertura.contracts import Window
-from apertura.focus.engines import ENGINES, instruction_set
+from apertura.focus.engines import instruction_set
 from apertura.focus.tiles import compute_tiles
 from apertura.imaging.certify import certified, measures
 from apertura.imaging.focus_check import focus_flags, focus_report
@@ -29,7 +29,6 @@ from apertura.quality.budget import expected
 from apertura.steps.stamping import stamped
 from apertura.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
 
-_MODULES = [__name__, *ENGINES.values()]
 _MISSING = np.complex64(complex(np.nan, np.nan))
 """What a tile that no pulse sees reads as; it is not stored."""
 
@@ -41,7 +40,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
 
     Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
     """
-    lineage = result_of(campaign, "image", flight, pair).begin(campaign.root, _MODULES)
+    lineage = result_of(campaign, "image", flight, pair).begin(campaign.root)
     work = _open(campaign, flight, pair, threads=threads)
     folder, echo, plan = work.folder, work.echo, work.formation.plan
     with writing(folder) as wip:
@@ -170,7 +169,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),
         "image",
-        modules=_MODULES,
+        modules=result_of(campaign, "image", flight, pair).modules,
         parents=[echo, profile, track.stage, *scene.parents],
         inputs=pattern_digests(campaign, pair),
         settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},

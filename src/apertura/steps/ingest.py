@@ -10,6 +10,7 @@ from apertura.errors import CampaignError
 from apertura.ingest import open_recording
 from apertura.ingest.recording import Recording
 from apertura.lineage import result_of
+from apertura.load.reading import read_log
 from apertura.load.transmitted import read_framing
 from apertura.paths import inside
 from apertura.settings import CONFIG, PulseWaveform, SampledWaveform
@@ -25,22 +26,22 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     CampaignError
         If a file is missing, damaged, or not what its format promises.
     """
-    logged = result_of(campaign, "track", flight, node).begin(campaign.root, [__name__])
-    log = campaign.read_log(flight, node)
+    logged = result_of(campaign, "track", flight, node).begin(campaign.root)
+    log = read_log(campaign, flight, node)
     read_by = campaign.log_settings(node)
-    track = stamped(log, "track", modules=[__name__], settings=read_by, inputs=logged.sources.digests)
+    track = stamped(log, "track", modules=logged.modules, settings=read_by, inputs=logged.sources.digests)
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
     preamble = () if recording.framing is None else (_preamble(recording, campaign),)
     recorded = result_of(campaign, "raw", flight, node).begin(
-        campaign.root, [__name__], further=[campaign.relative(path) for path in preamble]
+        campaign.root, further=[campaign.relative(path) for path in preamble]
     )
     if recording.framing is None:
         dataset, settings = recording.cut(recording.captures, node=node), {}
     else:
         dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
     dataset.attrs["samples"] = campaign.relative(recording.samples.path)
-    raw = stamped(dataset, "raw", modules=[__name__], settings=settings, inputs=recorded.sources.digests)
+    raw = stamped(dataset, "raw", modules=recorded.modules, settings=settings, inputs=recorded.sources.digests)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
     save_stage(raw, folders[0], lineage=recorded)
     save_stage(track, folders[1], lineage=logged)

@@ -10,7 +10,7 @@ from rasterio import Affine
 
 from apertura.atomic import write_json
 from apertura.campaign import Campaign
-from apertura.export import export_modules, write_exports
+from apertura.export import write_exports
 from apertura.interferometry.comparison import Compared, compared
 from apertura.interferometry.flags import raised
 from apertura.interferometry.level import Level
@@ -39,14 +39,13 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     """
     scene = open_scene(campaign)
     two = open_two(campaign, name, scene)
-    modules = [__name__, *export_modules("interferogram")]
-    lineage = result_of(campaign, "interferogram", name).begin(campaign.root, modules)
+    lineage = result_of(campaign, "interferogram", name).begin(campaign.root)
     tiles = scene.grid.tiles(campaign.settings.processing.tile_px)
     first, second = (stage.image for stage in two.images)
     window = campaign.settings.interferometry.window_px
     found = compared(first, second, two.ground, tiles, window=window)
     origin = Provenance.of(
-        modules,
+        lineage.modules,
         dict(zip(two.names, two.images, strict=True)),
         settings={"interferometry": campaign.relevant("interferogram"), "images": list(two.names)},
     )

@@ -13,7 +13,7 @@ from rasterio import Affine
 from apertura.antenna.beam import Beams
 from apertura.campaign import Campaign
 from apertura.contracts import Window
-from apertura.export import export_modules, write_exports
+from apertura.export import write_exports
 from apertura.export.layers import OUTSIDE
 from apertura.focus.inputs import Profiles
 from apertura.imaging.noise import PLACES, noise_power
@@ -35,15 +35,14 @@ from apertura.store import open_stage, record_files
 
 def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
     """Write incidence, bistatic angle, mask, looks and noise of one pair; return their paths."""
-    modules = [__name__, *export_modules("layers")]
-    lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root, modules)
+    lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
     beams = weighing(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
     noise = _noise(profiles, scene, beams)
     origin = Provenance.of(
-        modules,
+        lineage.modules,
         [echo, profile, *scene.parents],
         settings={**campaign.relevant("layers", pair), **scene.spec},
         inputs=pattern_digests(campaign, pair) | scene.inputs,

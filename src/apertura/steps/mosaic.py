@@ -17,7 +17,7 @@ def mosaic(campaign: Campaign) -> list[Path]:
 
     Flights lie upon one another in the order of config/flights.tsv, the last uppermost.
     """
-    lineage = result_of(campaign, "mosaic").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "mosaic").begin(campaign.root)
     made = _made(campaign.root, lineage.result.sources)
     styles = {row.file: row for kind in ("pair", "fused", "layers") for row in exports_in(kind) if row.style}
     written = []

@@ -45,7 +45,7 @@ _MOST_PANELS = 2  # pairs beside their sums
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
     """Write results/<flight>/report.html and the panels of its images; return their paths."""
-    lineage = result_of(campaign, "page", flight).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "page", flight).begin(campaign.root)
     reports = reports_of(campaign, flight)
     panels, text = campaign.result(flight, "fused", PANELS), campaign.result(flight, PAGE)
     _write_panels(panels, campaign, flight, reports["fused"], lineage)
@@ -138,7 +138,7 @@ def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[st
     west, south, east, north = scene.grid.bounds_m
     brightest = fused["brightest"]["x_m"] - west, fused["brightest"]["y_m"] - south
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    tags = tags_of(Provenance.of([__name__], images), lineage)
+    tags = tags_of(Provenance.of(lineage.modules, images), lineage)
     draw_panels(
         path, powers, size_m=(east - west, north - south), target_m=brightest, title=f"flight {flight}", tags=tags
     )
@@ -195,5 +195,5 @@ def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     path = campaign.result(PAGE)
     with replacement(path) as temporary:
         yield temporary, shipped() / "workflow" / "report" / "report.css"
-        lineage = result_of(campaign, "report").begin(campaign.root, [__name__])
+        lineage = result_of(campaign, "report").begin(campaign.root)
     record_files(campaign.root / lineage.result.manifest, [path], lineage)

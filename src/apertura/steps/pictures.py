@@ -42,11 +42,11 @@ Floats = NDArray[np.float64]
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     """Write the pictures of one pair; return their paths."""
-    lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root)
     shown = Shown(campaign, flight, pair)
     written = [campaign.result(flight, pair, "pictures", f"{name}.png") for name in PICTURES]
     geometry, pulses, phase, cuts, profiles, budget = written
-    origin = Provenance.of([__name__], [shown.echo, shown.profile, shown.image], settings=shown.scene.spec)
+    origin = Provenance.of(lineage.modules, [shown.echo, shown.profile, shown.image], settings=shown.scene.spec)
     drawn: dict[str, Any] = {"title": f"flight {flight}, {pair}", "tags": tags_of(origin, lineage)}
     quality = shown.image.attrs["quality"]
     draw_geometry(geometry, shown.geometry(), **drawn)

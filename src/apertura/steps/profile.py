@@ -28,7 +28,7 @@ from apertura.store import blocks_of_rows, finish, open_stage, write_blocks, wri
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr, block by block."""
-    lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
     aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
     check_antennas(scene.grid, scene.terrain, aperture, where=where)
@@ -49,7 +49,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     }
     settings, parents = {**campaign.relevant("profile", pair), **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
-    how: dict[str, Any] = {"modules": [__name__], "parents": parents, "settings": settings, "inputs": inputs}
+    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
     with writing(folder) as wip:
         write_blocks(wip, stage, "profile", _compressed(source, asked, window, scene))

@@ -9,7 +9,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign import Campaign
-from apertura.focus.engines import ENGINES
 from apertura.geometry.track_correction import TrackCorrection
 from apertura.imaging.stages import profiles_of
 from apertura.lineage import result_of
@@ -28,12 +27,10 @@ from apertura.refinement.refine import refine as refine_tracks
 from apertura.steps.stamping import stamped
 from apertura.store import open_stage, save_stage
 
-_MODULES = [__name__, *ENGINES.values()]
-
 
 def refine(campaign: Campaign, flight: str) -> Path:
     """Write results/<flight>/refined_track.zarr; where tracks are left as they are it says why, and has no knots."""
-    lineage = result_of(campaign, "refined_track", flight).begin(campaign.root, _MODULES)
+    lineage = result_of(campaign, "refined_track", flight).begin(campaign.root)
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
     asked = campaign.settings.processing.autofocus
     pairs = [] if asked == "off" else [open_pair(campaign, flight, pair) for pair in names]
@@ -52,7 +49,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
     settings = {**campaign.relevant("refined_track"), "refined": found.accepted}
     # Images that are formed from the logs stand on their own echoes alone, whatever was looked at here.
-    how: dict[str, Any] = {"modules": _MODULES, "settings": settings, **(inherits if found.accepted else {})}
+    how: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if found.accepted else {})}
     save_stage(stamped(stage, "refined_track", **how), folder, lineage=lineage)
     return folder
 

@@ -1,7 +1,6 @@
 """Rule `ro_crate`: the whole run as an RO-Crate, results/ro-crate-metadata.json; last of all."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,14 +16,13 @@ from apertura.environment import lock_sha256, software
 from apertura.lineage import on_demand, places_of, result_of
 from apertura.paths import inside, shipped
 from apertura.provenance import sha256_text
-from apertura.steps.code import code_of
 from apertura.steps.jobs import RuleRun, job_of
 from apertura.store import read_manifest, record_files, remake
 
 
 def ro_crate(campaign: Campaign) -> list[Path]:
     """Write results/ro-crate-metadata.json, and the workflow beside it; return their paths."""
-    lineage = result_of(campaign, "ro_crate").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "ro_crate").begin(campaign.root)
     manifest, workflow = campaign.root / lineage.result.manifest, _workflow()
     manifest.unlink(missing_ok=True)
     for name, text in workflow.items():
@@ -86,11 +84,11 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
     known
         File of the campaign → sha256, of inputs as the first result found them, of results as they are.
     """
-    code, jobs = cache(code_of), dict[RuleRun, list[_Made]]()
+    jobs = dict[RuleRun, list[_Made]]()
     for one in made:
         jobs.setdefault(job_of(one.name, one.where), []).append(one)
     for job, parts in jobs.items():
-        doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, code(one.name), known)]
+        doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, known)]
         yield Job(
             job.rule,
             job.where,
@@ -103,10 +101,10 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
         )
 
 
-def _doubts(recorded: Mapping[str, Any], result: Result, code: str, known: Mapping[str, str]) -> Iterator[str]:
+def _doubts(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
     """Yield why a result would not be made so today."""
-    if recorded["code"] != code:
-        yield f"made by other code than is installed now, which is {code}"
+    if recorded["code"] != result.code_sha256:
+        yield f"made by other code than is installed now, which is {result.code_sha256}"
     if recorded["settings"] != result.settings_sha256:
         yield f"made under other settings than these, of sha256 {recorded['settings']}"
     for name, sha256 in recorded["sources"].items():

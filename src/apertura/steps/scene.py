@@ -13,7 +13,7 @@ from apertura.store import open_stage, save_document
 
 def scene(campaign: Campaign) -> Path:
     """Write results/scene.json: the grid that config/config.yaml asks for and the height of its ground, and why."""
-    lineage = result_of(campaign, "scene").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "scene").begin(campaign.root)
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
     document = {"grid": asdict(grid), "height_m": height_m, "chosen": chosen, "inputs": ground.inputs}

@@ -32,7 +32,7 @@ _SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
 
 def stac(campaign: Campaign) -> list[Path]:
     """Write results/stac/; return the path of catalog.json, where it begins."""
-    lineage = result_of(campaign, "stac").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "stac").begin(campaign.root)
     manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
     described = _Described(campaign, settled_scene(campaign))
     files = catalog_files(campaign.settings.campaign, described.images())

@@ -1,5 +1,6 @@
 """Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ def terrain(campaign: Campaign) -> Path:
     CampaignError
         If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
     """
-    lineage = result_of(campaign, "terrain").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "terrain").begin(campaign.root)
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
     grid, ground = scene.grid, Ground.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
     if ground.dem is None:
@@ -37,7 +38,7 @@ def terrain(campaign: Campaign) -> Path:
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = resume(wip, _empty(campaign, scene, ground), "height", windows)
+        missing = resume(wip, _empty(campaign, scene, ground, lineage.modules), "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
@@ -54,7 +55,7 @@ def terrain(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(campaign: Campaign, scene: OpenScene, ground: Ground) -> xr.Dataset:
+def _empty(campaign: Campaign, scene: OpenScene, ground: Ground, modules: Sequence[str]) -> xr.Dataset:
     """Return the stamped stage without its heights."""
     return stamped(
         xr.Dataset(
@@ -63,7 +64,7 @@ def _empty(campaign: Campaign, scene: OpenScene, ground: Ground) -> xr.Dataset:
             attrs={"frame": scene.grid.frame, "terrain": {}},
         ),
         "terrain",
-        modules=[__name__],
+        modules=modules,
         settings={**campaign.relevant("terrain"), **scene.spec},
         inputs=ground.inputs,
     )

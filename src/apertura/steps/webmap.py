@@ -28,7 +28,7 @@ _MOST_TARGETS = 1000
 
 def webmap(campaign: Campaign) -> list[Path]:
     """Write results/map/map.json; return its path."""
-    lineage = result_of(campaign, "map").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "map").begin(campaign.root)
     scene = settled_scene(campaign)
     images, places = [], [*_stated(campaign)]
     notes: list[str] = []

@@ -84,7 +84,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
     adds to the planned error is added to that of every setting.
     """
-    lineage = result_of(campaign, "speed_accuracy").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
     logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
     scene = open_scene(campaign)
     profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))

@@ -61,7 +61,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
         Of every setting, taken in turn, so that what else the machine does touches all alike; one before them, which
         is not counted, opens libraries and files.
     """
-    lineage = result_of(campaign, "whole").begin(campaign.root, [__name__])
+    lineage = result_of(campaign, "whole").begin(campaign.root)
     work = with_inputs(campaign, campaign.result(STUDY) / "whole", link=False)
     choices = {
         name: _chosen(campaign, work, changes) for name, changes in _SETTINGS.items() if _applies(campaign, name)

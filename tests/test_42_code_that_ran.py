@@ -1,0 +1,144 @@
+"""A result's code hash covers what its step runs: every module whose functions the step calls, and no more."""
+
+import shutil
+import sys
+import threading
+
+import pytest
+
+from apertura.campaign import Campaign
+from apertura.code_imports import PACKAGE, WITHOUT_EFFECT, import_closure
+from apertura.lineage import RESULTS, places_of, result_of
+from apertura.provenance import code_sha256
+from apertura.steps import (
+    assess,
+    calibration,
+    coverage,
+    cphd,
+    cube,
+    echo,
+    export,
+    image,
+    ingest,
+    interferogram,
+    layers,
+    mosaic,
+    page,
+    pictures,
+    profile,
+    refine,
+    ro_crate,
+    scene,
+    stac,
+    terrain,
+    webmap,
+)
+
+STEPS = {
+    "raw": ingest.ingest,
+    "echo": echo.echo,
+    "calibration": calibration.calibrate,
+    "scene": scene.scene,
+    "terrain": terrain.terrain,
+    "profile": profile.profile,
+    "refined_track": refine.refine,
+    "image": image.image,
+    "layers": layers.layers,
+    "assessment": assess.assess,
+    "export": export.export,
+    "cphd": cphd.cphd,
+    "coverage": coverage.coverage,
+    "cube": cube.cube,
+    "fused": export.export_fused,
+    "interferogram": interferogram.interferogram,
+    "mosaic": mosaic.mosaic,
+    "stac": stac.stac,
+    "pictures": pictures.pictures,
+    "page": page.page,
+    "map": webmap.webmap,
+    "ro_crate": ro_crate.ro_crate,
+}
+
+
+def module_of(frame):
+    return frame.f_globals.get("__name__") or ""
+
+
+def called(step, *arguments):
+    """Run a step; return the modules of apertura whose functions it called, in any thread."""
+    modules = set()
+
+    def note(frame, event, _):
+        if event == "call" and module_of(frame) not in modules:
+            callers = [module_of(frame)]
+            while (frame := frame.f_back) is not None:
+                callers.append(module_of(frame))
+            if not any(name.startswith(WITHOUT_EFFECT) for name in callers):
+                modules.add(callers[0])
+
+    threading.setprofile(note)
+    sys.setprofile(note)
+    try:
+        step(*arguments)
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    return {name for name in modules if name.startswith("apertura.")}
+
+
+@pytest.mark.slow
+def test_every_module_that_a_step_calls_is_code_of_its_result(tiny):
+    campaign = Campaign.load(tiny)
+    missing = {}
+    for name, where, result in places_of(campaign):
+        if name in STEPS:
+            known = set(import_closure(result.modules))
+            if name == "raw":  # one step makes both
+                known |= set(import_closure(result_of(campaign, "track", *where).modules))
+            further = called(STEPS[name], campaign, *where) - known
+            if further:
+                missing[name, *where] = sorted(further)
+    assert missing == {}
+
+
+EVERY = frozenset(RESULTS)
+FOCUSED = {"refined_track", "image", "assessment", "pictures", "speed_accuracy", "whole"}
+READ = FOCUSED | {"raw", "track", "echo", "profile", "layers"}
+
+
+CHANGES = [
+    ("ingest/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
+    ("ingest/csv_track.py", "comment", set()),
+    ("ingest/csv_track.py", "code", READ - {"raw"}),
+    ("ingest/sigmf.py", "code", READ - {"track"}),
+    ("webmap/page.py", "code", set()),  # what a browser is shown, of results that are there
+    ("flags/images.py", "code", {"page", "report", "map"}),
+    ("errors.py", "code", set()),
+    ("settings/nodes.py", "docstring", set()),
+    ("echo/dechirp.py", "docstring", set()),
+    ("export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
+    ("lineage/products.py", "code", set()),  # sources and settings are compared for themselves
+    ("focus/engines/numba.py", "comment", set()),
+    ("focus/engines/numba.py", "code", FOCUSED),
+    ("constants.py", "code", EVERY),
+]
+EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edited."""\n'}
+
+
+@pytest.mark.slow
+def test_a_change_makes_again_what_runs_it_and_nothing_else(tiny, tmp_path):
+    copied = shutil.copytree(
+        PACKAGE, tmp_path / "package", ignore=shutil.ignore_patterns("__pycache__", "*.so", "page")
+    )
+    modules = {(name, result.modules) for name, _, result in places_of(Campaign.load(tiny))}
+
+    def hashes():
+        return {(name, code_sha256(*run, package=copied)) for name, run in modules}
+
+    before, found = hashes(), []
+    for file, edit, _ in CHANGES:
+        source = (copied / file).read_text()
+        (copied / file).write_text(source + EDITS[edit])
+        found.append((file, edit, {name for name, _ in hashes() - before}))
+        (copied / file).write_text(source)
+    assert found == [(file, edit, again & {name for name, _ in modules}) for file, edit, again in CHANGES]
