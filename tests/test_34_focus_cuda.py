@@ -87,13 +87,18 @@ def test_pulses_that_are_weighed_are_left_to_other_engines(monkeypatch):
         assert "cuda" not in told.value.expected
 
 
-def test_a_device_is_taken_for_large_images_and_not_for_small_ones(monkeypatch):
-    """Where one can be used: its first kernel takes longer to start than a small image takes on a processor."""
+def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
+    """However large the image and however few the seconds predicted; not as a fallback either."""
     monkeypatch.setattr(cuda, "available", lambda: True)
-    assert plan().engine != "cuda"
     large = plan(shape=(20000, 20000))
-    assert large.engine == "cuda"
-    assert any("seconds are not measured" in decision.reason for decision in large.decisions)
+    assert "cuda" not in {large.engine, *(setting.engine for setting in large.fallbacks)}
+    for asked in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
+        named = plan(shape=(20000, 20000), overrides=asked)
+        assert named.engine == "cuda"
+        assert any("seconds are not measured" in decision.reason for decision in named.decisions)
+    monkeypatch.setattr(cuda, "TIMED", True)
+    assert plan(shape=(20000, 20000)).engine == "cuda"
+    assert plan().engine != "cuda"  # its first kernel takes longer to start than a small image on a processor
 
 
 def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):

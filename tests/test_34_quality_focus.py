@@ -6,7 +6,14 @@ import pytest
 from apertura.geometry.aperture import Aperture
 from apertura.quality.agreement import agreement
 from apertura.quality.bright_points import BrightPoint, bright_points, common_shift
-from apertura.quality.budget import BudgetLine, NodePositions, accuracy_for, expected, position_lines
+from apertura.quality.budget import (
+    BudgetLine,
+    NodePositions,
+    accuracy_for,
+    expected,
+    position_lines,
+    strictest_accuracy_db,
+)
 from apertura.quality.focus import judge, judge_parts, point_focus
 from apertura.quality.path_errors import Effect, PointPaths
 from apertura.quality.sub_apertures import compare_parts
@@ -126,6 +133,14 @@ def test_what_nobody_stated_is_not_summed_and_does_not_set_the_arithmetic():
     assert accuracy_for([silent]) == -60.0
     assert accuracy_for([silent, stated]) == pytest.approx(-56.4, abs=0.1)
     assert accuracy_for([BudgetLine("positions", "1 cm", Effect(-1.2, 0.1, 0.1))]) == -40.0
+
+
+@pytest.mark.parametrize("loss_db", [0.0, -1e-7, -1e-4, -0.1, -3.0])
+def test_an_echo_serves_every_image_that_auto_may_ask_for(loss_db):
+    """Its clock is corrected, or not, before the budget that auto follows from is known."""
+    asked = accuracy_for([BudgetLine("positions", "stated", Effect(loss_db, 0.0, 0.0))])
+    assert strictest_accuracy_db("auto") <= asked
+    assert strictest_accuracy_db(-45.0) == -45.0
 
 
 def lobes(places, *, turned=0.0, carrier=1.1):

@@ -12,13 +12,14 @@ from apertura.antenna.illumination import illuminate
 from apertura.focus.inputs import PhaseHistory, Profiles
 from apertura.focus.job import Job
 from apertura.imaging.checks import check_inputs
-from apertura.imaging.choices import ACCURACY_DB, ImagingChoices
+from apertura.imaging.choices import ImagingChoices
 from apertura.imaging.formation import Formation
 from apertura.imaging.job import imaging_job, profiles_job
 from apertura.imaging.range_profiles import RangeWindow, range_compress
 from apertura.imaging.stages import inputs_of
 from apertura.planning.memory import memory_limit
 from apertura.planning.planner import make_plan
+from apertura.quality.budget import MOST_ACCURACY_DB
 from apertura.quality.error_bound import CONFIDENCE, ErrorBound, error_bound
 from apertura.scene.grid import SceneGrid
 from apertura.scene.ground_models import GroundModels
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 def backproject(
     profiles: "Profiles | PhaseHistory | xr.Dataset",
     grid: SceneGrid,
-    accuracy_db: float = ACCURACY_DB,
+    accuracy_db: float = MOST_ACCURACY_DB,
     *,
     terrain: Terrain | float | None = None,
     engine: str = "auto",

@@ -6,9 +6,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from apertura.focus.engines import ENGINES, PATCH_PX, load_engine
 
-ACCURACY_DB = -60.0
-"""Numerical error asked where nothing is known of other errors."""
-
 
 class Degrees(BaseModel):
     """So much of a straight pass."""
@@ -87,11 +84,6 @@ class ImagingChoices(BaseModel):
     def integrated(self) -> Any:
         """How much of a pass is asked for: 'auto', 'all', or a mapping."""
         return self.integration if isinstance(self.integration, str) else self.integration.model_dump()
-
-    @property
-    def asked_db(self) -> float:
-        """The numerical error asked, or that of `ACCURACY_DB` where it is to follow from other errors."""
-        return ACCURACY_DB if self.accuracy_db == "auto" else self.accuracy_db
 
     @field_validator("engine")
     @classmethod

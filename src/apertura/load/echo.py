@@ -23,6 +23,7 @@ from apertura.load.node_log import Times
 from apertura.load.positions import Placed, place
 from apertura.load.segments import keep_segments
 from apertura.load.transmitted import Transmitted
+from apertura.quality.budget import strictest_accuracy_db
 from apertura.settings import Processing, PulseWaveform
 
 Complexes = NDArray[np.complex64]
@@ -173,7 +174,7 @@ def _transfer(
         symbol_samples=sent.waveform.capture_samples,
         sidelink_m=length_m,
         method=processing.sidelink,
-        accuracy_db=processing.asked_db,
+        accuracy_db=strictest_accuracy_db(processing.accuracy_db),
         where=str(rx.files),
     )
     return _of_what_was_sent(measured, sent), length_m[measured.kept]

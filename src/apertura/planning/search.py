@@ -136,7 +136,10 @@ class Search:
             yield Decision(name, chosen.all_options[name], why + reason)
 
     def _engines(self) -> list[str]:
-        """Return the engines that can run here and that what is asked for leaves."""
+        """Return the engines that can run here and that what is asked for leaves; untimed ones where they are named.
+
+        Seconds that nobody has measured are no reason to prefer an engine.
+        """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
         if self.engine is not None and self.engine not in runnable:
@@ -149,7 +152,7 @@ class Search:
         if self.engine is not None:
             return [self.engine]
         stated = [name for name in runnable if any(v is not None for v in self.options.get(name, {}).values())]
-        return stated or runnable
+        return stated or [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
 
     def _unfit(self, what: str, others: list[str], remedy: str = "") -> CampaignError:
         return CampaignError(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +149,17 @@ def expected(lines: Iterable[BudgetLine]) -> Effect:
 def noise_loss(variance_rad2: float) -> Effect:
     """Return what phase noise that forgets itself from pulse to pulse does: exp(-σ²) of the peak's power."""
     return Effect(-10 * math.log10(math.e) * variance_rad2, 0.0, 0.0)
+
+
+def strictest_accuracy_db(asked: float | Literal["auto"]) -> float:
+    """Return the smallest numerical error that an image may ask for: what an echo, formed before images, must serve.
+
+    Examples
+    --------
+    >>> strictest_accuracy_db("auto"), strictest_accuracy_db(-45.0)
+    (-60.0, -45.0)
+    """
+    return MOST_ACCURACY_DB if asked == "auto" else asked
 
 
 def accuracy_for(lines: Iterable[BudgetLine]) -> float:

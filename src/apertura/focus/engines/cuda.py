@@ -20,9 +20,10 @@ from apertura.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.focus.engines.native_tables import TableDesign, design_table
 from apertura.focus.inputs import Profiles
 
-__all__ = ["NEEDS", "READS", "available", "candidates", "form", "instruction_set", "prepare"]
+__all__ = ["NEEDS", "READS", "TIMED", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
+TIMED = False  # no device was at hand: the seconds of cuda_prediction are others', and auto compares measured ones
 NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
 
 

@@ -88,6 +88,8 @@ class Engine(Protocol):
         Whether it can run here.
     NEEDS
         What it needs to run, in a few words; an engine that runs everywhere leaves it out.
+    TIMED
+        False where nobody has measured its seconds: it is taken where it is asked for, and never by the planner alone.
     candidates
         (job, pulses=, asked=) → settings with predicted error and cost; `pulses` may be fewer than the job's, `asked`
         holds options that a person asks for.
