@@ -37,7 +37,8 @@ def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray
     """
     if correlation_s <= 0:
         return (lag_s == 0).astype(np.float64)
-    return np.clip(1 - lag_s / correlation_s, 0, None)
+    falling: NDArray[np.float64] = np.clip(1 - lag_s / correlation_s, 0, None)
+    return falling
 
 
 @dataclass(frozen=True)
