@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import pytest
 from folders import SHARED, copy_writable, run_steps
+from in_this_process import Processes
 
 from apertura.focus.engines import ENGINES, native, native_binding
+from apertura.ingest import isolated
 from apertura.simulation import ImageGrid, preset, simulate
 
 # They run in other environments: of roc-validator, of QGIS.
@@ -57,3 +59,10 @@ def isa(request, monkeypatch):
 def toy(monkeypatch):
     """The engine of `toy_engine.py`, known by its one row."""
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
+
+
+@pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
+def reader(request, monkeypatch):
+    """What reads files that may crash their reader: this process, at once; by `make test-slow` one of its own, too."""
+    if request.param == "here":
+        monkeypatch.setattr(isolated, "subprocess", Processes)
