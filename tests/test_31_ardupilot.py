@@ -218,6 +218,7 @@ def log(request, tmp_path_factory):
     return tmp_path_factory.mktemp("damaged") / f"a.track{request.param}"
 
 
+@pytest.mark.quick(".bin")
 @DAMAGED
 @given(PLACES)
 def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
@@ -227,6 +228,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(PLACES, st.integers(0, 7)), min_size=1, max_size=4))
 def test_no_flipped_bit_moves_a_position_silently(log, flips):
@@ -238,6 +240,7 @@ def test_no_flipped_bit_moves_a_position_silently(log, flips):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
 def test_messages_in_another_order_are_refused_or_the_same(log, random, swaps):

@@ -303,6 +303,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(place, size):
         assert track.sizes["epoch"] <= 60
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(st.integers(0, len(MESSAGES) - 1), st.integers(0, 7)), min_size=1, max_size=4))
 def test_no_flipped_bit_moves_a_position_silently(place, flips):
@@ -314,6 +315,7 @@ def test_no_flipped_bit_moves_a_position_silently(place, flips):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
 def test_messages_in_another_order_are_refused_or_the_same(place, random, swaps):
