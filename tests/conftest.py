@@ -1,15 +1,55 @@
-"""Shared campaigns: the real ones beside the repository, and small simulated ones made once a session."""
+"""Shared campaigns: the real ones beside the repository, and small simulated ones made once a run. What is slow."""
 
+import fcntl
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
 import pytest
 from folders import SHARED, copy_writable, run_steps
+from in_this_process import Processes
 
+from apertura.campaign import Campaign
 from apertura.focus.engines import ENGINES, native, native_binding
+from apertura.ingest import isolated
 from apertura.simulation import ImageGrid, preset, simulate
 
 # They run in other environments: of roc-validator, of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Of tests that are marked ``quick(*ids)``, rows of other ids are slow; an id may hold stars."""
+    named, met = {}, set()
+    for item in items:
+        marker = item.get_closest_marker("quick")
+        if marker:
+            function, row = item.nodeid.partition("[")[0], item.callspec.id
+            named |= {(function, quick): item for quick in marker.args}
+            matching = [(function, quick) for quick in marker.args if fnmatchcase(row, quick)]
+            met.update(matching)
+            if not matching:
+                item.add_marker(pytest.mark.slow)
+    gone = [f"{function}[{row}]" for function, row in named.keys() - met]
+    if gone and not any("::" in arg for arg in config.args):
+        raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(gone))}")
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory, worker_id):
+    """A folder that is made by the first worker that asks for it, and read by all."""
+
+    def made(name, make):
+        base = tmp_path_factory.getbasetemp()
+        base = base if worker_id == "master" else base.parent
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (base / f"{name}.made").exists():
+                make(base / name / "campaign")
+                (base / f"{name}.made").touch()
+        return base / name / "campaign"
+
+    return made
 
 
 @pytest.fixture(scope="session")
@@ -21,9 +61,9 @@ def shared():
 
 
 @pytest.fixture(scope="session")
-def _tiny(tmp_path_factory):
+def _tiny(made_once):
     plan = replace(preset("demo", pulses=40), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
-    return simulate(tmp_path_factory.mktemp("tiny") / "campaign", plan, seed=7)
+    return made_once("tiny", lambda root: simulate(root, plan, seed=7))
 
 
 @pytest.fixture
@@ -33,20 +73,25 @@ def tiny(_tiny, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def finished_tiny(_tiny, tmp_path_factory):
+def finished_tiny(_tiny, made_once):
     """The tiny campaign with all its results; read only."""
-    return run_steps(copy_writable(_tiny, tmp_path_factory.mktemp("finished") / "campaign"))
+    return Campaign.load(made_once("finished", lambda root: run_steps(copy_writable(_tiny, root))))
 
 
 @pytest.fixture(scope="session")
-def finished_sample(shared, tmp_path_factory):
+def finished_sample(shared, made_once):
     """The independently made campaign-sample with all its results; read only."""
-    return run_steps(copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign"))
+    return Campaign.load(made_once("sample", lambda root: run_steps(copy_writable(shared / "campaign-sample", root))))
 
 
-@pytest.fixture(params=native.INSTRUCTION_SETS)
+WIDEST = next(filter(native_binding.runs, native.INSTRUCTION_SETS), None)
+
+
+@pytest.fixture(
+    params=[pytest.param(isa, marks=[] if isa == WIDEST else [pytest.mark.slow]) for isa in native.INSTRUCTION_SETS]
+)
 def isa(request, monkeypatch):
-    """Each instruction set of the compiled engine that this machine runs, in turn."""
+    """Each instruction set of the compiled engine that this machine runs, in turn; the one that is taken is quick."""
     if not native_binding.runs(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
@@ -57,3 +102,10 @@ def isa(request, monkeypatch):
 def toy(monkeypatch):
     """The engine of `toy_engine.py`, known by its one row."""
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
+
+
+@pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
+def reader(request, monkeypatch):
+    """What reads files that may crash their reader: this process, at once; by `make test-slow` one of its own, too."""
+    if request.param == "here":
+        monkeypatch.setattr(isolated, "subprocess", Processes)

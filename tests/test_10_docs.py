@@ -4,9 +4,8 @@ import json
 import pkgutil
 import re
 import tomllib
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -31,38 +30,47 @@ _NAME_IN_FILE = re.compile(r"`(\w+)` (?:of `\w+` )?in `([\w/.]+\.(?:py|hpp|cpp|s
 ENTRY_POINTS = {"apertura.exports"}
 """Groups of entry points: names, but not of modules."""
 
-parametrized = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+
+@cache
+def text_of(path):
+    return path.read_text(encoding="utf-8")
 
 
-def text_of(document):
-    return document.read_text(encoding="utf-8")
+@cache
+def anywhere(name):
+    return any(any((ROOT / folder).rglob(name)) for folder in SOURCES)
 
 
 def is_there(name, document):
     """A path counts from the root, src/apertura or the document; a name alone may stand anywhere in the code."""
     if any(any(place.glob(name.rstrip("/"))) for place in (*PLACES, document.parent)):
         return True
-    return "/" not in name and any(any((ROOT / folder).rglob(name)) for folder in SOURCES)
+    return "/" not in name and anywhere(name)
 
 
-@parametrized
-def test_every_file_that_a_document_names_is_there(document):
-    text = text_of(document)
-    named = {*_FILE.findall(text), *(name for name in _FOLDER.findall(text) if "." not in Path(name).name)}
-    assert [name for name in sorted(named) if not is_there(name, document)] == []
-    assert [link for link in _LINK.findall(text) if not (document.parent / link).exists()] == []
+def missing(found, documents=DOCUMENTS):
+    """Return document → what of it is not there, of those that lack something; each is asked in one pass."""
+    assert len(documents) > 20
+    lacking = {document.relative_to(ROOT).as_posix(): sorted(found(document)) for document in documents}
+    return {document: names for document, names in lacking.items() if names}
 
 
-@parametrized
-def test_every_test_that_a_document_cites_exists(document):
+def test_every_file_that_a_document_names_is_there():
+    def lacking(document):
+        text = text_of(document)
+        named = {*_FILE.findall(text), *(name for name in _FOLDER.findall(text) if "." not in Path(name).name)}
+        yield from (name for name in named if not is_there(name, document))
+        yield from (link for link in _LINK.findall(text) if not (document.parent / link).exists())
+
+    assert missing(lacking) == {}
+
+
+def test_every_test_that_a_document_cites_exists():
     written = set(re.findall(r"^\s*def (test_\w+)", "\n".join(map(text_of, ROOT.glob("tests/*.py"))), re.M))
-    assert sorted(set(_TEST.findall(text_of(document))) - written) == []
+    assert missing(lambda document: set(_TEST.findall(text_of(document))) - written) == {}
 
 
-@pytest.mark.parametrize(
-    "document", [*ROOT.glob("docs/theory/*.md"), *ROOT.glob("docs/[gt]*.md")], ids=lambda path: path.stem
-)
-def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code(document):
+def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code():
     files = [
         ROOT / "config/schema.json",
         *(ROOT / "native").glob("*.?pp"),
@@ -70,44 +78,66 @@ def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code(docu
         *ROOT.glob("tests/*.py"),
     ]
     code = set(re.findall(r"\w+", "\n".join(map(text_of, files))))
-    quoted = [name for name in re.findall(r"`([^`\n]+)`", text_of(document)) if not re.search(r"[/*{]|\.\w+$", name)]
-    words = {word for name in quoted for word in re.findall(r"[A-Za-z]\w*", name) if re.search(r"_|[a-z][A-Z]", word)}
-    assert sorted(words - code) == []
+
+    def lacking(document):
+        quoted = re.findall(r"`([^`\n]+)`", text_of(document))
+        words = [re.findall(r"[A-Za-z]\w*", name) for name in quoted if not re.search(r"[/*{]|\.\w+$", name)]
+        return {word for some in words for word in some if re.search(r"_|[a-z][A-Z]", word)} - code
+
+    assert missing(lacking, [*ROOT.glob("docs/theory/*.md"), *ROOT.glob("docs/[gt]*.md")]) == {}
 
 
-@parametrized
-def test_every_dotted_name_in_a_document_resolves(document):
-    for name in sorted(set(_DOTTED.findall(text_of(document))) - ENTRY_POINTS):
-        assert pkgutil.resolve_name(re.sub(r"^ap\.", "apertura.", name)) is not None
+def resolves(name):
+    try:
+        return pkgutil.resolve_name(re.sub(r"^ap\.", "apertura.", name)) is not None
+    except (ImportError, AttributeError):
+        return False
 
 
-@parametrized
-def test_every_command_that_a_document_gives_exists(document):
+def test_every_dotted_name_in_a_document_resolves():
+    def lacking(document):
+        return (name for name in set(_DOTTED.findall(text_of(document))) - ENTRY_POINTS if not resolves(name))
+
+    assert missing(lacking) == {}
+
+
+def test_every_command_that_a_document_gives_exists():
     from typer.main import get_command
 
     from apertura.cli import app
 
     commands = get_command(app).commands
-    shown = re.findall(r"`([^`\n]*)`|^(?:    |\$ )(.*)$", text_of(document), re.M)
-    for group, command in _COMMAND.findall("\n".join("".join(pair) for pair in shown)):
-        known = commands[group.strip()].commands if group else commands
-        assert command in known, f"apertura {group}{command}"
+
+    def lacking(document):
+        shown = re.findall(r"`([^`\n]*)`|^(?:    |\$ )(.*)$", text_of(document), re.M)
+        for group, command in _COMMAND.findall("\n".join("".join(pair) for pair in shown)):
+            known = commands[group.strip()].commands if group else commands
+            if command not in known:
+                yield f"apertura {group}{command}"
+
+    assert missing(lacking) == {}
 
 
-@parametrized
-def test_every_key_of_the_config_that_a_document_names_exists(document):
-    schema = json.loads((ROOT / "config/schema.json").read_text(encoding="utf-8"))
+def test_every_key_of_the_config_that_a_document_names_exists():
+    schema = json.loads(text_of(ROOT / "config/schema.json"))
     parts = [schema, *schema["$defs"].values()]
     keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
-    named = {word for key in _KEY.findall(text_of(document)) for word in key.split(".") if not word.startswith("<")}
-    assert sorted(named - keys) == []
+
+    def lacking(document):
+        named = {word for key in _KEY.findall(text_of(document)) for word in key.split(".")}
+        return {word for word in named if not word.startswith("<")} - keys
+
+    assert missing(lacking) == {}
 
 
-@parametrized
-def test_a_name_that_a_document_puts_in_a_file_stands_there(document):
-    for name, file in _NAME_IN_FILE.findall(text_of(document)):
-        path = next(place / file for place in PLACES if (place / file).is_file())
-        assert re.search(rf"\b{name}\b", text_of(path)), f"{file} has no {name}"
+def test_a_name_that_a_document_puts_in_a_file_stands_there():
+    def lacking(document):
+        for name, file in _NAME_IN_FILE.findall(text_of(document)):
+            path = next(place / file for place in PLACES if (place / file).is_file())
+            if not re.search(rf"\b{name}\b", text_of(path)):
+                yield f"{file} has no {name}"
+
+    assert missing(lacking) == {}
 
 
 def test_the_first_name_of_every_answer_of_the_guide_stands_in_its_file():

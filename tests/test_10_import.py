@@ -35,14 +35,11 @@ def test_reading_a_config_loads_no_arrays():
     assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.campaign")
 
 
-@pytest.mark.parametrize(
-    "name",
-    sorted(apertura.__all__),
-)
-def test_a_public_name_is_documented_and_listed(name):
-    assert getattr(apertura, name).__doc__
-    assert getattr(apertura, name) is vars(apertura)[name]
-    assert name in dir(apertura)
+def test_every_public_name_is_documented_and_listed():
+    for name in apertura.__all__:
+        assert getattr(apertura, name).__doc__, name
+        assert getattr(apertura, name) is vars(apertura)[name]
+        assert name in dir(apertura)
 
 
 def test_a_name_that_is_not_public_is_an_attribute_error():

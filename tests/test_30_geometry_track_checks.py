@@ -42,6 +42,7 @@ def checked(time_s, place, *, poor=None, tolerated_m=X_BAND_M):
     return check_track(time_s, place, poor_fix=nothing if poor is None else poor, tolerated_m=tolerated_m)
 
 
+@pytest.mark.quick("*-hover", "*-straight", "*-circle", "10.0-legs", "50.0-legs", "100.0-legs")
 @pytest.mark.parametrize("kind", ["hover", "straight", "circle", "legs"])
 @pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0, 10.0, 50.0, 100.0])
 def test_a_good_log_has_no_fault_and_no_hole(kind, rate_hz):

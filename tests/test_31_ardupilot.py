@@ -36,6 +36,7 @@ def apart_m(track):
     return np.linalg.norm(track.position.values - where, axis=1)
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("suffix", KINDS)
 def test_a_track_is_what_the_receiver_said(tmp_path, suffix):
     track = read(tmp_path, dataflash_rows(), suffix=suffix)
@@ -69,6 +70,7 @@ def test_the_log_written_here_is_one_to_the_makers_own_reader(tmp_path):
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values)[:, 2] - N_M, places[2], atol=1e-6)
 
 
+@pytest.mark.usefixtures("reader")
 def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_path):
     """GPS1_DELAY_MS says by how much it hears of an epoch late; 0 leaves it to the driver, 120 ms here."""
     said = read(tmp_path, dataflash_rows(parameters={"GPS1_DELAY_MS": 220.0}))
@@ -77,6 +79,7 @@ def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_p
     np.testing.assert_allclose(turned, 0.1 * np.degrees(8 / 50), atol=2e-3)
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("suffix", KINDS)
 def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, suffix):
     rows = dataflash_rows(without_ael=True)
@@ -86,12 +89,14 @@ def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, suffi
     assert apart_m(read(tmp_path, rows, suffix=suffix, options=LogOptions(height_offset_m=N_M))).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 def test_ellipsoidal_heights_of_a_driver_that_turns_the_geoid_over_are_not_used(tmp_path):
     rows = dataflash_rows(parameters={"GPS_TYPE": 15})
     assert "NovAtel" in complaint(lambda: read(tmp_path, rows))
     assert apart_m(read(tmp_path, rows, options=LogOptions(height_offset_m=N_M))).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 def test_one_of_several_receivers_is_chosen_by_number(tmp_path):
     """The second is 1e-5 degrees, 1.11 m, to the north."""
     rows = dataflash_rows(receivers=(0, 1))
@@ -106,6 +111,7 @@ def test_one_of_several_receivers_is_chosen_by_number(tmp_path):
     assert "nodes.a.log.body" in message
 
 
+@pytest.mark.usefixtures("reader")
 def test_messages_of_a_second_receiver_in_older_logs_are_its_own(tmp_path):
     own = "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"
     forms = dict.fromkeys(("GPS", "GPS2"), ("QBIHBcLLeffffB", own))
@@ -119,12 +125,14 @@ def test_messages_of_a_second_receiver_in_older_logs_are_its_own(tmp_path):
     assert moved[1] - moved[0] == pytest.approx(1e-5, abs=2e-7)
 
 
+@pytest.mark.usefixtures("reader")
 def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path):
     track = read(tmp_path, dataflash_rows(Status=np.resize([6, 5, 4, 3, 2, 1], 60)))
     assert track.attrs["dropped"] == {"no fix": 20}
     assert Counter(track.fix.values.tolist()) == {1: 10, 2: 10, 4: 10, 5: 10}
 
 
+@pytest.mark.usefixtures("reader")
 def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
     weeks = np.where(np.arange(60) < 9, 0, 2366)
     assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no time of the receiver": 9}
@@ -133,12 +141,14 @@ def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
     assert "nodes.a.log.start_utc" in message
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_flight_before_the_last_leap_seconds_is_behind_by_fewer(tmp_path):
     """Week 1850, in June 2015, was 16 s ahead of UTC; the same milliseconds ten years later are 18 s ahead."""
     track = read(tmp_path, dataflash_rows(GWk=np.full(60, 1850)))
     assert (track.time.values[0] - START) / SECOND == (1850 - 2366) * 7 * 86400 + 2
 
 
+@pytest.mark.usefixtures("reader")
 def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path):
     moved = [
         (name, {**v, "Lat": v["Lat"] + 1e-5 * (name == "GPS" and n == 59)}) if name == "GPS" else (name, v)
@@ -157,6 +167,7 @@ def numbered(rows):
         seen[name] += 1
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize(
     ("suffix", "data", "found"),
     [
@@ -207,6 +218,7 @@ def log(request, tmp_path_factory):
     return tmp_path_factory.mktemp("damaged") / f"a.track{request.param}"
 
 
+@pytest.mark.quick(".bin")
 @DAMAGED
 @given(PLACES)
 def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
@@ -216,6 +228,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(log, place):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(PLACES, st.integers(0, 7)), min_size=1, max_size=4))
 def test_no_flipped_bit_moves_a_position_silently(log, flips):
@@ -227,6 +240,7 @@ def test_no_flipped_bit_moves_a_position_silently(log, flips):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
 def test_messages_in_another_order_are_refused_or_the_same(log, random, swaps):

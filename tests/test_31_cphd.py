@@ -14,6 +14,8 @@ from apertura.errors import CampaignError
 from apertura.ingest import read_phase_history
 from apertura.ingest.isolated import read_isolated
 
+pytestmark = pytest.mark.usefixtures("reader")
+
 PULSES, SAMPLES = 12, 40
 SRP = np.array([4177000.0, 855000.0, 4727000.0])
 AWAY = {"TxPos": np.array([800.0, -500.0, 900.0]), "RcvPos": np.array([700.0, 600.0, 800.0])}

@@ -50,6 +50,7 @@ def moved(track, whole, kind):
     return int((off | late).sum())
 
 
+@pytest.mark.quick("csv", "rtklib")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
@@ -63,6 +64,7 @@ def test_a_log_that_is_cut_off_ends_earlier_or_is_refused(tmp_path_factory, kind
     assert track is None or track.sizes["epoch"] <= whole.sizes["epoch"]
 
 
+@pytest.mark.quick("rtklib")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
@@ -75,6 +77,7 @@ def test_a_log_whose_lines_change_places_is_refused_or_the_same(tmp_path_factory
     assert moved(read(folder, kind, ("\n".join(lines) + "\n").encode()), whole, kind) == 0
 
 
+@pytest.mark.quick("rtklib")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())
@@ -88,6 +91,7 @@ def test_a_log_that_lost_a_piece_is_refused_or_lacks_epochs(tmp_path_factory, ki
     assert moved(track, whole, kind) <= (0 if kind == "nmea" else 1)
 
 
+@pytest.mark.quick("rtklib", "optitrack")
 @pytest.mark.parametrize("kind", LOGS)
 @PROPERTY
 @given(data=st.data())

@@ -13,6 +13,8 @@ from apertura.ingest import read_phase_history
 from apertura.ingest.fmcw_wav import trigger_starts
 from apertura.simulation.fmcw import beat_signal
 
+pytestmark = pytest.mark.usefixtures("reader")
+
 COFFEE = Sweep(2.26e9, 330e6, 20e-3, 44_100.0)
 """The sweep of MIT's coffee-can radar."""
 

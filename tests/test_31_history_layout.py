@@ -14,6 +14,8 @@ from apertura.contracts import check
 from apertura.errors import CampaignError
 from apertura.ingest import read_phase_history
 
+pytestmark = pytest.mark.usefixtures("reader")
+
 PULSES, SUBCARRIERS = 9, 16
 SUFFIX = {"hdf5": ".h5", "zarr": ".zarr"}
 FORMATS = pytest.mark.parametrize("kind", SUFFIX)

@@ -186,6 +186,7 @@ def test_a_real_recording_of_another_maker_is_read(shared):
     assert raw.attrs["sample_rate_hz"] == 640000
 
 
+@pytest.mark.usefixtures("reader")
 def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
     """The antenna's distance to the scene centre is r0, so an echo from there has no phase left."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))

@@ -43,6 +43,7 @@ def test_arrays_come_back_from_the_process_as_they_were(tmp_path):
     np.testing.assert_allclose(echo.transfer.values[1], np.exp(1j * (1 + PULSES * np.arange(LINES))), atol=1e-6)
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -66,12 +67,14 @@ def test_a_field_that_is_not_what_it_should_be_is_named(tmp_path, changes, expec
     assert expected in message
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_second_file_at_other_frequencies_is_named(tmp_path):
     shifted = np.linspace(9.4e9, 10.0e9, LINES)
     paths = history(tmp_path / "a.mat"), history(tmp_path / "b.mat", freq=shifted)
     assert complaint(lambda: read(*paths)).startswith(f"{paths[1]}: other frequencies than the first file")
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_matlab_file_without_the_structure_is_refused(tmp_path):
     savemat(tmp_path / "a.mat", {"other": 1.0})
     assert "no structure called data" in complaint(lambda: read(tmp_path / "a.mat"))
@@ -110,6 +113,7 @@ def test_a_reader_that_asks_for_too_much_memory_is_refused(tmp_path):
         read_isolated("numpy:fromfile", [tmp_path / "a.mat"], memory_bytes=1 << 30)
 
 
+@pytest.mark.usefixtures("reader")
 def test_the_file_at_which_a_pass_ends_is_the_one_that_is_named(tmp_path):
     paths = [history(tmp_path / f"{name}.mat") for name in "abc"]
     paths[1].write_bytes(paths[1].read_bytes()[:300])

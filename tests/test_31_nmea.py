@@ -152,6 +152,7 @@ def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
     assert message.isprintable()
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_no_flipped_bit_moves_an_epoch(tmp_path_factory, data):

@@ -85,6 +85,7 @@ def apart_db(ours, theirs):
     return 10 * np.log10(np.mean(np.abs(ours - theirs) ** 2) / np.mean(np.abs(theirs) ** 2) + 1e-20)
 
 
+@pytest.mark.quick("ci16_be", "cu16_le")
 @pytest.mark.parametrize("datatype", ["ci16_be", "ci32_le", "ci32_be", "cf32_le", "cf32_be", "cf64_le", "cu16_le"])
 def test_a_datatype_that_holds_every_count_gives_the_same_bits(campaign, plain, datatype):
     stored = SampleLayout(datatype).stored
@@ -99,6 +100,7 @@ def test_a_datatype_that_holds_every_count_gives_the_same_bits(campaign, plain, 
         np.testing.assert_array_equal(transfer, plain[pair])
 
 
+@pytest.mark.quick("32768.0")
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**15])
 def test_the_unit_of_floats_is_that_of_the_echo_and_changes_nothing_else(campaign, plain, unit):
     """Volts or counts: by powers of two, to the last bit of what a node hears of itself."""
@@ -109,6 +111,7 @@ def test_the_unit_of_floats_is_that_of_the_echo_and_changes_nothing_else(campaig
     assert apart_db(scaled["a-b"], plain["a-b"] * unit) < -120
 
 
+@pytest.mark.quick("ci8")
 @pytest.mark.parametrize("datatype", ["ci8", "cu8"])
 def test_eight_bits_add_the_noise_of_their_steps_and_nothing_else(campaign, plain, datatype):
     """A step of Δ has Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
@@ -128,6 +131,7 @@ def as_real(counts, if_hz):
     return np.real((counts[..., 0] + 1j * counts[..., 1]) * carrier)
 
 
+@pytest.mark.quick("-24000000.0")
 @pytest.mark.parametrize("if_hz", [8e6, 8e6 + 5 * RATE_HZ, -24e6])
 def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, plain, if_hz):
     """In whichever Nyquist zone the band lies, upright or mirrored: to the filter's -80 dB."""
@@ -139,6 +143,7 @@ def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, 
         assert apart_db(transfer, plain[pair]) < -70, pair
 
 
+@pytest.mark.quick("rf16_le")
 @pytest.mark.parametrize("datatype", ["ri16_le", "ri16_be", "rf16_le"])
 def test_real_counts_add_the_noise_of_their_steps(campaign, plain, datatype):
     """Rounded to whole counts, Δ²/12 at the real sample: H gives as much to the quadrature, within the band."""

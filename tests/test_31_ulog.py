@@ -52,6 +52,7 @@ def apart_m(track, time_s=None):
     return np.linalg.norm(track.position.values - where, axis=1)
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize("topic", [GPS, SENSOR])
 def test_a_track_is_what_the_receiver_said(tmp_path, topic, old):
@@ -66,6 +67,7 @@ def test_a_track_is_what_the_receiver_said(tmp_path, topic, old):
     assert track.attrs["dropped"] == {}
 
 
+@pytest.mark.usefixtures("reader")
 def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_path):
     """Its clock hears of an epoch 110 ms late; without that, yaw would be 1.0° off in this turn."""
     track = read(tmp_path, (GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()))
@@ -75,6 +77,7 @@ def test_attitude_is_taken_where_the_autopilot_was_when_the_epoch_was_true(tmp_p
     assert np.degrees(late.attitude.values[:, 2] - track.attitude.values[:, 2]).mean() == pytest.approx(1.008, abs=0.01)
 
 
+@pytest.mark.usefixtures("reader")
 def test_an_attitude_that_its_neighbours_contradict_is_left_out(tmp_path):
     attitude = ulog_attitude()
     kind, values = attitude["q[0]"]
@@ -84,12 +87,14 @@ def test_an_attitude_that_its_neighbours_contradict_is_left_out(tmp_path):
     np.testing.assert_allclose(np.degrees(track.attitude.values), expected, atol=2e-3)
 
 
+@pytest.mark.usefixtures("reader")
 def test_where_attitude_was_not_logged_it_is_not_made_up(tmp_path):
     attitude = {name: (kind, values[80:]) for name, (kind, values) in ulog_attitude().items()}  # from 1.5 s
     track = read(tmp_path, (GPS, 0, ulog_receiver()), (ATTITUDE, 0, attitude))
     np.testing.assert_array_equal(np.isnan(track.attitude.values).any(axis=1), flight()[0] < 0.999)
 
 
+@pytest.mark.usefixtures("reader")
 def test_fused_positions_are_placed_in_utc_by_the_receiver(tmp_path):
     """The estimator takes the receiver to be late by EKF2_GPS_DELAY; so does the way back."""
     topics = (GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()), (FUSED, 0, ulog_fused())
@@ -105,6 +110,7 @@ def test_fused_positions_are_placed_in_utc_by_the_receiver(tmp_path):
     assert track.attrs["dropped"] == {"no fix": 20}
 
 
+@pytest.mark.usefixtures("reader")
 def test_one_of_several_receivers_is_chosen_by_name(tmp_path):
     other = ulog_receiver(lat=np.full(60, 480_000_000) + np.arange(60))
     topics = (SENSOR, 0, ulog_receiver()), (SENSOR, 1, other)
@@ -117,6 +123,7 @@ def test_one_of_several_receivers_is_chosen_by_name(tmp_path):
     assert "nodes.a.log.body" in message
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("old", [True, False])
 def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, old):
     name = "alt" if old else "altitude_msl_m"
@@ -129,10 +136,12 @@ def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, old):
         assert apart_m(read(tmp_path, receiver, options=LogOptions(height_offset_m=N_M))).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_height_that_the_log_tells_is_not_overruled(tmp_path):
     assert apart_m(read(tmp_path, (GPS, 0, ulog_receiver()), options=LogOptions(height_offset_m=1000.0))).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path):
     kinds = np.resize([6, 5, 4, 3, 2, 1, 0, 8], 60)
     track = read(tmp_path, (GPS, 0, ulog_receiver(fix_type=kinds)))
@@ -141,6 +150,7 @@ def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path)
     assert apart_m(track).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 def test_accuracies_that_no_receiver_states_are_not_kept(tmp_path):
     accuracy = np.resize([0.1, np.nan, np.inf, 0.0, -1.0, 4e9], 60)
     std = read(tmp_path, (GPS, 0, ulog_receiver(eph=accuracy))).position_std.values
@@ -148,6 +158,7 @@ def test_accuracies_that_no_receiver_states_are_not_kept(tmp_path):
     np.testing.assert_array_equal(std[:, 2], 0.5)
 
 
+@pytest.mark.usefixtures("reader")
 def test_epochs_without_utc_and_those_logged_twice_are_counted(tmp_path):
     receiver = ulog_receiver(time_utc_usec=np.where(np.arange(60) < 7, 0, ulog_receiver()["time_utc_usec"][1]))
     assert read(tmp_path, (GPS, 0, receiver)).attrs["dropped"] == {"no time of the receiver": 7}
@@ -157,6 +168,7 @@ def test_epochs_without_utc_and_those_logged_twice_are_counted(tmp_path):
     assert track.sizes["epoch"] == 60
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_log_that_never_knew_utc_asks_for_it(tmp_path):
     receiver = (GPS, 0, ulog_receiver(time_utc_usec=np.zeros(60, int)))
     message = complaint(lambda: read(tmp_path, receiver))
@@ -169,6 +181,7 @@ def test_a_log_that_never_knew_utc_asks_for_it(tmp_path):
     )
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_clock_that_drifts_is_followed_and_a_late_message_does_no_harm(tmp_path):
     time = flight(600)[0]
     late = np.where(np.arange(600) % 50 == 7, 0.06, 0)
@@ -180,6 +193,7 @@ def test_a_clock_that_drifts_is_followed_and_a_late_message_does_no_harm(tmp_pat
     assert np.abs(off).max() < 0.06  # 4 ms by the late ones at 9.2°/s, 3 ms by a drift that attitude does not share
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_receiver_that_learns_of_a_leap_second_on_the_way_is_refused(tmp_path):
     """It told 2 s too little at first; which half is right, the log alone does not say."""
     told = ulog_receiver()["time_utc_usec"][1] - np.where(np.arange(60) < 25, 2_000_000, 0)
@@ -192,6 +206,7 @@ def test_a_receiver_that_learns_of_a_leap_second_on_the_way_is_refused(tmp_path)
     assert apart_m(track).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("epoch", [0, 3, 30, 58, 59])
 @pytest.mark.parametrize(("field", "step"), [("lat", 90), ("lon", -150), ("alt_ellipsoid", 1000)])
 def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path, epoch, field, step):
@@ -202,18 +217,21 @@ def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path, ep
     assert apart_m(track).max() < 0.02
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("wrong", [{"vel_n_m_s": np.full(60, 30.0)}, {"vel_ned_valid": np.zeros(60, int)}])
 def test_velocities_that_contradict_the_whole_log_contradict_none_of_it(tmp_path, wrong):
     track = read(tmp_path, (GPS, 0, ulog_receiver(**wrong)))
     assert track.sizes["epoch"] == 60
 
 
+@pytest.mark.usefixtures("reader")
 def test_a_step_between_solutions_is_no_epoch_out_of_place(tmp_path):
     """From float to fix all later positions move; both sides are what the receiver said, and checked elsewhere."""
     moved = ulog_receiver()["lat"][1] + 180 * (np.arange(60) >= 30)
     assert read(tmp_path, (GPS, 0, ulog_receiver(lat=moved))).sizes["epoch"] == 60
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize(
     ("data", "found"),
     [
@@ -285,6 +303,7 @@ def test_a_log_cut_anywhere_is_shorter_or_refused(place, size):
         assert track.sizes["epoch"] <= 60
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.lists(st.tuples(st.integers(0, len(MESSAGES) - 1), st.integers(0, 7)), min_size=1, max_size=4))
 def test_no_flipped_bit_moves_a_position_silently(place, flips):
@@ -296,6 +315,7 @@ def test_no_flipped_bit_moves_a_position_silently(place, flips):
         assert_no_position_is_silently_wrong(track)
 
 
+@pytest.mark.slow
 @DAMAGED
 @given(st.randoms(use_true_random=False), st.integers(1, 20))
 def test_messages_in_another_order_are_refused_or_the_same(place, random, swaps):
@@ -333,6 +353,7 @@ def raw_messages(name):
     return formats[name], payloads
 
 
+@pytest.mark.usefixtures("reader")
 def test_epochs_span_bounds_and_rate_of_a_real_flight_are_those_of_its_messages(flown):
     """px4_real_flight, a PX4 1.9 multicopter over Zurich; fields are unpacked here by their offsets in the message."""
     names, payloads = raw_messages(GPS)
@@ -389,6 +410,7 @@ def test_attitude_of_a_real_flight_is_that_of_its_quaternions(flown):
         assert np.degrees(np.abs(off).max()) < 6, name
 
 
+@pytest.mark.usefixtures("reader")
 def test_fused_positions_of_a_real_flight_are_near_those_of_its_receiver(flown):
     fused = read_track(REAL, node="a", options=LogOptions(body=FUSED))
     assert fused.sizes["epoch"] == len(raw_messages(FUSED)[1]) == 95

@@ -41,6 +41,7 @@ def test_the_path_offset_of_a_node_is_estimated_to_a_millimetre(offset_m):
     assert estimate.flags == {}
 
 
+@pytest.mark.quick("10-0.0-0.01")
 @pytest.mark.parametrize(("snr_db", "clutter", "wobble_m"), [(-15, 0.0, 0.0), (10, 0.05, 0.0), (10, 0.0, 0.01)])
 def test_the_stated_deviation_is_the_one_over_many_flights(snr_db, clutter, wobble_m):
     flights = [

@@ -137,6 +137,7 @@ def test_a_clock_that_noise_only_suggests_is_left_alone():
     )
 
 
+@pytest.mark.slow
 def test_a_true_clock_under_a_weak_sidelink_is_left_alone_whatever_it_seems_to_be():
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -75,6 +75,7 @@ def stability(transfer, time_s=None):
     return phase_stability(transfer, np.arange(PULSES) / 20 if time_s is None else time_s, prefix_cells=PREFIX)
 
 
+@pytest.mark.quick("*-1", "*-5")
 @pytest.mark.parametrize("targets", [1, 5, 60])
 @pytest.mark.parametrize(("phase_rad", "flagged"), [(0.0, False), (0.3, False), (1.0, True), (30.0, True)])
 def test_random_phase_of_own_pulses_is_seen_on_points_and_on_clutter(targets, phase_rad, flagged):
@@ -85,6 +86,7 @@ def test_random_phase_of_own_pulses_is_seen_on_points_and_on_clutter(targets, ph
             assert found.rms_rad == pytest.approx(np.sqrt(6) * 0.3, rel=0.2)
 
 
+@pytest.mark.quick("3-*", "60-0.3")
 @pytest.mark.parametrize("step_m", [0.06, 0.15, 0.3])
 @pytest.mark.parametrize("targets", [3, 60])
 def test_a_sparsely_sampled_flight_is_not_taken_for_an_unstable_one(step_m, targets):

@@ -121,6 +121,7 @@ def test_a_clock_is_measured_as_well_on_stretches_of_a_long_flight():
     assert part.cfo_std_hz < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_m", [0.0, 9.0])
 def test_jitter_of_a_long_flight_is_not_taken_for_wrong_pulses(moved_m):
     """The highest of 300 000 medians is further out than that of a thousand; what moves further still is seen."""

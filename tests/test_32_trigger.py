@@ -68,6 +68,7 @@ def test_a_clock_of_10_khz_off_does_not_hide_a_preamble():
     assert [detection.sample for detection in detections] == pytest.approx(starts, abs=1)
 
 
+@pytest.mark.quick("1000.0")
 @pytest.mark.parametrize("sigma", [3.0, 1000.0])
 def test_noise_triggers_at_the_set_rate_at_any_level(sigma):
     rng = np.random.default_rng(4)
@@ -86,6 +87,7 @@ def theory(snr_db, false_alarm):
     return ncx2.sf(2 * threshold, 2, 2 * length * ratio)
 
 
+@pytest.mark.quick("-16.0", "-13.0")
 @pytest.mark.parametrize("snr_db", [-17.5, -16.0, -15.0, -13.0])
 def test_detection_probability_is_that_of_theory_and_99_percent_at_minus_13_db(snr_db):
     rng = np.random.default_rng(5)

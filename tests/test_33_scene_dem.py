@@ -199,7 +199,7 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
 
 def test_from_python_a_target_on_a_slope_is_imaged_where_it_stands_by_its_dem(tmp_path):
     """1.8 m lower flat ground puts it elsewhere; the raster lies in geographic coordinates, the scene in UTM."""
-    grid = ap.SceneGrid("EPSG:32632", 500056.0, 5400044.0, 0.1, (80, 80))
+    grid = ap.SceneGrid("EPSG:32632", 500059.0, 5400041.0, 0.1, (40, 40))
     path = geographic_dem(tmp_path / "dem.tif", slope=(0.3, -0.2))
     terrain = ap.open_dem(str(path), grid, datum="ellipsoid")
     track = frame_from_map(grid.crs, np.linspace(500052, 500068, 96), np.full(96, 5400020.0), np.full(96, 618.0))

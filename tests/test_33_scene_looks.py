@@ -76,6 +76,7 @@ def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
     assert (Looks.of(GRID, GROUND, FLOWN, None).effective((slice(0, 8), slice(0, 8))) == len(FLOWN)).all()
 
 
+@pytest.mark.quick("sector")
 @pytest.mark.parametrize("kind", WEIGHED)
 def test_outside_is_exact_at_every_pixel(kind):
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)

@@ -28,6 +28,7 @@ def plain():
     return pixels, scene.profiles(ecef(pixels))
 
 
+@pytest.mark.slow
 def test_the_simulated_device_passes_its_tests():
     tests = Path(__file__).with_name("simulated_device.py")
     command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", str(tests)]

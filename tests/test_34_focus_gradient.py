@@ -80,6 +80,7 @@ def test_the_objectives_here_change_as_they_say():
         assert gained == pytest.approx((objective(image)[1].conj() * change).real.sum(), rel=1e-6)
 
 
+@pytest.mark.quick("compiled-peaks", "numpy-entropy")
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("objective", [peaks, entropy])
 def test_every_component_is_the_finite_difference_of_the_image(objective):

@@ -12,6 +12,7 @@ from apertura.focus.presum import design, presum_error_db, presummed
 from apertura.quality.measures import numerical_error
 
 
+@pytest.mark.quick("0.1-False")
 @pytest.mark.parametrize(("step_m", "summed"), [(0.002, True), (0.1, False)])
 def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed):
     tx = straight_track(2000, length_m=2000 * step_m)
@@ -42,6 +43,7 @@ def oversampled(noise: float = 1.0):
     raise AssertionError("no campaign is oversampled")
 
 
+@pytest.mark.slow
 @compiled
 def test_a_presummed_image_equals_that_of_all_pulses_where_leaving_pulses_out_does_not():
     drawn, widest = oversampled()

@@ -68,6 +68,7 @@ def test_a_pulse_counts_where_the_total_path_is_shortest():
     np.testing.assert_allclose(np.linalg.norm(tx, axis=1) + np.linalg.norm(rx, axis=1), 1)
 
 
+@pytest.mark.quick("*-False-0.04", "*-True-0.25")
 @compiled
 @pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
 @pytest.mark.parametrize("antenna", [False, True])
@@ -137,6 +138,7 @@ def test_the_edge_is_level_at_both_ends():
     assert np.abs(np.diff(slope)).max() < 0.01
 
 
+@pytest.mark.quick("False")
 @pytest.mark.parametrize("antenna", [False, True])
 def test_pulses_that_are_left_out_add_nothing_at_all(antenna):
     """Whatever piece of the scene: each pulse with a weight anywhere in it is in a block that reaches it."""
@@ -193,6 +195,7 @@ def test_tiles_beyond_the_swath_are_not_formed():
     assert not Reach.of(narrow, aperture[:640], far, FLAT, [(slice(0, 32), slice(0, 32))]).seen.any()
 
 
+@pytest.mark.slow
 def test_the_range_window_of_a_long_flight_is_that_of_its_sector():
     """It holds what the pulse may add to, at any length of the flight, and nothing for pulses that add to nothing."""
     spans = []

@@ -32,6 +32,7 @@ def plain():
     return flown(pixel_grid(70, 90), pulses=300)
 
 
+@pytest.mark.quick("bistatic-*--50", "bistatic-*--98", "monostatic-*--74")
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 def test_every_instruction_set_errs_as_predicted(isa, flights, nodes_db):
     image, share = formed(flights, nodes_db=nodes_db)
@@ -96,6 +97,7 @@ def test_tiles_beyond_all_profiles_cost_nothing(plain):
     assert not image.any()
 
 
+@pytest.mark.quick("0.001")
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3, 1e-2])
 def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
     """A smooth track's 64 pulses become few; white noise of a millimetre on it is not smooth at 12 m, and is kept."""
@@ -126,6 +128,7 @@ def test_fewer_pulses_than_follow_a_track_err_as_predicted(plain, jitter_m, toge
     assert predicted_db - 7 <= decibels(images[1] - images[0], images[0]) <= predicted_db
 
 
+@pytest.mark.quick("0.05--74-4")
 @pytest.mark.parametrize(("height_m", "nodes_db", "sheets"), [(0.02, -50, 3), (0.05, -74, 4), (0.3, -62, 7)])
 def test_rough_ground_is_read_between_sheets(height_m, nodes_db, sheets):
     """Eq. 11: relief from pixel to pixel goes by trees that lie one above the other; one sheet less and it does not."""
@@ -157,6 +160,7 @@ def test_rolling_ground_goes_by_tree():
     assert error_db(flight.scene, rolling, image) <= setting(flight, nodes_db=-74).error_db + 3
 
 
+@pytest.mark.quick("10000000000.0-0.01-0.0005")
 @pytest.mark.parametrize(("carrier_hz", "spacing_m", "rough_m"), [(1.2e9, 0.05, 6e-4), (10e9, 0.01, 5e-4)])
 def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_m):
     """Eq. 9: noise on the ground that the tree takes at -50 dB; what it adds is delay at 1 GHz, phase at 10 GHz."""
@@ -174,6 +178,7 @@ def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_
     assert 10 * np.log10(powers[0] - powers[1]) == pytest.approx(predicted_db, abs=1)
 
 
+@pytest.mark.quick("12.0-0.05-2", "3.0-0.15-0")
 @pytest.mark.parametrize(("range_m", "spacing_m", "levels"), [(12.0, 0.05, 2), (5.0, 0.08, 1), (3.0, 0.15, 0)])
 def test_a_near_tile_takes_smaller_subapertures_or_goes_directly(range_m, spacing_m, levels):
     """The nearer a tile, the more nodes a subaperture takes: beyond 128 of them there are fewer levels, or no tree."""

@@ -32,6 +32,7 @@ def certify(image, exact, seed, *, random=160, bright=112):
     return found, numerical_error(image.ravel(), exact.ravel()).rms_db
 
 
+@pytest.mark.quick("speckle")
 @pytest.mark.parametrize("kind", ["speckle", "targets", "errors of bright targets"])
 def test_the_bound_holds_over_all_pixels_in_95_of_100_images_and_lies_close(kind):
     generator, above = np.random.default_rng(4), []

@@ -64,6 +64,7 @@ def ground_of(sightings):
     return Ground.of([Blocks.of(one, KNOTS_S) for one in sightings], tiles(sightings, GRID, GROUND, lasting_s=1.0))
 
 
+@pytest.mark.slow
 def test_tiles_share_out_the_scene():
     sightings, _ = seen(1)
     found = tiles(sightings, GRID, GROUND, lasting_s=1.0)
@@ -97,6 +98,7 @@ def test_the_gradient_is_that_of_the_value():
         assert (values[1] - values[0]) / 0.02 == pytest.approx(slope, rel=3e-3)
 
 
+@pytest.mark.slow
 def test_agreement_mends_what_blurs_speckle():
     """Path errors of the pair that sends and receives, less what only moves the image, fall as eq. 23 says."""
     left = []
@@ -129,6 +131,7 @@ def test_one_pair_has_nothing_to_agree_with():
     assert "one pair" in found.flags["refinement_too_few_patches"]
 
 
+@pytest.mark.slow
 def test_speckle_is_believed_by_the_coherence_of_tiles_that_were_not_fitted():
     sightings, _ = seen(1)
     found = refined_by_speckle(ground_of(sightings), PRIOR, KNOTS_S)

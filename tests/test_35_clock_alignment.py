@@ -108,6 +108,7 @@ def test_a_point_that_is_not_there_is_told_of():
     assert {"alignment_uncertain", "alignment_ambiguous"} & found.flags.keys()
 
 
+@pytest.mark.slow
 def test_sharpness_alone_finds_both_where_the_speed_changes():
     grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
     found = align_on_scene(*given(start_and_stop), grid, FlatGround(0.0), within_s=(-10.0, 15.0), search_m=1.6)

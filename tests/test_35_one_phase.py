@@ -158,6 +158,7 @@ PROBES_M = np.array([(15, -16, 0), (0, 1, 0), (-13, 17.5, 0)], float)
 FAR_ERRORS = {"a": SIGMA, "b": SIGMA}
 
 
+@pytest.mark.quick("phase_gradient-a-b", "minimum_entropy-a-a")
 @pytest.mark.parametrize("pair", ["a-a", "a-b"])
 @pytest.mark.parametrize("method", METHODS)
 def test_one_phase_mends_a_far_scene_and_leaves_it_in_place(method, pair):
@@ -191,6 +192,7 @@ def test_one_phase_does_not_mend_a_near_scene():
     assert before_db.mean() < after_db.mean() < -0.5
 
 
+@pytest.mark.quick("phase_gradient")
 @pytest.mark.parametrize("method", METHODS)
 def test_phases_of_noise_are_not_believed(method):
     """Three points to a range, whose noise is the same: what sharpens it for one sharpens it for the others."""

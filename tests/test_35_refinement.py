@@ -157,6 +157,7 @@ def refined(two_centimetres):
     return refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors)
 
 
+@pytest.mark.slow
 def test_two_centimetres_are_mended_at_places_that_no_fit_saw(two_centimetres, refined):
     before, after = judge(two_centimetres), judge(two_centimetres, refined.correction)
     assert before.probe_loss_db < -5
@@ -165,6 +166,7 @@ def test_two_centimetres_are_mended_at_places_that_no_fit_saw(two_centimetres, r
     assert not refined.flags
 
 
+@pytest.mark.slow
 def test_refinement_does_not_move_the_image(two_centimetres, refined, search):
     before, after = judge(two_centimetres), judge(two_centimetres, refined.correction)
     assert after.target_shift_cm < before.target_shift_cm + 0.3
@@ -178,6 +180,7 @@ def test_refinement_does_not_move_the_image(two_centimetres, refined, search):
     assert there.probe_loss_db > here.probe_loss_db - 0.05
 
 
+@pytest.mark.slow
 def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refined):
     known = [ReferencePoint(f"corner {number}", tuple(two_centimetres.targets_m[number]), 0.005) for number in range(4)]
     tied = refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors, reference_points=known)
@@ -188,6 +191,7 @@ def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refine
     assert {one["name"] for one in tied.report["reference_points"]} == {one.name for one in known}
 
 
+@pytest.mark.slow
 def test_a_log_that_states_four_times_its_errors_is_flagged(two_centimetres, refined):
     stated = {node: TrackErrors((0.08,) * 3) for node in two_centimetres.errors}
     found = refine(two_centimetres.sightings, GRID, FlatGround(0.0), stated)
@@ -210,6 +214,7 @@ def test_a_wavelength_of_path_over_a_part_of_the_aperture_is_told(two_centimetre
     assert slipped({"uav1": truth["uav1"] + slip, "uav2": truth["uav2"]})[0, 2]
 
 
+@pytest.mark.slow
 def test_speckle_is_refused(two_centimetres):
     generator = np.random.default_rng(6)
     noisy = []

@@ -40,6 +40,7 @@ def test_errors_have_the_deviation_and_the_correlation_of_the_prior():
     assert np.allclose(half, 0.5, atol=0.05)
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("pairs", ["mono", "bi"])
 def test_the_true_tracks_lose_nothing_and_the_logs_what_the_theory_says(pairs):
@@ -52,6 +53,7 @@ def test_the_true_tracks_lose_nothing_and_the_logs_what_the_theory_says(pairs):
     assert -2.2 < np.mean(losses) < -0.8
 
 
+@pytest.mark.slow
 @compiled
 def test_a_seed_keeps_its_tracks_and_noise_when_pairs_or_scene_change():
     joint, mono = (case("five", "straight", pairs, 0.01, 10, 1) for pairs in ("joint", "mono"))

@@ -74,6 +74,7 @@ def by_definition(channel, pulse, count):
     return total * np.exp(1j * (2 * np.pi * oscillator + channel.phase_rad[pulse]))
 
 
+@pytest.mark.quick("0-0-0-0-band_start", "50000.0--10000.0-2e-07--3e-07-band_centre")
 @pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
 @pytest.mark.parametrize(
     ("sfo_hz", "cfo_hz", "drift", "start_s"),

@@ -26,6 +26,7 @@ from apertura.simulation.trajectory import Straight, Waypoints, Wobble
 from apertura.simulation.waveforms import WaveformSpecification
 
 
+@pytest.mark.quick("demo", "paper", "swarm", "continuous", "flight", "paper-lab")
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid(name):
     """In a triggered recording; one that runs through is cut where the pulses are."""
@@ -48,6 +49,7 @@ def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid
     assert ((xmin < x) & (x < xmax) & (ymin < y) & (y < ymax)).all()
 
 
+@pytest.mark.quick("demo", "swarm", "continuous", "flight")
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_a_preset_makes_a_campaign_that_loads_and_whose_files_pass_the_check(tmp_path, name):
     root = simulate(tmp_path / "campaign", preset(name, pulses=3))

@@ -160,6 +160,7 @@ def test_the_phase_of_a_ramp_is_that_of_its_heights():
 # Sections 3 to 5: which pixels tell a height, and how well
 
 
+@pytest.mark.quick("1.0")
 @pytest.mark.parametrize("rise_m", [1.0, 4.0])
 def test_heights_of_a_ramp_lie_within_their_deviation(rise_m):
     first, second, told = two_tracks(rise_m, marked=True)
@@ -184,6 +185,7 @@ def test_heights_of_a_ramp_lie_within_their_deviation(rise_m):
     assert raised(found.measured) == {}
 
 
+@pytest.mark.slow
 def test_what_has_changed_between_the_flights_lowers_coherence_and_widens_the_deviation():
     still, changed = (parts(1.0, common=common)[0] for common in (1.0, 0.6))
     assert changed.measured.coherence == pytest.approx(0.6 * still.measured.coherence, abs=0.05)
@@ -201,6 +203,7 @@ def test_another_scene_is_decorrelated_and_tells_no_height():
     assert np.isfinite(found.panels["height"]).mean() < 0.01
 
 
+@pytest.mark.quick("1.0-13.0")
 @pytest.mark.parametrize(("rise_m", "along_m"), [(18.0, 0.0), (1.0, 13.0)])
 def test_tracks_too_far_apart_are_flagged_and_tell_no_height(rise_m, along_m):
     found, _ = parts(rise_m, along_m=along_m)
@@ -209,6 +212,7 @@ def test_tracks_too_far_apart_are_flagged_and_tell_no_height(rise_m, along_m):
     assert np.isfinite(found.panels["height"]).mean() < 0.03
 
 
+@pytest.mark.quick("1.0-0.93", "4.0-0.74")
 @pytest.mark.parametrize(("rise_m", "overlap"), [(1.0, 0.93), (4.0, 0.74), (7.0, 0.55)])
 def test_coherence_is_what_geometry_leaves(rise_m, overlap):
     found, _ = parts(rise_m)

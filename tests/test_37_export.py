@@ -155,6 +155,7 @@ for export in exports_in("pair"):
 """
 
 
+@pytest.mark.slow
 def test_the_same_image_gives_the_same_bytes_in_any_process_and_from_any_store(tmp_path):
     image = speckle(600, 520)
     np.save(tmp_path / "image.npy", image)
@@ -187,6 +188,7 @@ class Blocks:
         return (np.add.outer(np.array(rows) * 1j, columns) + 1).astype(np.complex64)
 
 
+@pytest.mark.quick("quicklook.png", "power.tif")
 @pytest.mark.parametrize("name", IMAGES)
 def test_an_image_is_never_held_whole(tmp_path, name):
     image = Blocks(READ + 300, READ + 500)
@@ -218,6 +220,7 @@ export.write(path, Deadly(), transform=Affine(1, 0, 0, 0, -1, 0), crs="EPSG:3263
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["slc.tif", "db.tif"])
 def test_a_killed_writer_leaves_no_half_file_and_the_next_one_clears_its_work(tmp_path, name):
     path = tmp_path / name
@@ -230,6 +233,7 @@ def test_a_killed_writer_leaves_no_half_file_and_the_next_one_clears_its_work(tm
     assert [left.name for left in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_in_an_error_and_leaves_nothing(tmp_path):
     limited = """
 import resource, signal

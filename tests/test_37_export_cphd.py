@@ -86,6 +86,7 @@ def gotcha(shared, tmp_path_factory):
     return campaign
 
 
+@pytest.mark.slow
 def test_gotcha_through_cphd_gives_the_same_image_to_80_db(gotcha, tmp_path):
     again = reimported(gotcha, "pass1", "radar-radar", tmp_path / "again")
     assert failures(gotcha.result("pass1", "radar-radar", "phase_history.cphd")) == {}
@@ -115,6 +116,7 @@ def fine_tiny(_tiny, tmp_path_factory):
     return campaign
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_a_simulated_pair_through_cphd_gives_the_same_image_to_80_db(fine_tiny, tmp_path, pair):
     again = reimported(fine_tiny, "f01", pair, tmp_path / "again")
@@ -172,6 +174,7 @@ def test_the_swath_ends_where_echoes_leave_the_prefix(tmp_path):
     assert failures(tmp_path / "a.cphd") == {}
 
 
+@pytest.mark.slow
 def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tiny):
     made = [result for name, result in results_of(fine_tiny) if name == "cphd"]
     assert [on_demand(result.manifest) for result in made] == [True, True]

@@ -29,6 +29,7 @@ def swept(monkeypatch, name, *sizes, draws=1):
     return list(run_cause(name))
 
 
+@pytest.mark.slow
 def test_noise_of_two_centimetres_is_flagged_and_next_to_none_is_not(monkeypatch):
     small, large = swept(monkeypatch, "track_noise", 1e-3, 2.0)
     assert small.flags == ""
@@ -121,6 +122,7 @@ def test_a_flag_is_counted_over_the_causes_that_raise_it():
     assert (rows["pairs_apart"].missed, rows["pairs_apart"].false) == (0.25, 0.0)
 
 
+@pytest.mark.slow
 def test_pictures_are_the_same_bytes_for_the_same_rows(tmp_path):
     for name in CAUSES:
         rows = [replace(row, cause=name) for row in SWEEP] + [outcome(2000.0, loss_db=np.nan, flags="refused")]

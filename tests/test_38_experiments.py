@@ -33,6 +33,7 @@ def campaigns(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab", "static"])
 def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaigns, name):
     experiment = open_experiment(campaigns, name)
@@ -41,6 +42,7 @@ def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaig
     assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab", "static"])
 @pytest.mark.parametrize("pair", [MONOSTATIC, BISTATIC])
 def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
@@ -52,6 +54,7 @@ def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
     assert found_m == pytest.approx(true_m, abs=0.08)  # clutter moves it by a fraction of a cell of 37 cm
 
 
+@pytest.mark.slow
 def test_the_sidelink_of_the_lab_is_the_cable_alone(campaigns):
     raw = open_experiment(campaigns, "lab").opened.campaign.settings.nodes["uav2"]
     assert raw.path_offset_m.sidelink == CABLE_M
@@ -60,6 +63,7 @@ def test_the_sidelink_of_the_lab_is_the_cable_alone(campaigns):
     np.testing.assert_allclose(apart[0] + raw.lever_arms_m.sidelink[1], 0.0, atol=1e-12)  # yaw 0: right is east
 
 
+@pytest.mark.slow
 def test_coherence_is_judged_by_the_noise_of_echo_free_ranges_and_by_chance(campaigns):
     claims = coherence_claims(campaigns)
     assert {claim.verdict for claim in claims} <= set(VERDICTS)
@@ -78,6 +82,7 @@ def test_coherence_is_judged_by_the_noise_of_echo_free_ranges_and_by_chance(camp
             assert float(claim.computed) == pytest.approx(float(claim.independent_model), rel=0.7)
 
 
+@pytest.mark.slow
 def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
     experiment = open_experiment(campaigns, "static")
     history = experiment.history(BISTATIC)
@@ -86,6 +91,7 @@ def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
     np.testing.assert_allclose(profiles_at(history, np.array([half_m]))[:, 0], expected, rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab_profile", "lab_phase", "static_profile", "static_phase"])
 def test_figures_of_the_experiments_are_drawn_from_their_campaigns(campaigns, tmp_path, name):
     path = experiment_figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")

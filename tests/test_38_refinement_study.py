@@ -56,6 +56,7 @@ def test_every_kind_of_scene_is_one_of_the_cases_and_sizes_begin_at_none():
     assert len(SEEDS) > 1
 
 
+@pytest.mark.slow
 @compiled
 def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_its_own():
     one = drawn("five", 1.0, 1)
@@ -66,6 +67,7 @@ def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_it
     assert (accepted.scene, accepted.sigma_cm, accepted.seed, accepted.flags) == ("five", 1.0, 1, "f")
 
 
+@pytest.mark.slow
 @compiled
 def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(monkeypatch):
     stated = []
@@ -103,6 +105,7 @@ def marks(axes, said):
     return line.get_xydata()
 
 
+@pytest.mark.slow
 def test_a_chart_tells_apart_what_was_said(monkeypatch, tmp_path):
     rows = [row(1.0, ACCEPTED), row(2.0, FLAGGED), row(3.0, REFUSED, product_db=6.0), row(5.0, TOO_FEW, product_db=10)]
     rows += [replace(one, scene="dense", said=TOO_FEW) for one in rows]
@@ -122,6 +125,7 @@ def test_the_tally_counts_what_was_accepted_and_did_harm():
     assert charts.tally(rows) == "1 of 2 accepted, 1 of them worse than the logs"
 
 
+@pytest.mark.slow
 def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):
     monkeypatch.setattr(outcomes, "run_kind", lambda scene: [row(1.0, ACCEPTED, scene=scene)])
     for arguments in (*(["refinement-sweep", scene] for scene in KINDS), ["refinement-chart"]):
@@ -153,6 +157,7 @@ def linear_path_error(one, place_m):
     return ((to_tx - sidelink) * tx).sum(axis=1) + ((to_rx + sidelink) * rx).sum(axis=1)
 
 
+@pytest.mark.slow
 @compiled
 def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_takes_away(monkeypatch, tmp_path):
     one = drawn("five", 2.0, 1)
@@ -178,6 +183,7 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
     assert "accepted: because; no flag" in figures[0].get_suptitle()
 
 
+@pytest.mark.slow
 @compiled
 def test_a_picture_of_what_was_refused_says_so_and_shows_the_logs(monkeypatch, tmp_path):
     one = drawn("five", 2.0, 1)

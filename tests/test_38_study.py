@@ -118,6 +118,7 @@ def test_uav_flight_is_as_wide_as_the_paper_says_and_fusion_with_the_fitted_segm
     assert rows["UAV flight: ground-range width, Hann, mono"].verdict == AGREES
 
 
+@pytest.mark.slow
 def test_timing_shifts_and_turns_a_profile_and_a_carrier_phase_leaves_its_magnitude():
     shift, phase, small, magnitude = effect_claims()
     assert float(shift.computed) == pytest.approx(0.4096, rel=0.01)
@@ -343,6 +344,7 @@ def short(monkeypatch, name, *sizes):
     monkeypatch.setitem(SWEEPS, name, replace(SWEEPS[name], sizes=sizes, draws=1, subcarriers=512))
 
 
+@pytest.mark.slow
 def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkeypatch):
     short(monkeypatch, "carrier_phase", 1.0)
     losses = {method: next(run_sweep("carrier_phase", method)).loss_db for method in CHOICES}
@@ -350,6 +352,7 @@ def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkey
     assert max(map(abs, losses.values())) < 0.05
 
 
+@pytest.mark.slow
 def test_moving_while_the_pulse_lasts_costs_nothing_below_10_m_s_and_something_at_3000(monkeypatch):
     monkeypatch.setitem(SWEEPS, "doppler", replace(SWEEPS["doppler"], sizes=(10.0, 3000.0), subcarriers=512))
     slow, fast = run_sweep("doppler", "none")
@@ -406,6 +409,7 @@ def test_outcomes_survive_their_file_and_give_a_tolerance(tmp_path):
     assert gained.size_at_1_db == tolerance.size_at_1_db
 
 
+@pytest.mark.slow
 def test_a_chart_is_the_same_bytes_for_the_same_rows(tmp_path):
     for method in CHOICES:
         write_table(part_path(tmp_path, "timing", method), [outcome(s, s, method=method) for s in (0.1, 1.0, 10.0)])

@@ -27,6 +27,7 @@ def test_an_engine_meets_its_aim_at_the_pixels_compared(small):
     assert row["seconds_from_echoes"] > row["seconds"] > row["seconds_shared"] > 0 < row["planning_seconds"]
 
 
+@pytest.mark.slow
 def test_blocks_of_pulses_add_up(small, monkeypatch):
     whole = House(small).planned("numba", -60.0, 60.0).run()[0]
     monkeypatch.setattr(memory, "BLOCK_BYTES", 1 << 16)

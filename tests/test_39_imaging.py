@@ -71,12 +71,14 @@ def test_a_stage_of_a_campaign_gives_the_image_of_its_workflow(finished_tiny):
     assert campaign.report(flight, pairs[0])["flags"] == campaign.flags(flight, pairs[0])
 
 
+@pytest.mark.slow
 def test_threads_processes_and_one_thread_give_the_same_bits(image):
     alone = image.compute(scheduler="synchronous").values
     np.testing.assert_array_equal(image.compute(scheduler="threads").values, alone)
     np.testing.assert_array_equal(image.compute(scheduler="processes", num_workers=2).values, alone)
 
 
+@pytest.mark.slow
 def test_a_local_cluster_of_two_processes_gives_the_same_bits(image):
     distributed = pytest.importorskip("distributed")
     alone = image.compute(scheduler="synchronous").values

@@ -34,6 +34,7 @@ def profiles(noise, *, echo=1.0):
     return Profiles(samples.astype(np.complex64), start, STEP_M, CENTRE_HZ, 2.0, FLOWN)
 
 
+@pytest.mark.quick("0.01")
 @pytest.mark.parametrize("noise", [1e-4, 1e-2, 4.0])
 def test_noise_of_a_recording_is_found_below_its_echoes(noise):
     """Its echoes are focused at other places, 40 dB above the noise of a pulse, and leave no mark on it."""

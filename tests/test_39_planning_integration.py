@@ -63,6 +63,7 @@ def test_degrees_are_the_angle_of_a_straight_pass():
     assert np.ptp(turn) == pytest.approx(30.0, abs=0.2)
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_width_of_a_target_is_the_resolution_that_was_asked(fixed):

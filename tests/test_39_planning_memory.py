@@ -22,6 +22,7 @@ def test_a_job_that_does_not_fit_is_refused_with_the_numbers():
 LONG = {"aperture": monostatic(straight_track(20_000, length_m=600)), "subcarriers": 128}
 
 
+@pytest.mark.slow
 def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
     """The fewest whose tables fit beside all else; with less than all else takes, the job is refused as before."""
     one = plan(**LONG)
@@ -46,6 +47,7 @@ def test_tables_that_outgrow_memory_are_made_in_blocks_of_pulses():
         check_fits(short, free_disk=None, where="f01/a-b", memory=beside // 2)
 
 
+@pytest.mark.slow
 def test_a_long_flight_is_summed_in_blocks_whatever_memory_there_is():
     """Neither its samples nor its tables are ever in memory together, so three times the flight takes no more."""
     flights = [

@@ -51,6 +51,7 @@ def renumber(first, node):
     return lambda root: edit_meta(root, node, change)
 
 
+@pytest.mark.quick("demo", "paper", "continuous", "flight")
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_is_without_problems(tmp_path, name):
     short = simulate(tmp_path / "campaign", preset(name, pulses=8))
@@ -120,6 +121,7 @@ def test_samples_are_not_read(tiny):
     assert told(tiny) == []
 
 
+@pytest.mark.slow
 def test_no_library_is_imported_that_headers_do_not_need(tiny):
     heavy = ("zarr", "numba", "matplotlib", "scipy.interpolate", "scipy.io", "rasterio", "snakemake", "jsonschema")
     code = f"import sys; from apertura.check import problems; assert problems({str(tiny)!r}) == []; print(*sys.modules)"

@@ -63,6 +63,7 @@ def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_t
     assert stale_results(finished_tiny) == {}
 
 
+@pytest.mark.slow
 def test_a_log_replaced_under_its_old_time_is_noticed_with_all_that_stands_on_it(finished):
     campaign, path = Campaign.load(finished), finished / LOG
     data = path.read_bytes()
@@ -121,6 +122,7 @@ def test_what_changes_while_it_is_read_is_no_source(tmp_path):
         sources.unchanged()
 
 
+@pytest.mark.slow
 def test_results_copied_with_other_times_and_inodes_are_not_stale(finished, tmp_path):
     copied = copy_writable(finished, tmp_path / "copied")
     for path in copied.rglob("*"):
@@ -129,6 +131,7 @@ def test_results_copied_with_other_times_and_inodes_are_not_stale(finished, tmp_
     assert damaged_results(Campaign.load(copied)) == {}
 
 
+@pytest.mark.quick("window")
 @pytest.mark.parametrize(
     ("change", "expected", "spared"),
     [
@@ -185,6 +188,7 @@ def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
     assert list(damaged_results(Campaign.load(finished))) == [f"results/{manifest}.manifest.json"]
 
 
+@pytest.mark.quick("edited-f01/uav1-uav1/db.tif", "gone-scene.json")
 @pytest.mark.parametrize(
     "file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "f01/uav1-uav1/mask.tif", "coverage.png", "scene.json"]
 )
@@ -200,6 +204,7 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
     assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
 
 
+@pytest.mark.quick("0")
 @pytest.mark.parametrize("before", [0, 1])
 def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, before, capsys):
     folder = finished / "results/f01/uav1-uav1"

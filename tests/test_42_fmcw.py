@@ -59,6 +59,7 @@ def off(root, flight, pair="uav1-uav1"):
     return np.abs(found[:, :2] - np.array(flight.targets)[:, :2]).max(), found[:, 2]
 
 
+@pytest.mark.quick("complex")
 @pytest.mark.parametrize(
     "sweep",
     [
@@ -104,6 +105,7 @@ def test_a_sweep_that_cannot_be_is_refused_by_its_key(tmp_path, changes, told):
     assert re.search(told, complaint(lambda: Campaign.load(root)))
 
 
+@pytest.mark.slow
 def test_a_second_node_on_the_same_clock_sees_the_same_targets(tmp_path):
     flight = replace(FLIGHT, nodes={"uav1": (0.0, -20.0, 10.0), "uav2": (3.0, -21.0, 11.0)})
     root = written(tmp_path, flight)
@@ -114,6 +116,7 @@ def test_a_second_node_on_the_same_clock_sees_the_same_targets(tmp_path):
         assert heights == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path, monkeypatch):
     """The frequency of its phase is gamma*tau lower: it stands at that much less of its distance along the track."""
     east = 12.0
@@ -136,6 +139,7 @@ def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path
     assert peaks(kept, flight)[0, 0] == pytest.approx(east - short_m, abs=0.005)
 
 
+@pytest.mark.slow
 def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
     flight = replace(FLIGHT, sweep=replace(FAST, iq="complex"))
     root = written(tmp_path, flight, iq="conjugate")

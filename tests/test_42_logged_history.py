@@ -103,12 +103,14 @@ def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
     assert echo.attrs["frame"] == "ecef"
 
 
+@pytest.mark.slow
 def test_by_a_clock_half_a_second_off_the_target_is_as_far_off_as_was_flown_meanwhile(campaign):
     keep_time(campaign, BEHIND_S + 0.5)
     run_steps(campaign, exports=False)
     assert abs(brightest(campaign)[0] - 1.5) < 0.25
 
 
+@pytest.mark.slow
 def test_what_clocks_tsv_says_of_an_offset_is_in_the_budget(campaign):
     keep_time(campaign, std_s=0.05)
     run_steps(campaign, exports=False)

@@ -83,6 +83,7 @@ def opened(campaign):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair):
     right, mended = (np.abs(image_of(one, pair)).max() for one in campaigns.values())
@@ -98,6 +99,7 @@ def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair
     assert quality["focus"]["expected_db"] == pytest.approx(20 * np.log10(mended / right), abs=0.2)
 
 
+@pytest.mark.slow
 def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
     """What it leaves the image to be moved by is what the budget says of the logs, one sigma."""
     (line,) = [one for one in quality_of(campaigns["mended"], PAIRS[0])["budget"] if one["cause"] == "positions"]
@@ -105,6 +107,7 @@ def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
     assert line["shift_m"] == pytest.approx(0.087, rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_was_found_is_what_images_use(campaigns):
     campaign = campaigns["mended"]
     pairs, scene = opened(campaign)
@@ -123,6 +126,7 @@ def test_what_was_found_is_what_images_use(campaigns):
         np.testing.assert_array_equal(imaged.aperture.tx_m, pair.aperture.tx_m)
 
 
+@pytest.mark.slow
 def test_a_method_that_is_asked_for_is_taken(campaigns, tmp_path):
     root = copy_writable(campaigns["mended"].root, tmp_path / "campaign")
     campaign = state(root, "processing", autofocus_method="phase_gradient")
@@ -150,6 +154,7 @@ def test_one_phase_is_taken_where_it_suffices_for_every_pair(asked, second, know
     assert ("in a-b one phase per pulse leaves" in decision.reason) is (asked == "auto" and not known_points)
 
 
+@pytest.mark.slow
 def test_near_scenes_need_tracks_and_far_ones_one_phase(campaigns, finished_tiny, tmp_path):
     near = state(copy_writable(finished_tiny.root, tmp_path / "near"), "processing", autofocus="on")
     for campaign, value in ((near, "tracks"), (campaigns["mended"], ONE_PHASE)):

@@ -94,6 +94,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
     assert 20 * np.log10(peaks[0] / peaks[1]) > 15
 
 
+@pytest.mark.slow
 def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
     """Two degrees of aperture of the airborne X-band circle, by the same steps, in a frame without a place on Earth."""
     root = tmp_path / "gotcha"
@@ -160,6 +161,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     assert said["numerical_error_estimate_db"] == pytest.approx(measured, abs=3)
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
     run_steps(tiny)
     products = sorted(
@@ -175,6 +177,7 @@ def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
         assert (tiny / "results" / manifest.relative_to(finished_tiny.results)).read_bytes() == manifest.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_threefold_thread_count_changes_nothing(tiny, finished_tiny):
     campaign = Campaign.load(tiny)
     run_steps(tiny, exports=False)

@@ -129,6 +129,7 @@ def write_track(campaign, began, correction, *, accepted=True, flags=None):
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
 
 
+@pytest.mark.slow
 def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_tiny):
     campaign, found = spoilt
     likeness = {}
@@ -227,6 +228,7 @@ def asked_on(folder, *, pulses, half_m, std_m=0.0, said_m=0.02):
     return campaign
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pulses", "half_m", "flags"),
     [(40, 3.0, {"refinement_too_few_patches"}), (200, 6.0, {"refinement_rejected", "prior_inconsistent"})],

@@ -37,7 +37,7 @@ PULSES = {
 }
 
 
-@pytest.fixture(scope="module", params=PULSES)
+@pytest.fixture(scope="module", params=[pytest.param("chirp", marks=pytest.mark.slow), "pn"])
 def imaged(request, tmp_path_factory):
     """Two nodes with noise, clocks of their own, missed triggers, random phases and starts; three targets."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
@@ -90,6 +90,7 @@ def alone(request, tmp_path_factory):
     return campaign
 
 
+@pytest.mark.quick("chirp-*")
 @pytest.mark.parametrize("pair", PAIRS)
 def test_range_profiles_of_a_pulse_have_the_sidelobes_of_the_window_at_every_delay(alone, pair):
     stage = open_stage(alone.stage("echo", "f01", pair), "echo")
@@ -132,6 +133,7 @@ def test_a_point_moves_while_the_pulse_lasts_and_no_longer(imaged):
     assert 0 < lines["stop and go"].effect.shift_m < 1e-6
 
 
+@pytest.mark.slow
 def test_no_hypothesis_improves_what_is_right(imaged):
     grid, places = targets(imaged)
     x, y = grid.map_at(*places[0])
@@ -165,6 +167,7 @@ def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, chan
     assert any(told in line for line in lines), lines
 
 
+@pytest.mark.quick("5e-08-False", "2.5e-07-True")
 @pytest.mark.parametrize(("late_s", "cut"), [(0.05e-6, False), (0.25e-6, True), (-0.6e-6, True)])
 def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_path, late_s, cut):
     """They begin 0.1 µs before it, less what the recorder is late by, and end 0.5 µs after it."""

@@ -77,6 +77,7 @@ def hillside(tmp_path_factory):
     return run_steps(root)
 
 
+@pytest.mark.slow
 def test_every_target_on_a_hillside_is_where_it_stands(hillside):
     findings = score(hillside)
     assert len(findings) == 9
@@ -93,6 +94,7 @@ def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
     assert min(off) > 0.1
 
 
+@pytest.mark.slow
 def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
     report = json.loads((hillside.results / "f01" / "uav1-uav2" / "image.json").read_text())
     assert report["terrain"]["dem"] == "dem.tif"
@@ -109,6 +111,7 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
             assert (runspec["dem"], runspec["dem_datum"]) == ("dem.tif", "ellipsoid")
 
 
+@pytest.mark.slow
 def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
     grid = settled_scene(hillside).grid
     heights = open_stage(hillside.stage("terrain"), "terrain").height.values
@@ -156,6 +159,7 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
     assert settled["inputs"] == {"geoid": hashlib.sha256((tiny / "egm96_15.gtx").read_bytes()).hexdigest()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [True, False])
 def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
     """Samples and bytes of tables are those of its ground, whether stage `terrain` is made or only its DEM is there."""
@@ -173,6 +177,7 @@ def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
 
 
+@pytest.mark.slow
 def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
     """Its stage may even be gone: the pair is opened and planned from the arrays that are held."""
     campaign = Campaign.load(copy_writable(hillside.root, tmp_path / "campaign"))
@@ -279,6 +284,7 @@ def test_a_void_undeclared_is_no_height_on_earth(tiny):
         assert "nodata" in message
 
 
+@pytest.mark.slow
 def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     """620 m are 2034 ft: but from beside a DEM a radar may look up, so it is no error."""
     write_plane(tiny, height_m=620.0 / 0.3048)
@@ -302,6 +308,7 @@ def test_the_command_line_says_in_which_file_a_key_stands(tiny, monkeypatch, cap
     assert capsys.readouterr().err.startswith("error: config/config.yaml: scene.height_m: ")
 
 
+@pytest.mark.slow
 def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):
     """The hill is moved over the track; the scene is widened to hold it."""
     root = copy_writable(hillside.root, tmp_path / "campaign")

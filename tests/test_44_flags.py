@@ -59,6 +59,7 @@ def test_a_node_that_sends_with_a_random_phase_is_flagged_in_its_own_image(tmp_p
     assert set(flags) == {"phase_unstable"}
 
 
+@pytest.mark.quick("2.5-True")
 @pytest.mark.parametrize(("peak_to_peak_db", "flagged"), [(1.5, False), (2.5, True)])
 def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagged):
     flags = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(peak_to_peak_db, 5e-9))).attrs["flags"]
@@ -72,6 +73,7 @@ def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
     assert ("saturated_sidelink" in flags) is flagged
 
 
+@pytest.mark.quick("30.0-divide", "-5.0-two_parameter")
 @pytest.mark.parametrize(
     ("snr_db", "method"),
     [(30.0, "divide"), (8.0, "wiener"), (-5.0, "two_parameter"), (-14.0, "two_parameter")],
@@ -92,6 +94,7 @@ def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, fla
     assert ("sidelink_noisy" in attrs["flags"]) is flagged
 
 
+@pytest.mark.quick("0.3-True")
 @pytest.mark.parametrize(("amplitude", "flagged"), [(0.3, True), (0.03, False)])
 def test_an_echo_in_the_sidelink_is_flagged_where_division_is_asked_for(tmp_path, amplitude, flagged):
     campaign = flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=amplitude),))
@@ -164,6 +167,7 @@ def test_flags_reach_image_json(tmp_path):
     assert report["clock"]["corrected"] is False
 
 
+@pytest.mark.slow
 def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
     campaign = flown(tmp_path)
     edit_config(

@@ -67,6 +67,7 @@ def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
     assert attrs["time_tags"]["jitter_s"] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.quick("0.02-expected1")
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [(None, (None, "nobody")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
@@ -175,6 +176,7 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
     assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
 
 
+@pytest.mark.quick("0.0", "-0.004")
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):
     """12 m/s, 9.5 GHz, receiver 4.7 m ahead: placed at its own tag, 1 ms late, R_sl would err by 1.2 cm, -2.27 rad.

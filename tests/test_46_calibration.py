@@ -83,6 +83,7 @@ def test_the_workflow_knows_what_an_echo_stands_on(calibrated):
     assert manifest not in result_of(calibrated, "echo", "c01", "uav1-uav2").sources
 
 
+@pytest.mark.slow
 def test_a_flight_without_a_visible_reflector_is_refused(tmp_path):
     campaign = flown(tmp_path, reflector=False)
     message = complaint(lambda: calibration.calibrate(campaign, "c01"))

@@ -30,6 +30,7 @@ def reported(finished_tiny, tmp_path_factory):
     return campaign
 
 
+@pytest.mark.slow
 def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_made_from(reported):
     listed = read_manifest(reported.result("f01", "uav1-uav2", "pictures.manifest.json"))
     assert set(listed["files"]) == {f"pictures/{name}.png" for name in PICTURES}
@@ -39,6 +40,7 @@ def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_ma
     assert "results/f01/uav1-uav1/pictures.manifest.json" in listed["sources"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("manifest", ["uav1-uav2/pictures", "page"])
 def test_every_picture_says_what_it_was_made_from(reported, manifest):
     path = reported.result("f01", f"{manifest}.manifest.json")
@@ -48,6 +50,7 @@ def test_every_picture_says_what_it_was_made_from(reported, manifest):
             assert json.loads(read_tags(path.parent / name)["APERTURA_SOURCES"]) == listed["sources"]
 
 
+@pytest.mark.slow
 def test_the_page_holds_every_picture_every_decision_and_the_campaigns_name_as_text(reported):
     html = reported.result("f01", "report.html").read_text()
     report = reported.result("f01", "uav1-uav2", "image.json")
@@ -64,6 +67,7 @@ def _models(path):
     return json.loads(path.read_text())["models"]
 
 
+@pytest.mark.slow
 def test_the_same_results_give_the_same_bytes(reported):
     path = reported.result("f01", "report.html")
     before = path.read_bytes()
@@ -71,6 +75,7 @@ def test_the_same_results_give_the_same_bytes(reported):
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_the_landing_text_is_no_markup_but_its_tables(reported):
     told = landing(reported)
     body = publish_parts(
@@ -83,6 +88,7 @@ def test_the_landing_text_is_no_markup_but_its_tables(reported):
     assert "f01 uav1-uav2" in body["body"]
 
 
+@pytest.mark.slow
 def test_the_brightest_target_adds_up_once_the_sidelink_took_the_clocks_out(reported):
     found = Shown(reported, "f01", "uav1-uav2").phasors()
     before, after = (steadiness(phasors) for phasors in found.values())
@@ -91,6 +97,7 @@ def test_the_brightest_target_adds_up_once_the_sidelink_took_the_clocks_out(repo
     assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, on the tracks of the logs"]
 
 
+@pytest.mark.slow
 def test_pulses_left_out_are_those_that_the_image_counts(reported):
     for pair in ("uav1-uav1", "uav1-uav2"):
         shown = Shown(reported, "f01", pair)
@@ -99,6 +106,7 @@ def test_pulses_left_out_are_those_that_the_image_counts(reported):
         np.testing.assert_allclose(record.time_s, record.sent_s[record.kept])
 
 
+@pytest.mark.slow
 def test_widths_of_the_cuts_are_those_that_the_image_states(reported):
     shown = Shown(reported, "f01", "uav1-uav2")
     stated = shown.image.attrs["quality"]["brightest"]
@@ -107,6 +115,7 @@ def test_widths_of_the_cuts_are_those_that_the_image_states(reported):
         assert cut.decibels[cut.decibels.size // 2] == 0
 
 
+@pytest.mark.slow
 def test_tracks_are_drawn_where_the_flight_was(reported):
     flown = Shown(reported, "f01", "uav1-uav2").geometry()
     west, south, east, north = flown.bounds_m
@@ -119,6 +128,7 @@ def test_tracks_are_drawn_where_the_flight_was(reported):
     assert (heights < 8).all()
 
 
+@pytest.mark.slow
 def test_a_picture_changed_by_hand_does_not_reach_the_page(reported):
     path = reported.result("f01", "uav1-uav1", "pictures", "cuts.png")
     whole = path.read_bytes()

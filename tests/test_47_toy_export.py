@@ -41,6 +41,7 @@ def output_of(package, *command):
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_the_step_writes_a_toy_product_with_the_others(finished_tiny, toy_package, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     written = output_of(toy_package, "apertura", "step", "export", "f01", "uav1-uav1", "--campaign", str(root))

@@ -155,6 +155,7 @@ def cross_range_m(campaign):
     return cut.width_m, report
 
 
+@pytest.mark.slow
 def test_a_target_out_of_the_beam_for_half_the_track_is_twice_as_wide(even):
     whole, _ = cross_range_m(stated(even, None))
     behind = pattern(even, [(0, 7), (40, 7), (80, 7)])  # only what lies behind abeam, and 7 dB are all the same
@@ -166,6 +167,7 @@ def test_a_target_out_of_the_beam_for_half_the_track_is_twice_as_wide(even):
     assert report["numerical_error_db"] <= -60
 
 
+@pytest.mark.slow
 def test_a_sampled_gaussian_is_the_gaussian(beamed):
     by_width, _ = imaged(stated(beamed, BEAM | {"cutoff_db": -30}))
     angle = np.arange(-60, 60.1, 0.25)
@@ -201,6 +203,7 @@ def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beam
     assert not (beamed / "results/f01/uav1-uav1/image.manifest.json").exists()
 
 
+@pytest.mark.quick("0.0-False")
 @pytest.mark.parametrize(("turn_deg", "misses"), [(0.0, False), (28.0, True)])
 def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_deg, misses):
     turned = BEAM | {"boresight_deg": [90.0 + turn_deg, -DEPRESSION_DEG]}

@@ -32,14 +32,9 @@ def sample(folder, spoil=lambda _: None):
     return run_steps(root)
 
 
-@pytest.fixture(scope="module")
-def right(tmp_path_factory):
-    return sample(tmp_path_factory.mktemp("right"))
-
-
-def test_a_right_campaign_is_focused_agrees_and_has_no_flag(right):
-    reports = reports_of(right)
-    assert flags_of(right) == {name: set() for name in (*PAIRS, "fused")}
+def test_a_right_campaign_is_focused_agrees_and_has_no_flag(finished_sample):
+    reports = reports_of(finished_sample)
+    assert flags_of(finished_sample) == {name: set() for name in (*PAIRS, "fused")}
     for pair in PAIRS:
         assert reports[pair]["focus"]["verdict"] == "focused"
         assert reports[pair]["focus"]["loss_db"] > -0.1
@@ -52,16 +47,16 @@ def test_a_right_campaign_is_focused_agrees_and_has_no_flag(right):
     assert list(reports["fused"]["fusion"]["phases_rad"]) == list(PAIRS)
 
 
-def test_every_image_carries_its_budget(right):
-    lines = {line["cause"]: line for line in reports_of(right)["uav1-uav2"]["budget"]}
+def test_every_image_carries_its_budget(finished_sample):
+    lines = {line["cause"]: line for line in reports_of(finished_sample)["uav1-uav2"]["budget"]}
     assert {"positions", "heights", "time tags", "calibration", "clock", "sidelink noise", "arithmetic"} <= set(lines)
     assert lines["heights"]["stated"].startswith("not stated; 1 m")
     assert 0.2 < lines["heights"]["shift_m"] < 0.8
     assert lines["arithmetic"]["loss_db"] > -0.001
 
 
-def test_the_summary_says_each_flag_once_and_whole(right, capsys, tmp_path):
-    root = copy_writable(right.root, tmp_path / "campaign")
+def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_path):
+    root = copy_writable(finished_sample.root, tmp_path / "campaign")
     for name in (*PAIRS, "fused"):
         path = root / "results" / "f01" / name / "image.json"
         report = json.loads(path.read_text())
@@ -79,6 +74,7 @@ def flip_right_arm(document):
         arms[point][1] *= -1
 
 
+@pytest.mark.slow
 def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     """Both images are sharp, 33 and 26 cm from the truth: only each other they contradict."""
     campaign = sample(tmp_path, lambda root: edit_config(root, flip_right_arm))
@@ -122,9 +118,9 @@ def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(right, tmp_path):
+def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(finished_sample, tmp_path):
     def off_by_a_quarter(align):
-        root = copy_writable(right.root, tmp_path / f"align-{align}")
+        root = copy_writable(finished_sample.root, tmp_path / f"align-{align}")
 
         def change(document):
             offsets = document["nodes"]["uav2"]["path_offset_m"]

@@ -93,6 +93,7 @@ def small(tmp_path_factory):
     return made(tmp_path_factory.mktemp("small"), half_width_m=5.0, density_per_m2=8)
 
 
+@pytest.mark.slow
 def test_every_product_lies_there_with_its_tags(small):
     folder = small / "results/interferometry" / NAME
     assert {path.name for path in folder.iterdir()} == FILES | {"interferogram.manifest.json"}
@@ -117,6 +118,7 @@ def test_every_product_lies_there_with_its_tags(small):
     assert (folder / "quicklook.png").read_bytes()[1:4] == b"PNG"
 
 
+@pytest.mark.slow
 def test_its_lineage_names_both_images_and_all_that_their_geometry_is_from(small):
     sources = result_of(Campaign.load(small), "interferogram", NAME).sources
     for flight in ("f01", "f02"):
@@ -126,10 +128,12 @@ def test_its_lineage_names_both_images_and_all_that_their_geometry_is_from(small
     assert set(manifest["sources"]) == set(sources)
 
 
+@pytest.mark.slow
 def test_verify_finds_every_link_as_it_was(small, capsys):
     assert print_verified(small, quiet=True) == 0, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_heights_of_sparse_ground_lie_about_the_ramp(small):
     height, transform, *_ = read(small, "height")
     wrong, std = height - ramp_at(small, transform, height.shape), read(small, "height_std")[0]
@@ -139,6 +143,7 @@ def test_heights_of_sparse_ground_lie_about_the_ramp(small):
     assert np.mean(abs(wrong[there]) < 3 * std[there]) > 0.97
 
 
+@pytest.mark.slow
 def test_the_summary_tells_heights_and_the_flags_of_an_interferogram(small, tmp_path, capsys):
     root = copy_writable(small, tmp_path / "unlevelled")
     print_summary(Campaign.load(root))
@@ -153,6 +158,7 @@ def test_the_summary_tells_heights_and_the_flags_of_an_interferogram(small, tmp_
     assert "interferometry two_tracks: no point of known height shows" in told
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_bytes(small, tmp_path):
     again = copy_writable(small, tmp_path / "elsewhere")
     before = contents(again / "results/interferometry")
@@ -160,6 +166,7 @@ def test_the_same_images_give_the_same_bytes(small, tmp_path):
     assert contents(again / "results/interferometry") == before
 
 
+@pytest.mark.slow
 def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
     root = copy_writable(small, tmp_path / "edited")
     mask = root / "results/f02/uav1-uav1/mask.tif"
@@ -168,6 +175,7 @@ def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
     assert "mask.tif: not as it was written" in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pairs", "expected"),
     [
@@ -189,6 +197,7 @@ def test_an_interferogram_that_is_none_is_refused_by_its_key(small, tmp_path, pa
     assert expected in told
 
 
+@pytest.mark.slow
 def test_a_window_needs_a_middle_and_a_name_a_place(small):
     with pytest.raises(ValueError, match="must be odd"):
         Interferometry(window_px=8)

@@ -36,6 +36,7 @@ def asking(finished_tiny, tmp_path, monkeypatch):
     return ask
 
 
+@pytest.mark.slow
 def test_workers_of_a_scheduler_form_the_same_bytes(asking, cluster):
     campaign = asking(cluster.scheduler_address)
     folder = campaign.stage("image", "f01", "uav1-uav2")
@@ -54,6 +55,7 @@ def test_where_tiles_are_formed_makes_nothing_stale_but_the_crate_that_names_the
     assert "scheduler" not in result_of(campaign, "whole").settings["processing"]
 
 
+@pytest.mark.quick("tcp://127.0.0.1:9-tcp*")
 @pytest.mark.parametrize(
     ("address", "named", "expected"),
     [
@@ -71,6 +73,7 @@ def test_a_scheduler_that_cannot_be_used_is_told_within_seconds(asking, address,
     assert time.monotonic() - asked < 15
 
 
+@pytest.mark.slow
 def test_a_scheduler_without_workers_is_told(asking):
     address = {"host": "127.0.0.1", "port": 0, "dashboard_address": None}
     with distributed.SpecCluster(scheduler={"cls": distributed.Scheduler, "options": address}) as empty:

@@ -51,6 +51,7 @@ def larger(root):
     path.write_text(yaml.safe_dump(document))
 
 
+@pytest.mark.slow
 def test_a_name_that_looks_like_a_wildcard_is_text(tiny):
     path = tiny / "config" / "config.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"campaign": "{{7*7}} {config} {flight} %s"}))

@@ -26,6 +26,7 @@ def test_a_folder_that_is_no_campaign_ends_with_2_and_one_line(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_every_problem_is_a_line_of_its_own(tiny):
     (tiny / "raw/f01/uav1.sigmf-data").unlink()
     (tiny / "raw/codes.npy").write_bytes(b"x")

@@ -197,6 +197,7 @@ def test_every_command_is_tried():
     assert set(TYPED) | MAY_REFUSE <= set(leaves())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", every_command())
 def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, command):
     planted = plant(finished)
@@ -308,6 +309,7 @@ def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, words):
     assert "lies in the campaign folder" in said
 
 
+@pytest.mark.slow
 def test_a_profile_of_the_environment_is_one_of_the_command_line(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
@@ -327,11 +329,13 @@ def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
     assert "reads a pickle of the campaign folder" in said
 
 
+@pytest.mark.slow
 def test_a_short_option_of_snakemake_reaches_it_letter_for_letter(unfinished):
     _, said = run([BIN / "apertura", "run", ".", "-s/review/quiet"], unfinished)
     assert "/review/quiet" in said
 
 
+@pytest.mark.slow
 def test_a_target_that_is_there_stays_the_name_that_rules_know(finished):
     target = "results/f01/uav1-uav1/export.manifest.json"
     for words in ([target, "-n"], ["-n", "--", target]):
@@ -339,6 +343,7 @@ def test_a_target_that_is_there_stays_the_name_that_rules_know(finished):
         assert status == 0, said
 
 
+@pytest.mark.slow
 def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere_are_found(unfinished, tmp_path):
     planted, own = plant(unfinished), tmp_path / "elsewhere" / "mine"
     own.mkdir(parents=True)
@@ -508,6 +513,7 @@ def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinishe
     assert "scene" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["chunk", *slow("config", "raw", "log", "results", "records")])
 def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(finished, tmp_path, what):
     planted = plant(finished)
@@ -554,6 +560,7 @@ def test_code_in_the_config_is_refused_as_a_key_or_a_tag(unfinished, road, line)
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["version 2", "codec"])
 def test_a_stage_whose_chunks_are_code_is_not_opened(finished, kind):
     """A forged result with manifests that agree: zarr's version 2 keeps objects as pickles, a codec may do anything."""

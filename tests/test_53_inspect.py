@@ -228,6 +228,7 @@ def test_inside_a_campaign_the_config_says_how_a_log_is_read(tiny, tmp_path):
     assert look(alone, ["columns.height_m=up"]).problem is None
 
 
+@pytest.mark.quick("campaign-sample", "dem_isce3*")
 @pytest.mark.parametrize(
     "name",
     [
@@ -249,6 +250,7 @@ def test_previews_are_pictures_and_the_same_each_time(shared, tmp_path, capsys, 
     assert str(tmp_path / "0.png") in capsys.readouterr().out.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
     folder = copy_writable(SHARED / "campaign-sample", tmp_path / "sample")
     airdata = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
@@ -276,6 +278,7 @@ def test_beats_of_a_campaign_are_told_with_the_times_beside(tmp_path):
     assert "sweep 1 begins" in refused.problem.found
 
 
+@pytest.mark.slow
 def test_times_of_a_campaign_are_whole_on_a_narrow_terminal_and_for_machines(shared):
     meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
     report = look(SHARED / "campaign-sample")

@@ -108,6 +108,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
     copied = shutil.copytree(PACKAGE, tmp_path / "src" / "apertura", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("Snakefile", "requirements"):
@@ -125,6 +126,7 @@ def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
     assert verified() == (1, [f"changed  code of {EXPORT}"])
 
 
+@pytest.mark.quick("raw/f01/uav2.sigmf-data", "results/f01/uav1-uav2/export.manifest.json")
 @pytest.mark.parametrize("gone", [RAW, DB, EXPORT, "results/f01/uav1/raw.manifest.json", "results/scene.json"])
 def test_a_file_that_is_gone_is_missing(root, gone):
     (root / gone).unlink()

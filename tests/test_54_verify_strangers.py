@@ -102,6 +102,7 @@ def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root
     assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
 
 
+@pytest.mark.quick("words0")
 @pytest.mark.parametrize("words", [("verify", "nowhere.tif"), ("diff", "nowhere.tif", "there.tif"), ("reproduce", ".")])
 def test_a_question_that_cannot_be_answered_ends_with_2_and_one_line(tmp_path, words):
     apertura = Path(sys.executable).parent / "apertura"

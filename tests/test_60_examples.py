@@ -53,6 +53,7 @@ def width(cut, peak):
     return right - left - sum(inner)
 
 
+@pytest.mark.slow
 def test_the_rail_pass_is_aligned_by_its_reflector_as_its_config_says(rail_pass):
     campaign = Campaign.load(rail_pass)
     found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)))
@@ -62,6 +63,7 @@ def test_the_rail_pass_is_aligned_by_its_reflector_as_its_config_says(rail_pass)
     assert stated["path_offset_m"] == pytest.approx(campaign.settings.nodes["radar"].path_offset_m.radar, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_path_that_was_frozen_leaves_only_the_clock_to_be_found(rail_pass):
     """As another pass of the same radar needs it."""
     (rail_pass / "config/clocks.tsv").unlink()
@@ -74,6 +76,7 @@ def test_a_path_that_was_frozen_leaves_only_the_clock_to_be_found(rail_pass):
     assert stated["path_offset_m"] == 3.8225
 
 
+@pytest.mark.slow
 def test_the_reflector_of_the_rail_pass_is_where_it_was_tracked(rail_pass):
     assert problems(rail_pass) == []
     run_steps(rail_pass, exports=False)
@@ -101,6 +104,7 @@ def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(
     assert response(rail_pass, reflector(rail_pass))[0] < 0.10
 
 
+@pytest.mark.slow
 def test_targets_seen_from_a_real_px4_flight_are_within_a_centimetre(shared, tmp_path):
     runpy.run_path(str(EXAMPLES / "px4_flight" / "replay.py"))["replay"](
         shared / "px4_real_flight" / "esc_status_log.ulg", tmp_path / "replayed"

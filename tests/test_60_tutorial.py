@@ -16,6 +16,7 @@ TUTORIAL = Path(__file__).parents[1] / "docs/tutorial.md"
 PROJECT = Path(__file__).parents[1] / "examples/qgis_project.py"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not native.available(), reason="the plan that is shown takes the compiled engine")
 def test_every_block_of_the_tutorial_runs_and_prints_what_it_shows(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -22,6 +22,7 @@ def disturbed(*options: str, steps: tuple[str, ...] = ()) -> list[int]:
     return [int(count) for count in re.search(r"^all +(\d+) +(\d+) +(\d+)", done.stdout, re.MULTILINE).groups()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(compiler() is None, reason="no C compiler to build what makes calls fail")
 def test_a_step_killed_or_failing_or_on_a_full_disk_leaves_nothing_half_and_resumes_to_the_same_bytes():
     full = 2 if may_mount() else 0

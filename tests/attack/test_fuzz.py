@@ -15,6 +15,7 @@ from .parsers import PARSERS, Parser
 INPUTS = 150
 
 
+@pytest.mark.quick("track.csv", "sigmf-meta", "codes.npy")
 @pytest.mark.parametrize("name", PARSERS)
 def test_wrong_files_are_refused_in_one_message_or_read_without_harm(name):
     tally = fuzz.fuzz(name, INPUTS, seed=2)
