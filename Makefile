@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
-TESTS ?= tests src
+TESTS ?= tests src research
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
@@ -13,17 +13,17 @@ setup: $(SETUP)
 
 # uv comes first, by hash; it then installs everything else by hash, and the package from this folder. All is compiled
 # to bytecode now: where Python may not write it later, every start would compile a step's 3000 imported files again.
-$(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml $(wildcard CMakeLists.txt native/*)
+$(SETUP): requirements/uv.txt requirements/all.txt pyproject.toml research/pyproject.toml $(wildcard CMakeLists.txt native/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/uv.txt
 	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python --require-hashes requirements/all.txt
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m compileall -q src
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable . --editable research
+	$(BIN)/python -m compileall -q src research
 	if command -v npm >/dev/null; then $(MAKE) --no-print-directory webmap || echo "no map: see above" >&2; fi
 	touch $@
 
 # The page of `apertura map`, into the package. Its libraries come by hash, as Python's do; none runs a script of its own.
-PAGE := src/apertura/webmap/page/index.html
+PAGE := src/apertura/views/webmap/page/index.html
 webmap: $(PAGE)
 $(PAGE): webmap/build.mjs webmap/package-lock.json $(wildcard webmap/src/*)
 	npm ci --prefix webmap --ignore-scripts --no-audit --no-fund --loglevel=error
@@ -43,7 +43,7 @@ run: $(SETUP)
 
 # The paper's claims and the stability atlas, into results/study/; killed runs go on where they were.
 paper stability: $(SETUP)
-	$(BIN)/snakemake --snakefile workflow/rules/study.smk --workflow-profile profiles/default $@
+	$(BIN)/snakemake --snakefile research/study.smk --workflow-profile profiles/default $@
 
 # Every engine on one job, against fastsar: prints a table and writes benchmarks/latest.json.
 bench: $(SETUP)
@@ -89,19 +89,19 @@ crate-check: $(SETUP)
 	$(BIN)/python -m tests.crate $(or $(CAMPAIGN),$(error which campaign? make crate-check CAMPAIGN=folder))
 
 lint: $(SETUP)
-	$(BIN)/ruff check src tests benchmarks website
-	$(BIN)/ruff format --check src tests benchmarks website
+	$(BIN)/ruff check src research tests benchmarks website
+	$(BIN)/ruff format --check src research tests benchmarks website
 	$(BIN)/mypy --cache-dir=/dev/null  # what a cache remembers, a fresh clone does not: an error hid behind one
-	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/snakefmt --check Snakefile workflow research/study.smk
 	$(BIN)/clang-format --dry-run -Werror native/*.?pp
 	$(BIN)/lint-imports
 	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
 	$(BIN)/snakemake --lint --directory build/lint
 
 format: $(SETUP)
-	$(BIN)/ruff check --fix src tests benchmarks website
-	$(BIN)/ruff format src tests benchmarks website
-	$(BIN)/snakefmt Snakefile workflow
+	$(BIN)/ruff check --fix src research tests benchmarks website
+	$(BIN)/ruff format src research tests benchmarks website
+	$(BIN)/snakefmt Snakefile workflow research/study.smk
 	$(BIN)/clang-format -i native/*.?pp
 
 # Needs a registry; the files name none.

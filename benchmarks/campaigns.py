@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.compression import window_weights
-from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.job import Job
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.job import imaging_job
-from apertura.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, range_compress
-from apertura.scene.grid import SceneGrid
-from apertura.scene.ground_models import GroundModels
-from apertura.scene.swath import swath
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.echo.compression import window_weights
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.job import Job
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.job import imaging_job
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround
 
 FLAT = FlatGround(0.0)
 

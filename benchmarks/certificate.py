@@ -12,14 +12,14 @@ import numpy as np
 from campaigns import Drawn, draw
 from numpy.typing import NDArray
 
-from apertura.focus.engines import load_engine, reference
-from apertura.focus.engines.engine import Setting
-from apertura.imaging.certify import certified
-from apertura.imaging.formation import Formation
-from apertura.planning.plan import Plan
-from apertura.planning.planner import make_plan
-from apertura.planning.search import Search
-from apertura.quality.error_bound import error_bound
+from apertura.core.focus.engines import load_engine, reference
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.imaging.certify import certified
+from apertura.core.imaging.formation import Formation
+from apertura.core.planning.plan import Plan
+from apertura.core.planning.planner import make_plan
+from apertura.core.planning.search import Search
+from apertura.core.quality.error_bound import error_bound
 
 TILE_PX = 32
 

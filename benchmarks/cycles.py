@@ -26,10 +26,10 @@ import numba as nb
 import numpy as np
 from job import CENTRE_HZ, Job, build, echoes, error_db
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.errors import CampaignError
-from apertura.focus.engines import native, native_binding
-from apertura.focus.engines.native_tables import Tables
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import native, native_binding
+from apertura.core.focus.engines.native_tables import Tables
 
 STEPS, CYCLES_PER_STEP = 2_000_000, 4
 

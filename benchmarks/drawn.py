@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.geometry.aperture import Aperture
 
 TRACKS = ("straight", "wobbling", "circular")
 JITTERS_M = (0.0, 0.0, 1e-4, 1e-3, 1e-2)

@@ -24,9 +24,9 @@ import numpy as np
 from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectra, turned
 from latest import replace_rows
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import compress, window_weights
-from apertura.focus.engines import native, native_binding, numba
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import compress, window_weights
+from apertura.core.focus.engines import native, native_binding, numba
 
 
 @dataclass

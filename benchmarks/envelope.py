@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from job import GUARD, Job, exact, response, total_path
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native
-from apertura.focus.inputs import Profiles
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import native
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
 
 RANGES_M = (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
 CARRIERS_HZ = (0.4e9, 1.2e9, 3.5e9, 10e9)

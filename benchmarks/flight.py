@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy import fft
 
-from apertura.campaign import Campaign
-from apertura.ingest import open_recording
-from apertura.lineage import results_of
+from apertura.formats.reading import open_recording
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import results_of
 from apertura.simulation import preset, simulate
 
 PRF_HZ = 500

@@ -19,19 +19,19 @@ from pathlib import Path
 
 import numpy as np
 
-from apertura.campaign import Campaign
-from apertura.contracts import Window
-from apertura.focus.engines import ENGINES, load_engine
-from apertura.focus.tiles import compute_tiles
-from apertura.imaging.formation import Formation
-from apertura.imaging.stages import profiles_of
-from apertura.load.pair import open_pair
-from apertura.load.plan import job_of
-from apertura.load.refined import open_refined
-from apertura.load.scene import open_scene
-from apertura.planning.planner import make_plan
-from apertura.quality.error_check import random_pixels
-from apertura.store import open_stage
+from apertura.common.contracts import Window
+from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.focus.tiles import compute_tiles
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.stages import profiles_of
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.error_check import random_pixels
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import job_of
+from apertura.pipeline.opening.refined import open_refined
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.store import open_stage
 
 FLIGHT = "f01"
 

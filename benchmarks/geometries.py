@@ -17,13 +17,13 @@ import numpy as np
 from drawn import Geometry, draw
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import tree
-from apertura.focus.engines.engine import Setting
-from apertura.focus.inputs import Profiles
-from apertura.focus.job import Job, Signal
-from apertura.planning.planner import make_plan
-from apertura.quality.error_bound import error_bound
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import tree
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.inputs import Profiles
+from apertura.core.focus.job import Job, Signal
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.error_bound import error_bound
 
 AIM_DB = -60.0
 LINES, GUARD, SCATTERERS, CHECKED = 128, 32, 200, 400

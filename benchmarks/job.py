@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.inputs import Profiles
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16

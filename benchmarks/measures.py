@@ -21,22 +21,22 @@ import zarr
 from rich.console import Console
 from rich.table import Table
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.compression import window_weights
-from apertura.focus.inputs import PhaseHistory
-from apertura.focus.tiles import compute_tiles
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.certify import certified, measures
-from apertura.imaging.focus_check import focus_report
-from apertura.imaging.formation import Formation
-from apertura.imaging.job import imaging_job
-from apertura.imaging.range_profiles import range_compress
-from apertura.planning.planner import make_plan
-from apertura.quality.agreement import agreement
-from apertura.quality.bright_points import BrightPoint
-from apertura.scene.grid import SceneGrid
-from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.echo.compression import window_weights
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.focus.tiles import compute_tiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.certify import certified, measures
+from apertura.core.imaging.focus_check import focus_report
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import imaging_job
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.agreement import agreement
+from apertura.core.quality.bright_points import BrightPoint
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import FlatGround
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
 

@@ -11,22 +11,22 @@ from statistics import median
 from time import process_time
 
 import numpy as np
+from apertura_research.study.refinement.cases import PROBES_M, Case, case
+from apertura_research.study.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
+from apertura_research.study.refinement.scenes import AREA_M, GRID
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.quality.path_errors import PointPaths
-from apertura.refinement.candidates import Candidates
-from apertura.refinement.one_phase import METHODS
-from apertura.refinement.outcome import Refinement
-from apertura.refinement.path_offsets import refine_one_phase
-from apertura.refinement.refine import refine
-from apertura.refinement.space_variance import SpaceVariance, space_variance
-from apertura.scene.terrain import FlatGround
-from apertura.study.refinement.cases import PROBES_M, Case, case
-from apertura.study.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
-from apertura.study.refinement.scenes import AREA_M, GRID
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.quality.path_errors import PointPaths
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.candidates import Candidates
+from apertura.methods.autofocus.one_phase import METHODS
+from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.methods.autofocus.refine import refine
+from apertura.methods.autofocus.space_variance import SpaceVariance, space_variance
 from benchmarks.refinement.__main__ import Key, keys
 
 MIDDLE_M = np.array([0.0, 15.0, 0.0])

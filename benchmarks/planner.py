@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from campaigns import Drawn, draw
 
-from apertura.focus.engines import load_engine, numba, reference
-from apertura.focus.engines.engine import Setting
-from apertura.planning.plan import Plan
-from apertura.planning.planner import make_plan
-from apertura.planning.search import Search
-from apertura.quality.measures import numerical_error
+from apertura.core.focus.engines import load_engine, numba, reference
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.planning.plan import Plan
+from apertura.core.planning.planner import make_plan
+from apertura.core.planning.search import Search
+from apertura.core.quality.measures import numerical_error
 
 
 @dataclass

@@ -43,13 +43,14 @@ def campaign_of(root, flights):
 
 def finish(root):
     """Put a file in the place of every result, with the manifest that its step would write."""
-    from apertura.atomic import write_json
-    from apertura.campaign import Campaign
-    from apertura.digests import Sources
-    from apertura.export import exports_in
-    from apertura.lineage import results_of
-    from apertura.steps.code import code_of
-    from apertura.store import record_files
+    from apertura.pipeline.steps.code import code_of
+
+    from apertura.common.atomic import write_json
+    from apertura.formats.export import exports_in
+    from apertura.pipeline.campaign import Campaign
+    from apertura.pipeline.digests import Sources
+    from apertura.pipeline.lineage import results_of
+    from apertura.pipeline.store import record_files
 
     beside = {
         "scene": ["scene.json"],

@@ -20,16 +20,16 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import PATCH_PX, native
-from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.native_tables import Tables
-from apertura.focus.inputs import Profiles
-from apertura.focus.tiles import compute_tiles, image_array
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.geodesy import ecef_from_projected
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import PATCH_PX, native
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.engines.native_tables import Tables
+from apertura.core.focus.inputs import Profiles
+from apertura.core.focus.tiles import compute_tiles, image_array
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import ecef_from_projected
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 512
 

@@ -25,24 +25,24 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.antenna.illumination import illuminate
-from apertura.antenna.pattern import gaussian_cut
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.compression import centre_frequency
-from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.tiles import compute_tiles
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.certify import certified, measures
-from apertura.imaging.focus_check import focus_report
-from apertura.imaging.formation import Formation
-from apertura.imaging.job import imaging_job
-from apertura.imaging.range_profiles import RangeWindow, range_compress
-from apertura.imaging.stages import Rows
-from apertura.planning.planner import make_plan
-from apertura.scene.grid import SceneGrid
-from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.illumination import illuminate
+from apertura.core.antenna.pattern import gaussian_cut
+from apertura.core.echo.compression import centre_frequency
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.tiles import compute_tiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.certify import certified, measures
+from apertura.core.imaging.focus_check import focus_report
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import imaging_job
+from apertura.core.imaging.range_profiles import RangeWindow, range_compress
+from apertura.core.imaging.stages import Rows
+from apertura.core.planning.planner import make_plan
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import FlatGround
 
 FLAT = FlatGround(0.0)
 SPEED_M, HEIGHT_M = 0.02, 40.0

@@ -19,13 +19,13 @@ import numpy as np
 from job import Job, build
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native, tree
-from apertura.focus.engines.engine import Setting
-from apertura.focus.job import Job as PlannedJob
-from apertura.focus.job import Signal
-from apertura.geometry.aperture import Aperture
-from apertura.planning.planner import MARGIN_DB
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import native, tree
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.job import Job as PlannedJob
+from apertura.core.focus.job import Signal
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.planning.planner import MARGIN_DB
 
 AIMS_DB = (-40.0, -60.0, -80.0)
 SLOWER = 1.05

@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 
-from apertura.leap_seconds import GPS_EPOCH, gps_from_utc
+from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc
 
 START = np.datetime64("2025-05-14T09:30:00", "ns")
 LAG_S, BOOT_S = 0.11, 300.0

@@ -8,9 +8,9 @@ import pytest
 from folders import SHARED, copy_writable, run_steps
 from in_this_process import Processes
 
-from apertura.campaign import Campaign
-from apertura.focus.engines import ENGINES, native, native_binding
-from apertura.ingest import isolated
+from apertura.core.focus.engines import ENGINES, native, native_binding
+from apertura.formats import isolated
+from apertura.pipeline.campaign import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
 
 # They run in other environments: of roc-validator, of QGIS.

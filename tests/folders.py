@@ -11,27 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from apertura.campaign import Campaign
-from apertura.check.files import check_files
-from apertura.check.inspected import Inspected
-from apertura.errors import CampaignError
-from apertura.settings import SampledWaveform
-from apertura.simulation import (
-    CampaignSpecification,
-    Framing,
-    ImageGrid,
-    Impairments,
-    Origin,
-    PointTarget,
-    SimulatedFlight,
-    SimulatedNode,
-    Straight,
-    WaveformSpecification,
-)
-from apertura.simulation.observation import Observation, fly
-from apertura.simulation.scene import scatterers
-from apertura.simulation.specification import DrawnCampaign, draw_campaign
-from apertura.steps import (
+from apertura.common.errors import CampaignError
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.files import check_files
+from apertura.pipeline.check.inspected import Inspected
+from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.steps import (
     assess,
     coverage,
     cube,
@@ -48,9 +33,24 @@ from apertura.steps import (
     scene,
     stac,
     terrain,
-    webmap,
 )
-from apertura.store import open_stage
+from apertura.pipeline.store import open_stage
+from apertura.simulation import (
+    CampaignSpecification,
+    Framing,
+    ImageGrid,
+    Impairments,
+    Origin,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    WaveformSpecification,
+)
+from apertura.simulation.observation import Observation, fly
+from apertura.simulation.scene import scatterers
+from apertura.simulation.specification import DrawnCampaign, draw_campaign
+from apertura.views.webmap import step as webmap
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from apertura.antenna.beam import Beam
-from apertura.antenna.pattern import antenna_axes, gaussian_cut
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native
-from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.job import Job, Signal
-from apertura.geometry.aperture import Aperture
-from apertura.planning.plan import Plan
-from apertura.planning.planner import make_plan
-from apertura.scene.grid import SceneGrid
-from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import FlatGround, GridHeights
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beam
+from apertura.core.antenna.pattern import antenna_axes, gaussian_cut
+from apertura.core.focus.engines import native
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.job import Job, Signal
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.planning.plan import Plan
+from apertura.core.planning.planner import make_plan
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import FlatGround, GridHeights
 
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 WAVELENGTH = C / 1.2e9

@@ -13,13 +13,13 @@ import pytest
 from scenes import BANDWIDTH_HZ, SUBCARRIERS, C, decibels, ecef, error_db, fly, pixel_grid, plan, scatter
 
 import apertura as ap
-from apertura.errors import CampaignError
-from apertura.focus.engines import cuda
-from apertura.focus.engines.cuda_prediction import candidates
-from apertura.focus.inputs import PhaseHistory
-from apertura.focus.job import Job, Signal
-from apertura.geometry.aperture import Aperture
-from apertura.scene.grid import SceneGrid
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import cuda
+from apertura.core.focus.engines.cuda_prediction import candidates
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.focus.job import Job, Signal
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
 
 PULSES = 12
 

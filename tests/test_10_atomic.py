@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apertura.atomic import remove, replacement, write_beside, write_json, write_text
-from apertura.errors import explained
+from apertura.common.atomic import remove, replacement, write_beside, write_json, write_text
+from apertura.common.errors import explained
 
 
 def names(folder):
@@ -42,7 +42,7 @@ def test_a_second_writer_of_the_same_file_waits(tmp_path):
 MANY = """
 import sys
 from pathlib import Path
-from apertura.atomic import write_text
+from apertura.common.atomic import write_text
 for turn in range(40):
     write_text(Path(sys.argv[1]), sys.argv[2] * 20000)
 """
@@ -64,7 +64,7 @@ def test_many_writers_at_once_leave_one_complete_file(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from apertura.atomic import replacement
+from apertura.common.atomic import replacement
 with replacement(Path(sys.argv[1])) as temporary:
     temporary.mkdir()
     (temporary / "half").write_text("half")

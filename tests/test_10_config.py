@@ -11,11 +11,11 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import apertura
-from apertura import validation
-from apertura.cli import app
-from apertura.errors import CampaignError
-from apertura.settings import Processing, Scene, Settings, validated
-from apertura.settings.template import WAVEFORMS, config_schema, config_template, flights_template
+from apertura.common import validation
+from apertura.common.errors import CampaignError
+from apertura.pipeline.config import Processing, Scene, Settings, validated
+from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template, flights_template
+from apertura.views.cli import app
 
 ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}

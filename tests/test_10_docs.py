@@ -104,7 +104,7 @@ def test_every_dotted_name_in_a_document_resolves():
 def test_every_command_that_a_document_gives_exists():
     from typer.main import get_command
 
-    from apertura.cli import app
+    from apertura.views.cli import app
 
     commands = get_command(app).commands
 

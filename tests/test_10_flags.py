@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from apertura.flags import FLAGS
+from apertura.common.flags import FLAGS
 from website.pages import PAGES
 
 ROOT = Path(__file__).parents[1]

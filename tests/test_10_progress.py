@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from apertura import progress as told
-from apertura.progress import progress, telling, told_at
+from apertura.common import progress as told
+from apertura.common.progress import progress, telling, told_at
 
 
 @pytest.fixture
@@ -62,9 +62,9 @@ def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeyp
     """A tile of a long flight is done with the last block of pulses: parts are counted, not tiles."""
     from dask.array import ones
 
-    from apertura.focus.tiles import compute_tiles
+    from apertura.core.focus.tiles import compute_tiles
 
-    monkeypatch.setattr("apertura.progress._BETWEEN_S", 0.0)
+    monkeypatch.setattr("apertura.common.progress._BETWEEN_S", 0.0)
     seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6))
 
     class Watched:

@@ -9,10 +9,10 @@ from types import EllipsisType, SimpleNamespace
 
 import pytest
 
-from apertura.code_imports import PACKAGE, import_closure, without_description
-from apertura.export import export_modules
-from apertura.focus.engines import ENGINES
-from apertura.provenance import Provenance, code_sha256, merged
+from apertura.common.code_imports import PACKAGE, import_closure, without_description
+from apertura.common.provenance import Provenance, code_sha256, merged
+from apertura.core.focus.engines import ENGINES
+from apertura.formats.export import export_modules
 
 RUN = {"image": ENGINES.values(), "export": export_modules("pair")}
 
@@ -32,45 +32,45 @@ def changes(copied, file, *modules):
 @pytest.mark.parametrize(
     ("edited", "step", "reruns"),
     [
-        ("focus/engines/numba.py", "image", True),
-        ("focus/engines/numba.py", "echo", False),
-        ("fusion/sums.py", "cube", True),
-        ("fusion/sums.py", "image", False),
-        ("echo/sidelink.py", "echo", True),
-        ("echo/sidelink.py", "image", False),
-        ("export/__init__.py", "export", True),
-        ("export/cog.py", "export", True),
-        ("export/cog.py", "cube", False),
-        ("export/__init__.py", "cube", False),
-        ("ingest/rtklib.py", "ingest", False),
+        ("core/focus/engines/numba.py", "image", True),
+        ("core/focus/engines/numba.py", "echo", False),
+        ("core/combination/sums.py", "cube", True),
+        ("core/combination/sums.py", "image", False),
+        ("core/echo/sidelink.py", "echo", True),
+        ("core/echo/sidelink.py", "image", False),
+        ("formats/export/__init__.py", "export", True),
+        ("formats/export/cog.py", "export", True),
+        ("formats/export/cog.py", "cube", False),
+        ("formats/export/__init__.py", "cube", False),
+        ("formats/tracks/rtklib.py", "ingest", False),
         ("simulation/presets.py", "image", False),
         ("constants.py", "image", True),
-        ("settings/nodes.py", "ingest", True),
-        ("store/progress.py", "ingest", True),
+        ("pipeline/config/nodes.py", "ingest", True),
+        ("pipeline/store/progress.py", "ingest", True),
         ("errors.py", "image", False),
-        ("ingest/names.py", "ingest", True),
-        ("ingest/px4_ulog.py", "ingest", False),
+        ("formats/names.py", "ingest", True),
+        ("formats/tracks/px4_ulog.py", "ingest", False),
         ("cli.py", "ingest", False),
     ],
 )
 def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, edited, step, reruns):
-    assert changes(copied, edited, f"apertura.steps.{step}", *RUN.get(step, ())) is reruns
+    assert changes(copied, edited, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
 
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
 def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
     digests = copied / "focus/engines/_backprojection.sha256"
     digests.write_text("of other sources")
-    assert changes(copied, digests, f"apertura.steps.{step}", *RUN.get(step, ())) is reruns
+    assert changes(copied, digests, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
 
 
 LOADED = """
 import json, sys
-from apertura.code_imports import WITHOUT_EFFECT
+from apertura.common.code_imports import WITHOUT_EFFECT
 for name in WITHOUT_EFFECT:
     __import__(name)
 before = set(sys.modules)
-import apertura.steps.image
+import apertura.pipeline.steps.image
 ours = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == "apertura"}
 print(json.dumps([name for name, module in ours.items() if name not in before and not hasattr(module, "__path__")]))
 """
@@ -79,15 +79,15 @@ print(json.dumps([name for name, module in ours.items() if name not in before an
 def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))
-    assert {"apertura.store.stages", "apertura.focus.tiles", "apertura.geometry.aperture"} <= loaded
-    assert loaded <= set(import_closure(["apertura.steps.image"]))
+    assert {"apertura.pipeline.store.stages", "apertura.core.focus.tiles", "apertura.core.geometry.aperture"} <= loaded
+    assert loaded <= set(import_closure(["apertura.pipeline.steps.image"]))
 
 
 def test_a_module_of_another_package_counts_with_what_it_imports_of_apertura(tmp_path, monkeypatch, copied):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "toy_format.py").write_text("import json\nfrom apertura.export import cog\n")
+    (tmp_path / "toy_format.py").write_text("import json\nfrom apertura.formats.export import cog\n")
     assert "json" not in import_closure(["toy_format"], package=copied)
-    assert changes(copied, "export/cog.py", "toy_format")
+    assert changes(copied, "formats/export/cog.py", "toy_format")
     assert changes(copied, "../toy_format.py", "toy_format")
 
 
@@ -128,13 +128,13 @@ def stage(code, **runspec):
 
 def test_settings_of_one_line_join_and_those_of_several_lines_stay_apart():
     first, second = stage("1", node="a", window="hann"), stage("2", node="b")
-    line = Provenance.of(["apertura.errors"], [first, second], settings={"engine": "native"})
+    line = Provenance.of(["apertura.common.errors"], [first, second], settings={"engine": "native"})
     assert line.runspec == {"node": "b", "window": "hann", "engine": "native"}
-    apart = Provenance.of(["apertura.errors"], {"a-a": first, "a-b": second})
+    apart = Provenance.of(["apertura.common.errors"], {"a-a": first, "a-b": second})
     assert apart.runspec == {"a-a": {"node": "a", "window": "hann"}, "a-b": {"node": "b"}}
     assert apart.inputs == {"1": "1", "2": "2"}
 
 
 def test_the_code_of_a_parent_changes_the_code_of_its_child():
-    hashes = {Provenance.of(["apertura.errors"], [stage(code)]).code_sha256 for code in ("1", "2")}
+    hashes = {Provenance.of(["apertura.common.errors"], [stage(code)]).code_sha256 for code in ("1", "2")}
     assert len(hashes) == 2

@@ -13,11 +13,11 @@ import pytest
 import xarray as xr
 import zarr
 
-from apertura.contracts import STAGES, check
-from apertura.errors import CampaignError, ContractError
-from apertura.provenance import sha256_tree
-from apertura.steps.stamping import stamp
-from apertura.store import (
+from apertura.common.contracts import STAGES, check
+from apertura.common.errors import CampaignError, ContractError
+from apertura.common.provenance import sha256_tree
+from apertura.pipeline.steps.stamping import stamp
+from apertura.pipeline.store import (
     blocks,
     finish,
     manifest_of,
@@ -30,8 +30,8 @@ from apertura.store import (
     write_blocks,
     writing,
 )
-from apertura.store.chunks import StageStore
-from apertura.store.manifest import check_stage
+from apertura.pipeline.store.chunks import StageStore
+from apertura.pipeline.store.manifest import check_stage
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -250,7 +250,7 @@ def test_no_name_in_work_of_a_stranger_removes_anything_else(tmp_path):
 
 
 def test_a_second_writer_waits_for_the_first(tmp_path):
-    holder = "from apertura.store import writing\nfrom pathlib import Path\nimport sys, time\n"
+    holder = "from apertura.pipeline.store import writing\nfrom pathlib import Path\nimport sys, time\n"
     holder += "with writing(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(1.5)\n"
     with subprocess.Popen(
         [sys.executable, "-c", holder, str(tmp_path / "image.zarr")], stdout=subprocess.PIPE, text=True

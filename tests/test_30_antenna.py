@@ -19,16 +19,16 @@ from scenes import (
     swaying_beam,
 )
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.antenna.illumination import illuminate
-from apertura.antenna.pattern import antenna_axes, gaussian_cut, sampled_cut
-from apertura.focus.engines import load_engine, native, reference
-from apertura.focus.engines.native_prediction import pixel_seconds
-from apertura.focus.engines.native_weights import NO_BEAMS, PatchWeights, patch_weights
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.geodesy import body_axes
-from apertura.planning.planner import make_plan
-from apertura.quality.measures import numerical_error
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.illumination import illuminate
+from apertura.core.antenna.pattern import antenna_axes, gaussian_cut, sampled_cut
+from apertura.core.focus.engines import load_engine, native, reference
+from apertura.core.focus.engines.native_prediction import pixel_seconds
+from apertura.core.focus.engines.native_weights import NO_BEAMS, PatchWeights, patch_weights
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import body_axes
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.measures import numerical_error
 
 
 def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scenes import WAVELENGTH, ground_points, monostatic, straight_track
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.geometry.aperture import Aperture
 
 COORDINATES = st.floats(-1e4, 1e4, allow_subnormal=False)
 LEGS = st.integers(1, 6).flatmap(lambda pulses: st.tuples(*[arrays(np.float64, (pulses, 3), elements=COORDINATES)] * 2))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from apertura.geometry.phase_centres import position_spline
-from apertura.geometry.track_checks import check_track
-from apertura.geometry.track_faults import find_spikes, find_steps, misfits, scatter_m
-from apertura.geometry.track_writing import find_frozen, rounded_time_m
+from apertura.core.geometry.phase_centres import position_spline
+from apertura.core.geometry.track_checks import check_track
+from apertura.core.geometry.track_faults import find_spikes, find_steps, misfits, scatter_m
+from apertura.core.geometry.track_writing import find_frozen, rounded_time_m
 
 X_BAND_M = 0.0316 / 16
 

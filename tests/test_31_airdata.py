@@ -7,10 +7,10 @@ from folders import complaint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.contracts import check
-from apertura.geometry.geodesy import geodetic_from_ecef, ned_axes
-from apertura.ingest import read_track
-from apertura.ingest.log_options import LogOptions
+from apertura.common.contracts import check
+from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.log_options import LogOptions
 from tests.attack import logs
 
 TIMES, PLACES = logs.circle(60)

@@ -9,14 +9,14 @@ from folders import complaint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.contracts import check
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from apertura.geometry.track_checks import check_track
-from apertura.ingest import read_track
-from apertura.ingest.ardupilot import track_of
-from apertura.ingest.dataflash_fields import read_fields
-from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
+from apertura.common.contracts import check
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.core.geometry.track_checks import check_track
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.ardupilot import track_of
+from apertura.formats.tracks.dataflash_fields import read_fields
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 
 SECOND = np.timedelta64(1, "s")
 KINDS = {".bin": dataflash, ".log": dataflash_text}

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from folders import complaint
 
-from apertura.contracts import check
-from apertura.geometry.geodesy import ecef_from_geodetic
-from apertura.ingest import read_track
-from apertura.ingest.log_options import LogOptions
+from apertura.common.contracts import check
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.log_options import LogOptions
 from tests.attack import logs
 
 TIMES, PLACES = logs.circle()

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.errors import CampaignError
-from apertura.ingest import read_track
-from apertura.ingest.log_options import LogOptions
+from apertura.common.errors import CampaignError
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.log_options import LogOptions
 from tests.attack import logs
 
 TIMES, PLACES = logs.circle()

@@ -8,9 +8,9 @@ import pytest
 from folders import complaint
 from scipy.io import savemat, wavfile
 
-from apertura.echo.dechirp import Sweep, transfer_of
-from apertura.ingest import read_phase_history
-from apertura.ingest.fmcw_wav import trigger_starts
+from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.formats.phase_histories.fmcw_wav import trigger_starts
+from apertura.formats.reading import read_phase_history
 from apertura.simulation.fmcw import beat_signal
 
 pytestmark = pytest.mark.usefixtures("reader")

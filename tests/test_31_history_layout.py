@@ -9,10 +9,10 @@ import pytest
 import zarr
 from folders import complaint, require_files
 
-from apertura.campaign import Campaign
-from apertura.contracts import check
-from apertura.errors import CampaignError
-from apertura.ingest import read_phase_history
+from apertura.common.contracts import check
+from apertura.common.errors import CampaignError
+from apertura.formats.reading import read_phase_history
+from apertura.pipeline.campaign import Campaign
 
 pytestmark = pytest.mark.usefixtures("reader")
 

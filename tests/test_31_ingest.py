@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.campaign import Campaign
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.contracts import check
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import open_recording, read_phase_history, read_track
-from apertura.ingest.beam_pattern import read_beam_pattern
-from apertura.ingest.names import RECORDERS, TRACKS, LogFormat
-from apertura.ingest.recording import Captures, Recording
-from apertura.ingest.sample_file import SampleFile
-from apertura.ingest.track import make_track
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.contracts import check
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import geodetic_from_ecef
+from apertura.formats.beam_pattern import read_beam_pattern
+from apertura.formats.names import RECORDERS, TRACKS, LogFormat
+from apertura.formats.reading import open_recording, read_phase_history, read_track
+from apertura.formats.recordings.recording import Captures, Recording
+from apertura.formats.recordings.sample_file import SampleFile
+from apertura.formats.tracks.track import make_track
+from apertura.pipeline.campaign import Campaign
 
 QUICK = settings(max_examples=30, deadline=None, derandomize=True)
 EPOCHS = st.lists(

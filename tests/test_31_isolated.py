@@ -10,8 +10,8 @@ import pytest
 from folders import ROOT, complaint
 from scipy.io import savemat
 
-from apertura.ingest import read_phase_history
-from apertura.ingest.isolated import UnreadableError, read_isolated
+from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.reading import read_phase_history
 
 PULSES, LINES = 6, 5
 
@@ -131,6 +131,7 @@ def test_a_module_that_lies_in_the_campaign_is_not_imported(tmp_path, monkeypatc
 
 def test_the_process_imports_numpy_and_scipy_and_nothing_heavier():
     """Half a second of a step is spent here."""
-    code = "import sys, apertura.ingest.isolated, apertura.ingest.mat_fields, scipy.io; print(*sys.modules)"
+    code = "import sys, apertura.formats.isolated, scipy.io"
+    code += "\nimport apertura.formats.phase_histories.mat_fields; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-P", "-c", code], check=True, capture_output=True, text=True).stdout
     assert {"pandas", "xarray", "dask", "numba", "rasterio", "pydantic"}.isdisjoint(loaded.split())

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apertura.leap_seconds import (
+from apertura.common.leap_seconds import (
     GPS_EPOCH,
     KNOWN_UNTIL,
     LATEST_S,

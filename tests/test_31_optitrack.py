@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from folders import complaint
 
-from apertura.contracts import check
-from apertura.geometry.geodesy import body_axes
-from apertura.ingest import read_track
-from apertura.ingest.log_options import LogOptions
-from apertura.ingest.optitrack import body_position, read_optitrack
+from apertura.common.contracts import check
+from apertura.core.geometry.geodesy import body_axes
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.log_options import LogOptions
+from apertura.formats.tracks.optitrack import body_position, read_optitrack
 from tests.attack import logs
 
 SECONDS = np.arange(12) / 360

@@ -6,9 +6,9 @@ from folders import complaint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.errors import CampaignError
-from apertura.ingest.pulson import BAND_HZ, MESSAGE, SAMPLE_RATE_HZ, read_pulson
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.formats.phase_histories.pulson import BAND_HZ, MESSAGE, SAMPLE_RATE_HZ, read_pulson
 
 TOTAL, START_PS = 800, 10_000
 MESSAGES = -(-TOTAL // 350)

@@ -9,20 +9,20 @@ import pytest
 import sigmf
 from folders import complaint, copy_writable, edit_meta, small_simulation
 
-from apertura.campaign import Campaign
-from apertura.check.inspected import Inspected
-from apertura.check.recordings import check_recordings
-from apertura.contracts import check
-from apertura.echo.captures import SATURATED_SHARE, Saturation
-from apertura.errors import CampaignError
-from apertura.ingest import open_recording
-from apertura.ingest.names import recording_files
-from apertura.ingest.real_samples import EDGE, SETTLING, Mixing
-from apertura.ingest.sample_file import SampleFile
-from apertura.ingest.sample_layout import SampleLayout
+from apertura.common.contracts import check
+from apertura.common.errors import CampaignError
+from apertura.core.echo.captures import SATURATED_SHARE, Saturation
+from apertura.formats.names import recording_files
+from apertura.formats.reading import open_recording
+from apertura.formats.recordings.real_samples import EDGE, SETTLING, Mixing
+from apertura.formats.recordings.sample_file import SampleFile
+from apertura.formats.recordings.sample_layout import SampleLayout
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.inspected import Inspected
+from apertura.pipeline.check.recordings import check_recordings
+from apertura.pipeline.steps import echo, ingest
+from apertura.pipeline.store import open_stage
 from apertura.simulation.campaign import write_campaign
-from apertura.steps import echo, ingest
-from apertura.store import open_stage
 
 RATE_HZ, DFT = 64e6, 256
 NODES = {"a": 1, "b": 2}

@@ -22,14 +22,14 @@ from folders import ROOT, complaint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.contracts import check
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from apertura.geometry.track_checks import check_track
-from apertura.ingest import read_track
-from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
-from apertura.ingest.px4_ulog import track_of
-from apertura.ingest.ulog_fields import read_fields
+from apertura.common.contracts import check
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from apertura.core.geometry.track_checks import check_track
+from apertura.formats.reading import read_track
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.px4_ulog import track_of
+from apertura.formats.tracks.ulog_fields import read_fields
 
 REAL = ROOT.parent / "shared" / "data" / "px4_real_flight" / "esc_status_log.ulg"
 GPS, SENSOR, FUSED, ATTITUDE = "vehicle_gps_position", "sensor_gps", "vehicle_global_position", "vehicle_attitude"

@@ -3,7 +3,7 @@
 import pytest
 from folders import complaint, edit_track
 
-from apertura.ingest import read_track
+from apertura.formats.reading import read_track
 
 
 def csv_log(tmp_path, *lines, heading="time_utc,latitude_deg,longitude_deg,height_m,yaw_deg"):

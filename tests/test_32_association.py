@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apertura.echo.association import associate
-from apertura.echo.baseline import EXPLAINED_M, baseline_residual, best_baseline, detect_wrong_association
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
+from apertura.core.echo.association import associate
+from apertura.core.echo.baseline import EXPLAINED_M, baseline_residual, best_baseline, detect_wrong_association
 
 NS = 1_000_000_000
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.calibration import NEEDED_STD_M, estimate_path_offset, reflector_history
-from apertura.errors import CampaignError
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
+from apertura.core.echo.calibration import NEEDED_STD_M, estimate_path_offset, reflector_history
 
 FREQUENCY = 1.2e9 + np.arange(256) * 1.6e6  # 409.6 MHz
 ALONG = np.linspace(-3, 3, 96)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import window_weights
-from apertura.echo.dechirp import Sweep, sweep_motion_flags, transfer_of
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import window_weights
+from apertura.core.echo.dechirp import Sweep, sweep_motion_flags, transfer_of
 from apertura.simulation.fmcw import beat_signal
 
 FAST = Sweep(2.2e9, 400e6, 20e-6, 25e6)

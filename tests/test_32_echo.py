@@ -6,18 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal.windows import hann
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.echo.demodulate import Numerology, demodulate, remove_path, subcarrier_numbers
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import (
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
+from apertura.core.echo.demodulate import Numerology, demodulate, remove_path, subcarrier_numbers
+from apertura.core.geometry.geodesy import (
     ecef_from_geodetic,
     ecef_from_projected,
     geodetic_from_ecef,
     ned_axes,
     projected_from_ecef,
 )
-from apertura.geometry.phase_centres import phase_centres
+from apertura.core.geometry.phase_centres import phase_centres
 
 RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
 

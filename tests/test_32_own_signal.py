@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.code_check import own_code
-from apertura.echo.phase_check import phase_stability
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.echo.code_check import own_code
+from apertura.core.echo.phase_check import phase_stability
 
 PULSES, CELLS, PREFIX = 200, 256, 80
 

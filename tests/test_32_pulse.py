@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import yaml
 
-from apertura.campaign import Campaign
-from apertura.echo.captures import blocks_of
-from apertura.echo.demodulate import Numerology, demodulate
-from apertura.echo.pulse_filter import cut_pulses, occupied_band, pulse_filter, pulse_spectrum
-from apertura.echo.transfer import transfer_by_sidelink
-from apertura.errors import CampaignError
-from apertura.load.transmitted import read_pulse, transmitted
-from apertura.settings import PulseWaveform, validated
+from apertura.common.errors import CampaignError
+from apertura.core.echo.captures import blocks_of
+from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.pulse_filter import cut_pulses, occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.transfer import transfer_by_sidelink
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import PulseWaveform, validated
+from apertura.pipeline.opening.transmitted import read_pulse, transmitted
 from apertura.simulation.pulse import TransmitPulse, pulse_samples
 from apertura.simulation.radar import Paths
 from apertura.simulation.synthesis import Channel, samples

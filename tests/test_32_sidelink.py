@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.line_of_sight import LOCK_FALSE_ALARM, fit_line_of_sight
-from apertura.echo.sidelink import METHODS, choose, divide, edges, measure
-from apertura.errors import CampaignError
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, fit_line_of_sight
+from apertura.core.echo.sidelink import METHODS, choose, divide, edges, measure
 
 TARGETS = np.array([(0, 5, 0), (-2, 8, 0), (0, 11, 0), (2, 14, 0), (0, 18, 0)], float)
 

@@ -5,14 +5,14 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from apertura.echo import transfer
-from apertura.echo.baseline import baseline_residual, detect_wrong_association
-from apertura.echo.captures import Saturation, blocks_of, spread
-from apertura.echo.clock import clock_of, estimate_clock
-from apertura.echo.demodulate import Numerology, remove_path
-from apertura.echo.line_of_sight import fit_line_of_sight
-from apertura.echo.sidelink_state import measure, measure_blocks
-from apertura.echo.transfer import transfer_by_code, transfer_by_sidelink
+from apertura.core.echo import transfer
+from apertura.core.echo.baseline import baseline_residual, detect_wrong_association
+from apertura.core.echo.captures import Saturation, blocks_of, spread
+from apertura.core.echo.clock import clock_of, estimate_clock
+from apertura.core.echo.demodulate import Numerology, remove_path
+from apertura.core.echo.line_of_sight import fit_line_of_sight
+from apertura.core.echo.sidelink_state import measure, measure_blocks
+from apertura.core.echo.transfer import transfer_by_code, transfer_by_sidelink
 
 NUMEROLOGY = Numerology(1.2e9, 32e6, np.arange(200), prefix_samples=64, dft_samples=256)
 CODES = np.exp(2j * np.pi * np.random.default_rng(1).random(200)).astype(np.complex64)

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import max_len_seq
 from scipy.stats import ncx2
 
-from apertura.echo.framing import Framing
-from apertura.echo.trigger import find_preambles, score_threshold
+from apertura.core.echo.framing import Framing
+from apertura.core.echo.trigger import find_preambles, score_threshold
 
 RATE_HZ = 100e6
 SYMBOL = 1600

@@ -10,12 +10,12 @@ from rasterio.transform import from_origin
 from scenes import UTM_GRID
 
 import apertura as ap
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import frame_from_map
-from apertura.scene import geoid
-from apertura.scene.dem_file import NAMES_FILES, open_dem
-from apertura.scene.grid import SceneGrid
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import frame_from_map
+from apertura.core.scene import geoid
+from apertura.core.scene.dem_file import NAMES_FILES, open_dem
+from apertura.core.scene.grid import SceneGrid
 
 
 def write_dem(path, heights, transform, crs="EPSG:32632", **profile):

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 from scenes import UTM_GRID
 
-from apertura.errors import CampaignError
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
-from apertura.scene.auto_grid import auto_bounds, utm_crs
-from apertura.scene.grid import SceneGrid
-from apertura.scene.pixel_positions import block
-from apertura.scene.swath import swath
-from apertura.scene.terrain import FlatGround
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
+from apertura.core.scene.auto_grid import auto_bounds, utm_crs
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.pixel_positions import block
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround
 
 
 def test_places_above_the_scene_come_back_as_rows_columns_and_heights():

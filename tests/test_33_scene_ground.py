@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from scenes import UTM_GRID
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.errors import CampaignError
-from apertura.focus.engines import reference
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
-from apertura.quality.point_targets import find_peak
-from apertura.scene.clearance import check_antennas, clearance
-from apertura.scene.grid import SceneGrid
-from apertura.scene.swath import swath
-from apertura.scene.terrain import FlatGround, GridHeights, Plane
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import reference
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.quality.point_targets import find_peak
+from apertura.core.scene.clearance import check_antennas, clearance
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround, GridHeights, Plane
 
 FREQUENCY = 1.2e9 + 4e6 * np.arange(100)
 

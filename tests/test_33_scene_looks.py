@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scenes import monostatic, straight_track
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.antenna.pattern import gaussian_cut
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.sector import Sector
-from apertura.scene.grid import SceneGrid
-from apertura.scene.lattice import BLOCK_PX
-from apertura.scene.looks import Looks
-from apertura.scene.terrain import FlatGround
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.pattern import gaussian_cut
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.lattice import BLOCK_PX
+from apertura.core.scene.looks import Looks
+from apertura.core.scene.terrain import FlatGround
 
 GROUND = FlatGround(0.0)
 GRID = SceneGrid("local", -60.0, 70.0, 0.25, (200, 480))

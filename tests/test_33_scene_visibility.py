@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scenes import UTM_GRID
 
-from apertura.export import layers as exported
-from apertura.scene import sightlines
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import GridHeights
-from apertura.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.core.scene import sightlines
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import GridHeights
+from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.formats.export import layers as exported
 
 STREET = SceneGrid("local", 0.0, 3.0, 0.25, (12, 240))
 

@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.compression import compress, range_step, window_weights
-from apertura.focus.engines import ENGINES, load_engine, reference
-from apertura.focus.engines.engine import Setting
-from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.focus.tiles import compute_tiles, image_array
-from apertura.geometry.aperture import Aperture
-from apertura.quality.measures import numerical_error
-from apertura.quality.point_targets import cut_through, find_peak
-from apertura.scene.auto_grid import auto_spacing
-from apertura.scene.grid import SceneGrid
-from apertura.scene.swath import swath
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import compress, range_step, window_weights
+from apertura.core.focus.engines import ENGINES, load_engine, reference
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.tiles import compute_tiles, image_array
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.scene.auto_grid import auto_spacing
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround
 
 FREQUENCY = 1.2e9 + 1.6e6 * np.arange(256)
 GRID = SceneGrid("local", -4.0, 14.0, 0.1, (80, 80))

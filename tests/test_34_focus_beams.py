@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scenes import Scene, decibels, ecef, fly, pixel_grid, scatter, swaying_beam
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.focus.engines import native, numba, reference
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.focus.engines import native, numba, reference
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from apertura.focus.band_limited import band_limited_image
-from apertura.focus.contributions import block_contributions
-from apertura.focus.echoes import DEGREE, TAPS, tap_polynomials
-from apertura.focus.engines import native, native_binding
+from apertura.core.focus.band_limited import band_limited_image
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.echoes import DEGREE, TAPS, tap_polynomials
+from apertura.core.focus.engines import native, native_binding
 from tests.scenes import compiled, decibels, ecef, fly, pixel_grid, scatter
 
 LOCAL = pixel_grid(40, 40)
@@ -24,7 +24,7 @@ WAYS = [pytest.param(True, marks=compiled, id="compiled"), pytest.param(False, i
 def way(request, monkeypatch):
     """Both ways in which contributions are computed, one after the other."""
     if not request.param:
-        monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+        monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
 
 
 def exact(block: slice) -> np.ndarray:
@@ -63,7 +63,7 @@ def test_every_instruction_set_adds_what_numpy_adds(isa, monkeypatch):
     monkeypatch.setenv("APERTURA_ISA", isa)
     weights = np.random.default_rng(1).uniform(0, 1, PULSES)
     fast = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
-    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     slow = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
     assert decibels(fast - slow, slow) < -115
 
@@ -135,7 +135,7 @@ class Recorded:
 
 @pytest.mark.usefixtures("way")
 def test_pulses_are_read_a_few_at_a_time_and_never_those_without_weight(monkeypatch):
-    monkeypatch.setattr("apertura.focus.echoes._BYTES_AT_ONCE", 8 * 10 * (PROFILES.samples.shape[1] + 2 * TAPS))
+    monkeypatch.setattr("apertura.core.focus.echoes._BYTES_AT_ONCE", 8 * 10 * (PROFILES.samples.shape[1] + 2 * TAPS))
     weights = np.ones(PULSES)
     weights[14:28] = 0
     lazy = Recorded(PROFILES.samples)

@@ -12,13 +12,13 @@ import pytest
 from scenes import ecef, fly, pixel_grid, plan, planning_job, scatter
 from scenes import side_beam as beam_of
 
-from apertura.antenna.beam import Beams
-from apertura.errors import CampaignError
-from apertura.focus.engines import cuda, load_engine
-from apertura.focus.engines.cuda_constants import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM
-from apertura.focus.engines.cuda_prediction import candidates
-from apertura.focus.engines.engine import Setting
-from apertura.planning.search import Search
+from apertura.common.errors import CampaignError
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.engines import cuda, load_engine
+from apertura.core.focus.engines.cuda_constants import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM
+from apertura.core.focus.engines.cuda_prediction import candidates
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.planning.search import Search
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
 def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
     """Nor where it alone would come near an accuracy: what costs more than the double sum is worth nothing."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
-    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     monkeypatch.setattr(cuda, "available", lambda: True)
     job = planning_job()
     (double_sum,) = load_engine("reference").candidates(job, pulses=300, asked={})
@@ -130,6 +130,6 @@ def test_without_a_device_the_engine_is_refused_with_one_message(plain):
 
 
 def test_looking_for_a_device_imports_nothing_where_there_is_no_driver():
-    program = "import sys; from apertura.focus.engines import load_engine\nload_engine('cuda').available()"
+    program = "import sys; from apertura.core.focus.engines import load_engine\nload_engine('cuda').available()"
     program += "\nimport ctypes\ntry: ctypes.CDLL('libcuda.so.1')\nexcept OSError: assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scenes import ecef, error_db, fly, pixel_grid, scatter
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import native
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -7,12 +7,12 @@ import pytest
 import xarray as xr
 
 import apertura as ap
-from apertura.antenna.beam import Beams
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.contributions import block_contributions
-from apertura.focus.echoes import Echoes
-from apertura.focus.engines import native, native_binding
-from apertura.focus.gradient import path_gradient
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.echoes import Echoes
+from apertura.core.focus.engines import native, native_binding
+from apertura.core.focus.gradient import path_gradient
 from tests.scenes import (
     TARGET_GRID,
     compiled,
@@ -36,7 +36,7 @@ STEP_M = 1e-4
 def way(request, monkeypatch):
     """Both ways in which gradients are computed, one after the other."""
     if not request.param:
-        monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+        monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
 
 
 def added(profiles):
@@ -118,10 +118,10 @@ def test_every_instruction_set_gives_what_numpy_gives(isa, monkeypatch):
     slope = peaks(added(PROFILES).sum(0))[1]
     beams = Beams(receive=swaying_beam(PROFILES.aperture.rx_m, (12.0, 0.5, 0.0)))
     monkeypatch.setenv("APERTURA_ISA", isa)
-    monkeypatch.setattr("apertura.focus.echoes._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
-    monkeypatch.setattr("apertura.focus.echoes._VALUES_AT_ONCE", 33 * 50)
+    monkeypatch.setattr("apertura.core.focus.echoes._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
+    monkeypatch.setattr("apertura.core.focus.echoes._VALUES_AT_ONCE", 33 * 50)
     fast = path_gradient(PROFILES, PLACES, slope, beams=beams)
-    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     slow = path_gradient(PROFILES, PLACES, slope, beams=beams)
     for side in (*SIDES, "path_m"):
         one, other = getattr(fast, side), getattr(slow, side)

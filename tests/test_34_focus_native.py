@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scenes import AXES, PLACE, decibels, ecef, error_db, fly, pixel_grid, scatter
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native, native_binding
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import native, native_binding
+from apertura.core.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from apertura.errors import CampaignError
-from apertura.focus.engines import native, native_binding
-from apertura.focus.engines.native_constants import KERNEL
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import native, native_binding
+from apertura.core.focus.engines.native_constants import KERNEL
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -23,7 +23,7 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch):
 
 
 def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     assert not native.available()
     with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
         native.instruction_set()

@@ -5,11 +5,11 @@ import pytest
 from campaigns import draw
 from scenes import compiled, monostatic, plan, straight_track
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.errors import CampaignError
-from apertura.focus.engines import native
-from apertura.focus.presum import design, presum_error_db, presummed
-from apertura.quality.measures import numerical_error
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import native
+from apertura.core.focus.presum import design, presum_error_db, presummed
+from apertura.core.quality.measures import numerical_error
 
 
 @pytest.mark.quick("0.1-False")

@@ -18,18 +18,18 @@ from scenes import (
     swaying_beam,
 )
 
-from apertura.antenna.beam import Beams
-from apertura.antenna.illumination import reached
-from apertura.focus.engines import native, numba, reference
-from apertura.focus.engines.engine import Setting
-from apertura.focus.reach import PULSES, Reach
-from apertura.focus.tiles import Weighing, image_array
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.sector import Sector, edge, flight_axes
-from apertura.imaging.range_profiles import RangeWindow, range_compress
-from apertura.scene.grid import SceneGrid
-from apertura.scene.swath import swath
-from apertura.scene.terrain import FlatGround
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import reached
+from apertura.core.focus.engines import native, numba, reference
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.reach import PULSES, Reach
+from apertura.core.focus.tiles import Weighing, image_array
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector, edge, flight_axes
+from apertura.core.imaging.range_profiles import RangeWindow, range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround
 
 FLAT = FlatGround(0.0)
 

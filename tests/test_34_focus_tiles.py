@@ -6,12 +6,12 @@ import toy_engine
 from campaigns import draw
 from scenes import ecef, fly, pixel_grid, scatter
 
-from apertura.focus.engines import PATCH_PX, load_engine, native
-from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.native_constants import KERNEL
-from apertura.focus.tiles import compute_tiles, image_array
-from apertura.quality.measures import numerical_error
-from apertura.scene.terrain import FlatGround
+from apertura.core.focus.engines import PATCH_PX, load_engine, native
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.engines.native_constants import KERNEL
+from apertura.core.focus.tiles import compute_tiles, image_array
+from apertura.core.quality.measures import numerical_error
+from apertura.core.scene.terrain import FlatGround
 
 
 @pytest.mark.parametrize(

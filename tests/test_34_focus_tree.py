@@ -9,15 +9,15 @@ import pytest
 from scenes import compiled, decibels, ecef, error_db, pixel_grid, scatter, swaying_beam
 from tree_flights import WAVENUMBERS, counted, flown, formed, heard, seen, setting, shaken
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import native, pieces, reference, tree
-from apertura.focus.engines.tree_inputs import roughness
-from apertura.focus.engines.tree_nodes import nodes, supports, weights, widest_band
-from apertura.focus.engines.tree_surface import surfaces_of
-from apertura.focus.engines.tree_view import highest, nodes_for
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.sector import Sector
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.focus.engines import native, pieces, reference, tree
+from apertura.core.focus.engines.tree_inputs import roughness
+from apertura.core.focus.engines.tree_nodes import nodes, supports, weights, widest_band
+from apertura.core.focus.engines.tree_surface import surfaces_of
+from apertura.core.focus.engines.tree_view import highest, nodes_for
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector
 
 pytestmark = compiled
 

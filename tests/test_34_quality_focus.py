@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from apertura.geometry.aperture import Aperture
-from apertura.quality.agreement import agreement
-from apertura.quality.bright_points import BrightPoint, bright_points, common_shift
-from apertura.quality.budget import (
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.quality.agreement import agreement
+from apertura.core.quality.bright_points import BrightPoint, bright_points, common_shift
+from apertura.core.quality.budget import (
     BudgetLine,
     NodePositions,
     accuracy_for,
@@ -14,9 +14,9 @@ from apertura.quality.budget import (
     position_lines,
     strictest_accuracy_db,
 )
-from apertura.quality.focus import judge, judge_parts, point_focus
-from apertura.quality.path_errors import Effect, PointPaths
-from apertura.quality.sub_apertures import compare_parts
+from apertura.core.quality.focus import judge, judge_parts, point_focus
+from apertura.core.quality.path_errors import Effect, PointPaths
+from apertura.core.quality.sub_apertures import compare_parts
 
 PULSES, WAVELENGTH_M = 600, 0.214
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.geometry.aperture import Aperture
-from apertura.refinement.clock_alignment import align_on_point
-from apertura.refinement.clock_drift import with_drift
-from apertura.refinement.motion import Logged, Recorded, plausible_offsets
-from apertura.refinement.scene_alignment import align_on_scene
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
+from apertura.methods.synchronisation.clock_alignment import align_on_point
+from apertura.methods.synchronisation.clock_drift import with_drift
+from apertura.methods.synchronisation.scene_alignment import align_on_scene
 
 BEHIND_S, PATH_M = 3.217, 1.43
 FREQUENCY = 3.0e9 + 10e6 * np.arange(100)

@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.contributions import block_contributions
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.range_profiles import range_compress
-from apertura.quality.path_errors import PointPaths
-from apertura.refinement.candidates import Candidates
-from apertura.refinement.inputs import Sighting, TrackErrors
-from apertura.refinement.one_phase import METHODS, entropy
-from apertura.refinement.patches import Patch
-from apertura.refinement.path_offsets import refine_one_phase
-from apertura.refinement.space_variance import space_variance
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.quality.path_errors import PointPaths
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.candidates import Candidates
+from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.one_phase import METHODS, entropy
+from apertura.methods.autofocus.patches import Patch
+from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.methods.autofocus.space_variance import space_variance
 
 FREQUENCY_HZ = 1.2e9 + 1.6e6 * np.arange(256)
 WEIGHT = np.hanning(258)[1:-1] / np.hanning(258).sum()

@@ -5,26 +5,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from apertura_research.study.refinement.cases import case
+from apertura_research.study.refinement.measures import judge
+from apertura_research.study.refinement.scenes import GRID
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.contributions import block_contributions
-from apertura.focus.engines import reference
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.quality.path_errors import autocorrelation
-from apertura.refinement.candidates import LEAST_RATIO, bright_places
-from apertura.refinement.evidence import range_shifts
-from apertura.refinement.gauge import effects
-from apertura.refinement.inputs import ReferencePoint, TrackErrors
-from apertura.refinement.objective import Sharpness
-from apertura.refinement.prior import NodePrior, Prior
-from apertura.refinement.refine import Search, refine
-from apertura.scene.terrain import FlatGround
-from apertura.settings import Node
-from apertura.study.refinement.cases import case
-from apertura.study.refinement.measures import judge
-from apertura.study.refinement.scenes import GRID
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.engines import reference
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.quality.path_errors import autocorrelation
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.candidates import LEAST_RATIO, bright_places
+from apertura.methods.autofocus.evidence import range_shifts
+from apertura.methods.autofocus.gauge import effects
+from apertura.methods.autofocus.inputs import ReferencePoint, TrackErrors
+from apertura.methods.autofocus.objective import Sharpness
+from apertura.methods.autofocus.prior import NodePrior, Prior
+from apertura.methods.autofocus.refine import Search, refine
+from apertura.pipeline.config import Node
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = np.linspace(0, 30, 300)

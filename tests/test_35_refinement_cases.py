@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from apertura_research.study.refinement.cases import PROBES_M, case
+from apertura_research.study.refinement.echoes import transfer
+from apertura_research.study.refinement.flights import drawn_errors
+from apertura_research.study.refinement.measures import judge, peaks
+from apertura_research.study.refinement.scenes import Scatterers
 from scenes import compiled
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.geometry.aperture import Aperture
-from apertura.refinement.inputs import TrackErrors
-from apertura.study.refinement.cases import PROBES_M, case
-from apertura.study.refinement.echoes import transfer
-from apertura.study.refinement.flights import drawn_errors
-from apertura.study.refinement.measures import judge, peaks
-from apertura.study.refinement.scenes import Scatterers
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+from apertura.methods.autofocus.inputs import TrackErrors
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 

@@ -11,8 +11,8 @@ import yaml
 from folders import SHARED, contents, recordings_of, small_simulation
 from numpy.testing import assert_allclose
 
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_geodetic, ecef_from_projected
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected
 from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Impairments, Localization
 from apertura.simulation.scene import Clutter, Line, Origin, Plate, PointTarget, scatterers

@@ -9,7 +9,7 @@ import sigmf
 from folders import recordings_of, small_simulation
 from numpy.testing import assert_allclose
 
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
 from apertura.simulation import simulate
 from apertura.simulation.continuous import Framing, continuous_blocks, pulse_samples
 from apertura.simulation.impairments import Adc, Clock, Impairments, TimeTag, Timing

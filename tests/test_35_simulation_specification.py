@@ -8,10 +8,9 @@ import yaml
 from folders import contents, recordings_of, require_files, small_simulation
 from typer.testing import CliRunner
 
-from apertura.campaign import Campaign
-from apertura.cli import app
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import projected_from_ecef
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.pipeline.campaign import Campaign
 from apertura.simulation import preset, read_specification, simulate, specification_text
 from apertura.simulation.impairments import Impairments, TimeTag, UniformPhase
 from apertura.simulation.presets import PRESETS
@@ -24,6 +23,7 @@ from apertura.simulation.specification import (
 )
 from apertura.simulation.trajectory import Straight, Waypoints, Wobble
 from apertura.simulation.waveforms import WaveformSpecification
+from apertura.views.cli import app
 
 
 @pytest.mark.quick("demo", "paper", "swarm", "continuous", "flight", "paper-lab")

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import apertura as ap
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.interferometry.comparison import Ground, compared
-from apertura.interferometry.flags import raised
-from apertura.interferometry.heights import placed
-from apertura.interferometry.level import Known, Level, level, levelled
-from apertura.interferometry.sensitivity import Sensitivity, sensitivity
-from apertura.interferometry.unwrapping import Unwrapped, contradictions, unwrap
-from apertura.scene.looks import Looks
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.scene.looks import Looks
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.interferometry.comparison import Ground, compared
+from apertura.methods.interferometry.flags import raised
+from apertura.methods.interferometry.heights import placed
+from apertura.methods.interferometry.level import Known, Level, level, levelled
+from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
+from apertura.methods.interferometry.unwrapping import Unwrapped, contradictions, unwrap
 
 FREQUENCY = 1.0e9 + np.arange(128) * 400e6 / 128
 WAVELENGTH = C / FREQUENCY.mean()
@@ -275,7 +275,7 @@ def test_without_the_library_the_phase_stays_within_a_turn_and_says_so(monkeypat
     def missing(name):
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr("apertura.interferometry.unwrapping.version", missing)
+    monkeypatch.setattr("apertura.methods.interferometry.unwrapping.version", missing)
     _, wrapped = ramp_of_phase(0.5)
     told = unwrap(wrapped.astype(np.float32), np.full(wrapped.shape, 0.9, np.float32), looks=9.0)
     np.testing.assert_array_equal(told.phase, wrapped.astype(np.float32))

@@ -14,16 +14,16 @@ import rasterio
 import zarr
 from rasterio import Affine
 
-from apertura.errors import CampaignError, ContractError
-from apertura.export import exports_in
-from apertura.export.cog import write_power, write_slc
-from apertura.export.db import write_db
-from apertura.export.layers import LAYOVER, OUTSIDE, SHADOW, write_mask
-from apertura.export.map_layout import DPI, LEFT, TOP, MapLayout
-from apertura.export.quicklook import below_peak, shrink, write_quicklook
-from apertura.export.writing import READ
-from apertura.flags import FLAGS
-from apertura.geometry.geodesy import local_crs
+from apertura.common.errors import CampaignError, ContractError
+from apertura.common.flags import FLAGS
+from apertura.core.geometry.geodesy import local_crs
+from apertura.formats.export import exports_in
+from apertura.formats.export.cog import write_power, write_slc
+from apertura.formats.export.db import write_db
+from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW, write_mask
+from apertura.formats.export.map_layout import DPI, LEFT, TOP, MapLayout
+from apertura.formats.export.quicklook import below_peak, shrink, write_quicklook
+from apertura.formats.export.writing import READ
 
 ROOT = Path(__file__).parents[1]
 UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
@@ -145,7 +145,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from rasterio import Affine
-from apertura.export import exports_in
+from apertura.formats.export import exports_in
 folder, image = Path(sys.argv[1]), np.load(sys.argv[2])
 for export in exports_in("pair"):
     path, tags = folder / export.file, {"B": "2", "A": "1"}
@@ -206,7 +206,7 @@ import os, signal, sys
 from pathlib import Path
 import numpy as np
 from rasterio import Affine
-from apertura.export import exports_in
+from apertura.formats.export import exports_in
 class Deadly:
     shape, reads = (2100, 2100), 0
     def __getitem__(self, key):

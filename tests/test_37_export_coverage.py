@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rasterio import Affine
 
-from apertura.export.coverage import Covered, feature_collection, footprint, write_coverage
+from apertura.formats.export.coverage import Covered, feature_collection, footprint, write_coverage
 
 TRANSFORM = Affine(2.0, 0, 100.0, 0, -2.0, 80.0)
 RING = np.ones((8, 10), np.float32)

@@ -8,17 +8,17 @@ import sarkit.verification
 import yaml
 from folders import edit_config, make_images, settle_ground
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.check.stale import stale_results
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.export.cphd import write_cphd
-from apertura.export.cphd_collection import Collection
-from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.ingest import read_phase_history
-from apertura.lineage import on_demand, results_of
-from apertura.steps import cphd, echo
-from apertura.store import open_stage
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
+from apertura.formats.export.cphd import write_cphd
+from apertura.formats.export.cphd_collection import Collection
+from apertura.formats.reading import read_phase_history
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.check.stale import stale_results
+from apertura.pipeline.lineage import on_demand, results_of
+from apertura.pipeline.steps import cphd, echo
+from apertura.pipeline.store import open_stage
 
 AT = np.array([48.0, 11.0, 600.0])
 

@@ -7,10 +7,10 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from apertura.export import cog, db, writing
-from apertura.export.cog import power, write_power, write_slc
-from apertura.export.db import write_db
-from apertura.export.writing import added, check_written
+from apertura.formats.export import cog, db, writing
+from apertura.formats.export.cog import power, write_power, write_slc
+from apertura.formats.export.db import write_db
+from apertura.formats.export.writing import added, check_written
 
 UTM = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {"APERTURA_RUNSPEC": "{}"}}
 

@@ -8,13 +8,13 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from apertura.errors import ContractError
-from apertura.export.cog import write_power, write_slc
-from apertura.export.layers import OUTSIDE, SHADOW, write_looks, write_mask
-from apertura.export.mosaic import write_mosaic
-from apertura.export.radiometry import ECHO, TAG
-from apertura.geometry.geodesy import local_crs
-from apertura.provenance import canonical_json
+from apertura.common.errors import ContractError
+from apertura.common.provenance import canonical_json
+from apertura.core.geometry.geodesy import local_crs
+from apertura.formats.export.cog import write_power, write_slc
+from apertura.formats.export.layers import OUTSIDE, SHADOW, write_looks, write_mask
+from apertura.formats.export.mosaic import write_mosaic
+from apertura.formats.export.radiometry import ECHO, TAG
 
 UTM = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
 LOCAL = {"crs": local_crs('<&"gotcha"> pass 1'), "transform": Affine(0.2, 0, -50, 0, -0.2, 50)}

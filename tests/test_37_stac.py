@@ -9,13 +9,13 @@ import pytest
 from pyproj import CRS
 from rasterio import Affine
 
-from apertura.catalog import CATALOG
-from apertura.catalog.assets import asset_of, told_by
-from apertura.catalog.fields import EXTENSIONS, Acquisition, projection
-from apertura.catalog.stac import Image, catalog_files, instant, item_of
-from apertura.catalog.validation import document_problem, stac_problems
-from apertura.errors import CampaignError
-from apertura.export.cog import write_slc
+from apertura.common.errors import CampaignError
+from apertura.formats.catalog import CATALOG
+from apertura.formats.catalog.assets import asset_of, told_by
+from apertura.formats.catalog.fields import EXTENSIONS, Acquisition, projection
+from apertura.formats.catalog.stac import Image, catalog_files, instant, item_of
+from apertura.formats.catalog.validation import document_problem, stac_problems
+from apertura.formats.export.cog import write_slc
 
 START = datetime(2025, 5, 14, 9, 30, tzinfo=UTC)
 FLOWN = Acquisition(START, START + timedelta(seconds=15), 1.4e9, 4e8)

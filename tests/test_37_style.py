@@ -7,12 +7,12 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from apertura.errors import ContractError
-from apertura.export.db import write_db
-from apertura.export.layers import CLASSES, OUTSIDE, write_incidence, write_mask
-from apertura.export.radiometry import ECHO, TAG, of_sums
-from apertura.export.style import write_db_style, write_layer_style, write_mask_style
-from apertura.provenance import canonical_json
+from apertura.common.errors import ContractError
+from apertura.common.provenance import canonical_json
+from apertura.formats.export.db import write_db
+from apertura.formats.export.layers import CLASSES, OUTSIDE, write_incidence, write_mask
+from apertura.formats.export.radiometry import ECHO, TAG, of_sums
+from apertura.formats.export.style import write_db_style, write_layer_style, write_mask_style
 
 GRID = {"crs": "EPSG:32632", "transform": Affine(0.1, 0, 691523.4, 0, -0.1, 5333000.1)}
 IMAGE = np.full((30, 40), 1j, np.complex64)

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from apertura.errors import CampaignError
-from apertura.provenance import sha256_file
-from apertura.webmap.document import FORMAT, Layer, image_entry, map_document, named_files
-from apertura.webmap.page import FILES, SHELL, page_files
-from apertura.webmap.server import MapServer
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.views.webmap.document import FORMAT, Layer, image_entry, map_document, named_files
+from apertura.views.webmap.page import FILES, SHELL, page_files
+from apertura.views.webmap.server import MapServer
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "webmap"

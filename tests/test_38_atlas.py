@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from apertura_research.error_atlas import commands, outcomes
+from apertura_research.error_atlas.causes import CAUSES
+from apertura_research.error_atlas.charts import draw_cause, draw_summary
+from apertura_research.error_atlas.flight import PAIRS, flight
+from apertura_research.error_atlas.outcomes import Outcome, run_cause
+from apertura_research.error_atlas.summary import alarms, part_path, summary_of, write_summary
 from typer.testing import CliRunner
 
-from apertura.atlas import commands, outcomes
-from apertura.atlas.causes import CAUSES
-from apertura.atlas.charts import draw_cause, draw_summary
-from apertura.atlas.flight import PAIRS, flight
-from apertura.atlas.outcomes import Outcome, run_cause
-from apertura.atlas.summary import alarms, part_path, summary_of, write_summary
-from apertura.errors import CampaignError
-from apertura.study.tables import read_table, write_table
+from apertura.common.errors import CampaignError
+from apertura.common.tables import read_table, write_table
 
 CELL_M = 0.1
 

@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
+from apertura_research.study import commands
+from apertura_research.study.paper import experiment_figures, figures
+from apertura_research.study.paper.claims import AGREES, UNTESTABLE, VERDICTS
+from apertura_research.study.paper.coherence import coherence_claims
+from apertura_research.study.paper.experiments import BISTATIC, MONOSTATIC, open_experiment, profiles_at, terms_at
+from apertura_research.study.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
+from apertura_research.study.paper.losses import ERRORS
 from folders import run_steps
 
-from apertura.campaign import Campaign
-from apertura.quality.measures import coherence_factor
+from apertura.core.quality.measures import coherence_factor
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import preset, simulate
 from apertura.simulation.experiments import CABLE_M, GAP_M, SEGMENT_M
-from apertura.steps import echo, ingest
-from apertura.study import commands
-from apertura.study.paper import experiment_figures, figures
-from apertura.study.paper.claims import AGREES, UNTESTABLE, VERDICTS
-from apertura.study.paper.coherence import coherence_claims
-from apertura.study.paper.experiments import BISTATIC, MONOSTATIC, open_experiment, profiles_at, terms_at
-from apertura.study.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
-from apertura.study.paper.losses import ERRORS
 
 PULSES = 16
 

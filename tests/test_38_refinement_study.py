@@ -4,16 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import compiled
-from typer.testing import CliRunner
-
-from apertura.errors import CampaignError
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.outcome import Refinement
-from apertura.study import commands
-from apertura.study.refinement import charts, outcomes, pictures
-from apertura.study.refinement.measures import UNCORRECTED
-from apertura.study.refinement.outcomes import (
+from apertura_research.study import commands
+from apertura_research.study.refinement import charts, outcomes, pictures
+from apertura_research.study.refinement.measures import UNCORRECTED
+from apertura_research.study.refinement.outcomes import (
     ACCEPTED,
     FLAGGED,
     KINDS,
@@ -28,8 +22,14 @@ from apertura.study.refinement.outcomes import (
     run_kind,
     said_of,
 )
-from apertura.study.refinement.scenes import SCENES
-from apertura.study.tables import read_table, write_table
+from apertura_research.study.refinement.scenes import SCENES
+from scenes import compiled
+from typer.testing import CliRunner
+
+from apertura.common.errors import CampaignError
+from apertura.common.tables import read_table, write_table
+from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.methods.autofocus.outcome import Refinement
 
 
 def row(sigma_cm, said, *, scene="five", seed=1, product_db=0.2):

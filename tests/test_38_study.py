@@ -4,26 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from typer.testing import CliRunner
-
-from apertura.errors import CampaignError
-from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
-from apertura.simulation.observation import observe
-from apertura.simulation.synthesis import samples
-from apertura.study import commands
-from apertura.study.dft_window import demodulated, window_samples
-from apertura.study.paper import formulas
-from apertura.study.paper.claims import AGREES, DISAGREES, EXPLAINED, UNTESTABLE, Claim, compare, require
-from apertura.study.paper.corrected import clock_claims, corrected_claims
-from apertura.study.paper.effects import effect_claims
-from apertura.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
-from apertura.study.paper.parameters import parameter_claims
-from apertura.study.paper.positions import position_claims
-from apertura.study.paper.resolution import simulated_table, uav_table
-from apertura.study.paper.swarm import swarm_claims, trigger_claims
-from apertura.study.paper_scene import UNDISTURBED, Disturbance, receive_pair, receive_undisturbed, reduced_scene
-from apertura.study.point_response import (
+from apertura_research.study import commands
+from apertura_research.study.dft_window import demodulated, window_samples
+from apertura_research.study.paper import formulas
+from apertura_research.study.paper.claims import AGREES, DISAGREES, EXPLAINED, UNTESTABLE, Claim, compare, require
+from apertura_research.study.paper.corrected import clock_claims, corrected_claims
+from apertura_research.study.paper.effects import effect_claims
+from apertura_research.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
+from apertura_research.study.paper.parameters import parameter_claims
+from apertura_research.study.paper.positions import position_claims
+from apertura_research.study.paper.resolution import simulated_table, uav_table
+from apertura_research.study.paper.swarm import swarm_claims, trigger_claims
+from apertura_research.study.paper_scene import (
+    UNDISTURBED,
+    Disturbance,
+    receive_pair,
+    receive_undisturbed,
+    reduced_scene,
+)
+from apertura_research.study.point_response import (
     amplitude_db,
     coherence_factors,
     find_peaks,
@@ -32,11 +31,18 @@ from apertura.study.point_response import (
     phase_history,
     range_tables,
 )
-from apertura.study.stability.charts import draw_impairment
-from apertura.study.stability.outcomes import Outcome, correct, run_sweep
-from apertura.study.stability.summary import crossing, join_parts, part_path, tolerance_of
-from apertura.study.stability.sweeps import CHOICES, SWEEPS
-from apertura.study.tables import read_table, write_table
+from apertura_research.study.stability.charts import draw_impairment
+from apertura_research.study.stability.outcomes import Outcome, correct, run_sweep
+from apertura_research.study.stability.summary import crossing, join_parts, part_path, tolerance_of
+from apertura_research.study.stability.sweeps import CHOICES, SWEEPS
+from numpy.testing import assert_allclose
+from typer.testing import CliRunner
+
+from apertura.common.errors import CampaignError
+from apertura.common.tables import read_table, write_table
+from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
+from apertura.simulation.observation import observe
+from apertura.simulation.synthesis import samples
 
 
 def by_claim(claims):

@@ -5,9 +5,9 @@ import csv
 import pytest
 from folders import copy_writable
 
-from apertura.campaign import Campaign
-from apertura.study.chart.whole import whole_chart
-from apertura.study.chart.whole_picture import Whole, draw_whole, spread_db
+from apertura.pipeline.campaign import Campaign
+from apertura.views.chart.whole import whole_chart
+from apertura.views.chart.whole_picture import Whole, draw_whole, spread_db
 
 
 def whole(setting="a", *, loss_db=-0.1):

@@ -8,7 +8,7 @@ import pytest
 from growing import contestants, scene, table
 from growing.contestants import House, SkippedError
 
-from apertura.planning import memory
+from apertura.core.planning import memory
 
 
 @pytest.fixture(scope="module")

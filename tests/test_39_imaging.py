@@ -10,10 +10,10 @@ from campaigns import draw
 from scenes import TARGET_GRID, point_history
 
 import apertura as ap
-from apertura.errors import CampaignError
-from apertura.focus.engines import reference
-from apertura.quality.measures import numerical_error
-from apertura.scene.grid import SceneGrid
+from apertura.common.errors import CampaignError
+from apertura.core.focus.engines import reference
+from apertura.core.quality.measures import numerical_error
+from apertura.core.scene.grid import SceneGrid
 
 
 @pytest.fixture(scope="module")

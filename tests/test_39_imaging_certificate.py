@@ -7,14 +7,14 @@ import pytest
 from campaigns import compressed, draw
 from scenes import TARGET, TARGET_GRID, point_history
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.imaging.certify import certified, measures
-from apertura.imaging.formation import Formation
-from apertura.imaging.job import imaging_job
-from apertura.imaging.range_profiles import range_compress
-from apertura.planning.planner import make_plan
-from apertura.quality.measures import numerical_error
-from apertura.scene.ground_models import GroundModels
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.imaging.certify import certified, measures
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import imaging_job
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.measures import numerical_error
+from apertura.core.scene.ground_models import GroundModels
 
 SIDE_PX = 32
 

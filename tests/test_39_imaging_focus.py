@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.echo_place import echo_elsewhere
-from apertura.imaging.parts import PART_PX, PARTS, part_images
-from apertura.imaging.range_profiles import range_compress
-from apertura.imaging.sharpness import gathered
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.echo_place import echo_elsewhere
+from apertura.core.imaging.parts import PART_PX, PARTS, part_images
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.imaging.sharpness import gathered
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
 
 FREQUENCY_HZ = 1.2e9 + 1e6 * np.arange(256)
 PULSES = 128

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scenes import monostatic, straight_track
 
-from apertura.antenna.beam import Beams
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.band_limited import band_limited_image
-from apertura.focus.inputs import Profiles
-from apertura.geometry.sector import Sector
-from apertura.imaging.noise import noise_power
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.band_limited import band_limited_image
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.sector import Sector
+from apertura.core.imaging.noise import noise_power
 
 CENTRE_HZ, STEP_M = 1.2e9, 0.375 / 2
 FLOWN = monostatic(straight_track(2048, length_m=40.0))

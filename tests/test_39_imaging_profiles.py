@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import TARGET, TARGET_GRID, point_history
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround, GridHeights
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround, GridHeights
 
 FLAT = FlatGround(0.0)
 

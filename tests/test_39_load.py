@@ -8,15 +8,15 @@ import pytest
 import rasterio
 from folders import complaint, copy_writable, edit_config, ingest_all
 
-from apertura.campaign import Campaign
-from apertura.errors import CampaignError
-from apertura.load.pair import open_pair
-from apertura.load.results import OpenCampaign, open_campaign
-from apertura.load.scene import expected_scene, settled_scene
-from apertura.steps import echo, scene
-from apertura.steps.plan import first_flight
-from apertura.steps.score import score
-from apertura.store import record_files
+from apertura.common.errors import CampaignError
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.results import OpenCampaign, open_campaign
+from apertura.pipeline.opening.scene import expected_scene, settled_scene
+from apertura.pipeline.steps import echo, scene
+from apertura.pipeline.store import record_files
+from apertura.views.plan import first_flight
+from apertura.views.score import score
 
 PAIR = ("f01", "uav1-uav2")
 

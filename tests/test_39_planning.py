@@ -9,15 +9,15 @@ import pytest
 from campaigns import compressed, draw
 from scenes import WAVELENGTH, compiled, ground_points, monostatic, plan, planning_job, straight_track
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.echo.compression import window_weights
-from apertura.errors import CampaignError
-from apertura.focus.engines import load_engine, native, reference
-from apertura.focus.engines.native_prediction import path_variants, view_of
-from apertura.focus.inputs import Profiles
-from apertura.planning.planner import make_plan
-from apertura.planning.search import Search
-from apertura.quality.measures import numerical_error
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
+from apertura.core.echo.compression import window_weights
+from apertura.core.focus.engines import load_engine, native, reference
+from apertura.core.focus.engines.native_prediction import path_variants, view_of
+from apertura.core.focus.inputs import Profiles
+from apertura.core.planning.planner import make_plan
+from apertura.core.planning.search import Search
+from apertura.core.quality.measures import numerical_error
 
 
 def random_values(spectra, grid, image):
@@ -136,7 +136,7 @@ def test_an_accuracy_beyond_every_table_is_left_to_the_double_sum():
 def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was_not(monkeypatch):
     assert plan(shape=(100, 100)).engine == "native"
     assert plan(shape=(4000, 4000), overrides={"presum": 1}).engine == "tree"
-    monkeypatch.setattr("apertura.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
     assert plan().engine == "numba"
     with pytest.raises(CampaignError, match=r"cannot run here.* a C\+\+ compiler"):
         plan(overrides={"engine": "native"})

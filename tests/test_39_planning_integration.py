@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scenes import C, compiled, monostatic, strip_history
 
-from apertura.antenna.beam import Beam, Beams
-from apertura.errors import CampaignError
-from apertura.geometry.aperture import Aperture
-from apertura.imaging.backproject import backproject
-from apertura.imaging.choices import ImagingChoices
-from apertura.planning.integration import integrate
-from apertura.quality.point_targets import cut_through, find_peak
-from apertura.scene.grid import SceneGrid
+from apertura.common.errors import CampaignError
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.backproject import backproject
+from apertura.core.imaging.choices import ImagingChoices
+from apertura.core.planning.integration import integrate
+from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.scene.grid import SceneGrid
 
 WAVELENGTH = C / 1.25e9
 

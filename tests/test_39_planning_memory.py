@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from scenes import monostatic, plan, straight_track
 
-from apertura.errors import CampaignError
-from apertura.load.plan import check_fits
-from apertura.planning.memory import memory_limit
+from apertura.common.errors import CampaignError
+from apertura.core.planning.memory import memory_limit
+from apertura.pipeline.opening.plan import check_fits
 
 
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():

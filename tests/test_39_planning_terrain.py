@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scenes import WAVELENGTH, ground_of, monostatic, plan, planning_job, straight_track
 
-from apertura.errors import CampaignError
-from apertura.planning.terrain_model import decide_terrain
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround, Plane
+from apertura.common.errors import CampaignError
+from apertura.core.planning.terrain_model import decide_terrain
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround, Plane
 
 
 def terrain(height_m: float, *, slope: float = 0.0, wobble_m: float = 0.1, spacing_m: float = 10.0):

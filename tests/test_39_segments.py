@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from folders import ingest_all
 
-from apertura.campaign import Campaign
-from apertura.load.pair import open_pair
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.steps import echo
+from apertura.pipeline.store import open_stage
 from apertura.simulation import preset, simulate
-from apertura.steps import echo
-from apertura.store import open_stage
 
 FIRST = np.datetime64("2025-05-14T09:30:00")
 HEADING = "flight\tpair\tstart\tend\n"

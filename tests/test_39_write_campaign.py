@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import apertura as ap
-from apertura.campaign import Campaign
-from apertura.geometry.geodesy import geodetic_from_ecef
-from apertura.ingest import open_recording
+from apertura.core.geometry.geodesy import geodetic_from_ecef
+from apertura.formats.reading import open_recording
+from apertura.pipeline.campaign import Campaign
 
 WAVEFORM = {
     "kind": "ofdm",

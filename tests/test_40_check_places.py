@@ -10,11 +10,11 @@ import rasterio
 from folders import edit_config, edit_track
 from rasterio.transform import from_origin
 
-from apertura.campaign import Campaign
-from apertura.check import as_line, problems, resources
-from apertura.check.clocks import likely_cause
-from apertura.check.dem import needles
-from apertura.geometry.geodesy import projected_from_ecef
+from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import as_line, problems, resources
+from apertura.pipeline.check.clocks import likely_cause
+from apertura.pipeline.check.dem import needles
 from apertura.simulation.presets import DEMO_ORIGIN
 
 Usage = namedtuple("Usage", "total used free")

@@ -6,14 +6,14 @@ import pytest
 import yaml
 from folders import copy_writable, require_files
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.check.inspected import Inspected
-from apertura.check.links import check_links
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import local_crs
-from apertura.settings.config import validated
-from apertura.steps import ingest
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import local_crs
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.check.inspected import Inspected
+from apertura.pipeline.check.links import check_links
+from apertura.pipeline.config.config import validated
+from apertura.pipeline.steps import ingest
 
 
 def edit(root, key, value, *, load=True):

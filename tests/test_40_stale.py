@@ -9,14 +9,14 @@ import pytest
 import yaml
 from folders import copy_writable
 
-from apertura.campaign import Campaign
-from apertura.check.stale import damaged_results, make_again, stale_lines, stale_results
-from apertura.digests import Sources, digest_of
-from apertura.errors import CampaignError
-from apertura.lineage import ON_DEMAND, results_of
-from apertura.lineage.code import modules_of
-from apertura.lock import hold
-from apertura.steps.summary import print_summary
+from apertura.common.errors import CampaignError
+from apertura.common.lock import hold
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.stale import damaged_results, make_again, stale_lines, stale_results
+from apertura.pipeline.digests import Sources, digest_of
+from apertura.pipeline.lineage import ON_DEMAND, results_of
+from apertura.pipeline.lineage.code import modules_of
+from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
 
@@ -94,7 +94,7 @@ def test_samples_replaced_under_their_old_time_and_size_are_noticed_although_the
 def test_a_hash_is_taken_once_per_state_of_a_file_and_again_when_asked(tmp_path, monkeypatch):
     path = tmp_path / "raw.bin"
     path.write_bytes(bytes(100_000))
-    monkeypatch.setattr("apertura.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("apertura.pipeline.digests._SETTLED_S", -1.0)
     first, kept = digest_of(tmp_path, "raw.bin"), tmp_path / "results/.hashes/raw.bin.json"
     forged = json.loads(kept.read_text()) | {"sha256": "0" * 64}
     kept.write_text(json.dumps(forged))
@@ -149,9 +149,9 @@ def test_a_setting_makes_stale_what_it_matters_to(finished, change, expected, sp
 
 def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
     def other(campaign, result, *where):
-        return ("apertura.constants",) if result == "profile" else modules_of(campaign, result, *where)
+        return ("apertura.common.constants",) if result == "profile" else modules_of(campaign, result, *where)
 
-    monkeypatch.setattr("apertura.lineage.modules_of", other)
+    monkeypatch.setattr("apertura.pipeline.lineage.modules_of", other)
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
     assert not {"raw", "track", "echo", "scene"} & names(found)
@@ -246,8 +246,8 @@ def test_a_report_that_was_edited_is_not_believed(finished):
 def test_a_damaged_document_is_not_read(finished, file):
     path = finished / "results" / file
     path.write_text(path.read_text().replace("1", "2", 1))
-    from apertura.load.results import assessment_of
-    from apertura.load.scene import settled_scene
+    from apertura.pipeline.opening.results import assessment_of
+    from apertura.pipeline.opening.scene import settled_scene
 
     campaign = Campaign.load(finished)
     with pytest.raises(CampaignError, match=r"not as they were written, first .*Delete .*manifest\.json"):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all, require_files
 
-from apertura.campaign import Campaign
-from apertura.ingest.sample_file import SampleFile
-from apertura.load.pair import open_pair
-from apertura.steps import echo, ingest, profile, scene
+from apertura.formats.recordings.sample_file import SampleFile
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.steps import echo, ingest, profile, scene
 
 
 def nothing_half_written(root):
@@ -228,7 +228,7 @@ def test_a_silent_capture_is_named(tiny):
 def test_nan_in_phase_history_is_named(shared, tmp_path):
     from scipy.io import loadmat, savemat
 
-    from apertura.ingest import read_phase_history
+    from apertura.formats.reading import read_phase_history
 
     source = loadmat(shared / "gotcha_afrl" / "data_3dsar_pass1_az001_HH.mat")
     source["data"]["fp"][0, 0][3, 7] = np.nan

@@ -5,13 +5,13 @@ import re
 import pytest
 from folders import complaint, edit_config
 
-from apertura.campaign import Campaign
-from apertura.load.results import assessment_of, open_campaign
-from apertura.load.scene import settled_scene
-from apertura.steps.calibration import calibrated
-from apertura.steps.score import score
-from apertura.steps.summary import print_summary
-from apertura.store import manifest_of, record_files, save_document
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.results import assessment_of, open_campaign
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.steps.calibration import calibrated
+from apertura.pipeline.store import manifest_of, record_files, save_document
+from apertura.views.score import score
+from apertura.views.summary import print_summary
 
 DAMAGE = [b"", b"{", b"[]", b"{}", b'{"grid": 3}', b"\xff", b"null", b'{"pairs": 3}', b'{"pairs": {"uav1-uav2": {}}}']
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from folders import complaint, edit_meta
 
-from apertura.campaign import Campaign
-from apertura.load.transmitted import read_codes, read_framing
-from apertura.settings import read_segments
-from apertura.steps import ingest
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import read_segments
+from apertura.pipeline.opening.transmitted import read_codes, read_framing
+from apertura.pipeline.steps import ingest
 
 # Tables of the config
 

@@ -6,11 +6,11 @@ import threading
 
 import pytest
 
-from apertura.campaign import Campaign
-from apertura.code_imports import PACKAGE, WITHOUT_EFFECT, import_closure
-from apertura.lineage import RESULTS, places_of, result_of
-from apertura.provenance import code_sha256
-from apertura.steps import (
+from apertura.common.code_imports import PACKAGE, WITHOUT_EFFECT, import_closure
+from apertura.common.provenance import code_sha256
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import RESULTS, places_of, result_of
+from apertura.pipeline.steps import (
     assess,
     calibration,
     coverage,
@@ -23,16 +23,16 @@ from apertura.steps import (
     interferogram,
     layers,
     mosaic,
-    page,
-    pictures,
     profile,
     refine,
     ro_crate,
     scene,
     stac,
     terrain,
-    webmap,
 )
+from apertura.views.report import pictures
+from apertura.views.report import step as page
+from apertura.views.webmap import step as webmap
 
 STEPS = {
     "raw": ingest.ingest,
@@ -107,19 +107,19 @@ READ = FOCUSED | {"raw", "track", "echo", "profile", "layers"}
 
 
 CHANGES = [
-    ("ingest/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
-    ("ingest/csv_track.py", "comment", set()),
-    ("ingest/csv_track.py", "code", READ - {"raw"}),
-    ("ingest/sigmf.py", "code", READ - {"track"}),
-    ("webmap/page.py", "code", set()),  # what a browser is shown, of results that are there
-    ("flags/images.py", "code", {"page", "report", "map"}),
+    ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
+    ("formats/tracks/csv_track.py", "comment", set()),
+    ("formats/tracks/csv_track.py", "code", READ - {"raw"}),
+    ("formats/recordings/sigmf.py", "code", READ - {"track"}),
+    ("views/webmap/page.py", "code", set()),  # what a browser is shown, of results that are there
+    ("common/flags/images.py", "code", {"page", "report", "map"}),
     ("errors.py", "code", set()),
-    ("settings/nodes.py", "docstring", set()),
-    ("echo/dechirp.py", "docstring", set()),
-    ("export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
-    ("lineage/products.py", "code", set()),  # sources and settings are compared for themselves
-    ("focus/engines/numba.py", "comment", set()),
-    ("focus/engines/numba.py", "code", FOCUSED),
+    ("pipeline/config/nodes.py", "docstring", set()),
+    ("core/echo/dechirp.py", "docstring", set()),
+    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
+    ("pipeline/lineage/products.py", "code", set()),  # sources and settings are compared for themselves
+    ("core/focus/engines/numba.py", "comment", set()),
+    ("core/focus/engines/numba.py", "code", FOCUSED),
     ("constants.py", "code", EVERY),
 ]
 EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edited."""\n'}

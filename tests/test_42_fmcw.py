@@ -9,16 +9,16 @@ import pytest
 import yaml
 from folders import ROOT, complaint, edit_config, run_steps
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.dechirp import Sweep, transfer_of
-from apertura.load.recorded import recorded_echo
-from apertura.load.scene import open_scene
-from apertura.quality.point_targets import find_peak
-from apertura.settings import validated
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.core.quality.point_targets import find_peak
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.config import validated
+from apertura.pipeline.opening.recorded import recorded_echo
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.store import open_stage
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
-from apertura.store import open_stage
 
 FAST = Sweep(2.2e9, 400e6, 20e-6, 25e6)
 """400 MHz about 2.4 GHz in 20 µs: gamma 2e13 Hz/s, real beats to 12.5 MHz, which are 187 m of path."""
@@ -130,7 +130,9 @@ def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path
     root = written(tmp_path, flight)
     run_steps(root, exports=False)
     assert off(root, flight)[0] < 0.01
-    monkeypatch.setattr("apertura.ingest.fmcw.transfer_of", functools.partial(transfer_of, deskewed=False))
+    monkeypatch.setattr(
+        "apertura.formats.phase_histories.fmcw.transfer_of", functools.partial(transfer_of, deskewed=False)
+    )
     kept = written(tmp_path / "kept", flight)
     run_steps(kept, exports=False)
     delay_s = 2 * np.linalg.norm(np.subtract(flight.targets[0], (0.0, -60.0, 10.0))) / SPEED_OF_LIGHT_M_S

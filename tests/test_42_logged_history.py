@@ -6,12 +6,12 @@ import xarray as xr
 import yaml
 from folders import complaint, run_steps
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
-from apertura.ingest.names import PHASE_HISTORIES, HistoryFormat
-from apertura.store import open_stage
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
+from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.store import open_stage
 
 CRS = "EPSG:32632"
 EAST, NORTH = 570_000.0, 5_363_000.0

@@ -10,24 +10,24 @@ from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
 
-from apertura.campaign import Campaign
-from apertura.check.stale import stale_results
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.imaging.stages import profiles_of
-from apertura.load.autofocus import ONE_PHASE, autofocus_of, decide_method
-from apertura.load.pair import open_pair
-from apertura.load.refined import clock_s, open_refined
-from apertura.load.scene import open_scene
-from apertura.load.sightings import seen
-from apertura.refinement.candidates import Candidates
-from apertura.refinement.one_phase import METHODS
-from apertura.refinement.path_offsets import refine_one_phase
-from apertura.refinement.space_variance import MOST_LOSS_DB, SpaceVariance
-from apertura.settings.processing import Processing
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.imaging.stages import profiles_of
+from apertura.methods.autofocus.candidates import Candidates
+from apertura.methods.autofocus.one_phase import METHODS
+from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.methods.autofocus.space_variance import MOST_LOSS_DB, SpaceVariance
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.stale import stale_results
+from apertura.pipeline.config.processing import Processing
+from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, decide_method
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.refined import clock_s, open_refined
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.opening.sightings import seen
+from apertura.pipeline.steps import refine
+from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
-from apertura.steps import refine
-from apertura.steps.score import score
-from apertura.store import open_stage
+from apertura.views.score import score
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 ENOUGH, LACKING = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)

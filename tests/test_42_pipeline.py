@@ -7,18 +7,18 @@ import pytest
 import rasterio
 from folders import copy_writable, run_steps
 
-from apertura.campaign import Campaign
-from apertura.echo.compression import compress, range_step, window_weights
-from apertura.echo.sidelink import METHODS
-from apertura.focus.engines import load_engine, reference
-from apertura.focus.inputs import PhaseHistory, Profiles
-from apertura.geometry.aperture import Aperture
-from apertura.load.scene import open_scene
-from apertura.quality.measures import numerical_error
-from apertura.quality.point_targets import Patch, find_peak
-from apertura.steps import echo
-from apertura.steps.score import score
-from apertura.store import open_stage
+from apertura.core.echo.compression import compress, range_step, window_weights
+from apertura.core.echo.sidelink import METHODS
+from apertura.core.focus.engines import load_engine, reference
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.point_targets import Patch, find_peak
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.steps import echo
+from apertura.pipeline.store import open_stage
+from apertura.views.score import score
 
 
 def random_pixels(shape, count, seed):
@@ -181,7 +181,7 @@ def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
 def test_a_threefold_thread_count_changes_nothing(tiny, finished_tiny):
     campaign = Campaign.load(tiny)
     run_steps(tiny, exports=False)
-    from apertura.steps import image
+    from apertura.pipeline.steps import image
 
     image.image(campaign, "f01", "uav1-uav1", threads=6)
     one = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values

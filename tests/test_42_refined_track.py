@@ -10,31 +10,31 @@ from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
 
-from apertura.campaign import Campaign
-from apertura.check import as_line, problems
-from apertura.check.stale import stale_results
-from apertura.errors import CampaignError
-from apertura.geometry.geodesy import ecef_from_geodetic
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.imaging.stages import profiles_of
-from apertura.load.acquisition import open_acquisition
-from apertura.load.pair import open_pair
-from apertura.load.refined import RefinedTrack, clock_s, open_refined
-from apertura.load.results import open_campaign
-from apertura.load.scene import open_scene
-from apertura.load.sightings import Seen, reference_points
-from apertura.load.suspects import evidence_of, seen_from
-from apertura.load.transmitted import transmitted
-from apertura.planning.autofocus import BORNE_DB, decide_autofocus
-from apertura.planning.plan import Decision
-from apertura.refinement.inputs import Sighting
-from apertura.refinement.outcome import Refinement
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.imaging.stages import profiles_of
+from apertura.core.planning.autofocus import BORNE_DB, decide_autofocus
+from apertura.core.planning.plan import Decision
+from apertura.methods.autofocus.inputs import Sighting
+from apertura.methods.autofocus.outcome import Refinement
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import as_line, problems
+from apertura.pipeline.check.stale import stale_results
+from apertura.pipeline.opening.acquisition import open_acquisition
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.refined import RefinedTrack, clock_s, open_refined
+from apertura.pipeline.opening.results import open_campaign
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.opening.sightings import Seen, reference_points
+from apertura.pipeline.opening.suspects import evidence_of, seen_from
+from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.steps import echo, image, profile, refine, scene
+from apertura.pipeline.steps.stamping import stamped
+from apertura.pipeline.store import open_stage, save_stage
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.steps import echo, image, profile, refine, scene
-from apertura.steps.plan import print_plan
-from apertura.steps.score import score
-from apertura.steps.stamping import stamped
-from apertura.store import open_stage, save_stage
+from apertura.views.plan import print_plan
+from apertura.views.score import score
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 FOUND = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))

@@ -9,23 +9,23 @@ import pytest
 import yaml
 from folders import edit_config, run_steps
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.echo.compression import window_weights
-from apertura.errors import CampaignError
-from apertura.load.budget import budget_of
-from apertura.load.pair import open_pair
-from apertura.load.scene import open_scene
-from apertura.load.transmitted import read_pulse
-from apertura.quality.point_targets import find_peak
-from apertura.resources import Resources
-from apertura.settings import validated
+from apertura.common.errors import CampaignError
+from apertura.core.echo.compression import window_weights
+from apertura.core.quality.point_targets import find_peak
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.config import validated
+from apertura.pipeline.opening.budget import budget_of
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.opening.transmitted import read_pulse
+from apertura.pipeline.resources import Resources
+from apertura.pipeline.steps import echo, ingest
+from apertura.pipeline.steps.suspect import hypotheses
+from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
 from apertura.simulation.impairments import Timing
 from apertura.simulation.specification import specification_text
-from apertura.steps import echo, ingest
-from apertura.steps.suspect import hypotheses
-from apertura.store import open_stage
 
 ROOT = Path(__file__).parents[1]
 PAIRS = "uav1-uav1", "uav1-uav2"

@@ -11,18 +11,18 @@ import yaml
 from folders import copy_writable, quality_of
 from scenes import TARGET_GRID, plan, point_history
 
-from apertura.campaign import Campaign
-from apertura.errors import CampaignError
-from apertura.focus.engines import reference
-from apertura.focus.engines.engine import Setting
-from apertura.focus.inputs import PhaseHistory
-from apertura.imaging.range_profiles import range_compress
-from apertura.scene.terrain import FlatGround
-from apertura.steps import image
-from apertura.steps.plan import expected_plan
-from apertura.study.chart.pareto import Point, with_front
-from apertura.study.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
-from apertura.study.tables import write_table
+from apertura.common.errors import CampaignError
+from apertura.common.tables import write_table
+from apertura.core.focus.engines import reference
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.scene.terrain import FlatGround
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import image
+from apertura.views.chart.pareto import Point, with_front
+from apertura.views.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
+from apertura.views.plan import expected_plan
 
 
 @pytest.fixture(scope="module")

@@ -13,23 +13,23 @@ import yaml
 from folders import complaint, copy_writable, require_files, run_steps, settle_ground
 from rasterio.transform import from_origin
 
-from apertura.campaign import Campaign
-from apertura.cli import main
-from apertura.focus.engines import load_engine
-from apertura.geometry.geodesy import projected_from_ecef
-from apertura.imaging.stages import profiles_of
-from apertura.load.ground import Ground
-from apertura.load.pair import open_pair
-from apertura.load.plan import job_of, plan_pair
-from apertura.load.scene import expected_scene, open_scene, settled_scene
-from apertura.scene.grid import SceneGrid
+from apertura.core.focus.engines import load_engine
+from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.core.imaging.stages import profiles_of
+from apertura.core.scene.grid import SceneGrid
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.ground import Ground
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import job_of, plan_pair
+from apertura.pipeline.opening.scene import expected_scene, open_scene, settled_scene
+from apertura.pipeline.steps import profile, scene, terrain
+from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.scene import PointTarget
-from apertura.steps import profile, scene, terrain
-from apertura.steps.plan import expected_plan
-from apertura.steps.score import score
-from apertura.store import open_stage
+from apertura.views.cli import main
+from apertura.views.plan import expected_plan
+from apertura.views.score import score
 
 UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
 PAIR = ("f01", "uav1-uav2")

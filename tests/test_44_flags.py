@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, ingest_all, quality_of
 
-from apertura.campaign import Campaign
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import echo, image, profile, refine, scene
+from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
-from apertura.steps import echo, image, profile, refine, scene
-from apertura.store import open_stage
 
 
 def flown(folder, node="uav2", *, pulses=40, **impairments):

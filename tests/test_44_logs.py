@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, edit_track, small_simulation
 
-from apertura.campaign import Campaign
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.geometry.aperture import Aperture
-from apertura.geometry.geodesy import ecef_from_geodetic
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import echo, ingest
+from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
 from apertura.simulation.trajectory import Wobble
-from apertura.steps import echo, ingest
-from apertura.store import open_stage
 
 
 def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):

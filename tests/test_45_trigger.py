@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from folders import complaint, copy_writable, edit_data, small_simulation
 
-from apertura.campaign import Campaign
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import ingest
+from apertura.pipeline.store import open_stage
 from apertura.simulation import Framing, Impairments, simulate
-from apertura.steps import ingest
-from apertura.store import open_stage
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import pytest
 import yaml
 from folders import complaint, edit_config
 
-from apertura.campaign import Campaign
-from apertura.lineage import result_of
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.steps import calibration, echo, ingest
+from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.scene import PointTarget
-from apertura.steps import calibration, echo, ingest
-from apertura.store import open_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 

@@ -13,18 +13,18 @@ from folders import contents, copy_writable
 from rasterio.warp import transform_bounds
 from rocrate.rocrate import ROCrate
 
-from apertura.campaign import Campaign
-from apertura.catalog import CATALOG, CRATE
-from apertura.catalog.crate_check import changed_files
-from apertura.catalog.validation import stac_problems
-from apertura.environment import lock_sha256, software
-from apertura.errors import CampaignError
-from apertura.lineage import RESULTS, on_demand, places_of, result_of, results_of
-from apertura.provenance import sha256_file
-from apertura.steps.jobs import job_of
-from apertura.steps.ro_crate import ro_crate
-from apertura.steps.stac import stac
-from apertura.store import read_manifest
+from apertura.common.environment import lock_sha256, software
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.formats.catalog import CATALOG, CRATE
+from apertura.formats.catalog.crate_check import changed_files
+from apertura.formats.catalog.validation import stac_problems
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import RESULTS, on_demand, places_of, result_of, results_of
+from apertura.pipeline.steps.jobs import job_of
+from apertura.pipeline.steps.ro_crate import ro_crate
+from apertura.pipeline.steps.stac import stac
+from apertura.pipeline.store import read_manifest
 
 ROOT = Path(__file__).parents[1]
 

@@ -7,9 +7,9 @@ import pytest
 import rasterio
 from folders import copy_writable, edit_config
 
-from apertura.campaign import Campaign
-from apertura.steps import cube, export
-from apertura.store import create, finish, open_array, open_stage, writing
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.steps import cube, export
+from apertura.pipeline.store import create, finish, open_array, open_stage, writing
 
 SIDE = 32
 EMPTY = {"uav1-uav1": [(0, 0)], "uav1-uav2": [(0, 0), (1, 1)]}

@@ -21,15 +21,15 @@ from readers import (
     sampled_by_rioxarray,
 )
 
-from apertura.campaign import Campaign
-from apertura.check.stale import damaged_results
-from apertura.errors import CampaignError
-from apertura.export import exports_in, mosaics, product_files, write_exports
-from apertura.export.mosaic import write_mosaic
-from apertura.export.radiometry import ECHO
-from apertura.geometry.geodesy import LOCAL
-from apertura.scene.grid import SceneGrid
-from apertura.steps import mosaic
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL
+from apertura.core.scene.grid import SceneGrid
+from apertura.formats.export import exports_in, mosaics, product_files, write_exports
+from apertura.formats.export.mosaic import write_mosaic
+from apertura.formats.export.radiometry import ECHO
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.stale import damaged_results
+from apertura.pipeline.steps import mosaic
 
 FLOWN = {"f01": ("uav1-uav1", "uav1-uav2")}
 RASTERS = [name for name in product_files(FLOWN) if name.endswith((".tif", ".vrt"))]

@@ -12,13 +12,13 @@ from folders import run_steps
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
-from apertura.environment import packages, software
-from apertura.export import exports_in, product_files
-from apertura.focus.engines import instruction_set
-from apertura.paths import shipped
-from apertura.provenance import Provenance, sha256_file
+from apertura.common.environment import packages, software
+from apertura.common.paths import shipped
+from apertura.common.provenance import Provenance, sha256_file
+from apertura.core.focus.engines import instruction_set
+from apertura.formats.export import exports_in, product_files
+from apertura.pipeline.store import open_stage, read_manifest
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.store import open_stage, read_manifest
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": PAIRS}))
@@ -105,7 +105,7 @@ def test_a_product_that_stands_on_a_stage_of_other_versions_names_both(finished_
     image = open_stage(finished_tiny.stage("image", "f01", "uav1-uav1"), "image")
     assert image.attrs["software"] == packages()
     older = xr.Dataset(attrs=image.attrs | {"software": packages() | {"numpy": "0.1"}})
-    origin = Provenance.of(["apertura.errors"], [older], software=packages())
+    origin = Provenance.of(["apertura.common.errors"], [older], software=packages())
     assert origin.software["numpy"] == f"0.1, {packages()['numpy']}"
     assert origin.software["zarr"] == packages()["zarr"]
 

@@ -7,13 +7,13 @@ import pytest
 from docutils.core import publish_parts
 from folders import complaint, copy_writable, edit_config
 
-from apertura.audit.tags import read_tags
-from apertura.campaign import Campaign
-from apertura.report import PICTURES
-from apertura.report.phase import steadiness
-from apertura.steps.page import landing, page
-from apertura.steps.pictures import Shown, pictures
-from apertura.store import open_document, read_manifest
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.store import open_document, read_manifest
+from apertura.views.report import PICTURES
+from apertura.views.report.phase import steadiness
+from apertura.views.report.pictures import Shown, pictures
+from apertura.views.report.step import landing, page
+from apertura.views.verification.tags import read_tags
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"
 """All that a campaign's name may hold."""

@@ -12,8 +12,8 @@ from folders import copy_writable
 
 ROOT = Path(__file__).parents[1]
 TOY = """
-from apertura.atomic import write_json
-from apertura.export import Export
+from apertura.common.atomic import write_json
+from apertura.formats.export import Export
 
 def write_power(path, image, *, transform, crs, tags, title=""):
     power = abs(image[:, :]) ** 2

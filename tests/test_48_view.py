@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from apertura.store import open_stage
+from apertura.pipeline.store import open_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 

@@ -5,11 +5,11 @@ import json
 import pytest
 from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 
-from apertura.campaign import Campaign
-from apertura.load.results import assessment_of
-from apertura.steps import assess, cube, echo, image, profile
-from apertura.steps.summary import print_summary
-from apertura.store import record_files
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.results import assessment_of
+from apertura.pipeline.steps import assess, cube, echo, image, profile
+from apertura.pipeline.store import record_files
+from apertura.views.summary import print_summary
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 

@@ -7,11 +7,11 @@ import pytest
 import rasterio
 from folders import complaint, contents, copy_writable, edit_config, run_steps
 
-from apertura.audit.verify import print_verified
-from apertura.campaign import Campaign
-from apertura.export import exports_in
-from apertura.lineage import result_of
-from apertura.settings import Interferometry
+from apertura.formats.export import exports_in
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Interferometry
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.steps.interferogram import interferogram
 from apertura.simulation import (
     CampaignSpecification,
     Clutter,
@@ -25,8 +25,8 @@ from apertura.simulation import (
     WaveformSpecification,
     simulate,
 )
-from apertura.steps.interferogram import interferogram
-from apertura.steps.summary import print_summary
+from apertura.views.summary import print_summary
+from apertura.views.verification.verify import print_verified
 
 SLOPE = (0.03, 0.06)
 MARKS = ((-3.0, -2.5), (3.0, 3.0))

@@ -5,11 +5,11 @@ import time
 import pytest
 from folders import complaint, contents, copy_writable, edit_config
 
-from apertura.campaign import Campaign
-from apertura.check.stale import stale_results
-from apertura.focus.cluster import NAMED_BY
-from apertura.lineage import result_of
-from apertura.steps.image import image
+from apertura.core.focus.cluster import NAMED_BY
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.stale import stale_results
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.steps.image import image
 
 distributed = pytest.importorskip("distributed")
 

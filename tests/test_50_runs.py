@@ -12,17 +12,17 @@ import pytest
 from folders import ROOT, copy_writable
 from rich.console import Console
 
-from apertura.campaign import Campaign
-from apertura.errors import CampaignError
-from apertura.lock import hold, holder
-from apertura.progress import told_at
-from apertura.runs.expectation import Outlook, Told, expected_seconds
-from apertura.runs.failure import failures
-from apertura.runs.inventory import print_list, states
-from apertura.runs.journal import Job, Reader, Run, note
-from apertura.runs.removal import clean
-from apertura.runs.screen import Bar, Screen, bars, table
-from apertura.runs.status import print_status
+from apertura.common.errors import CampaignError
+from apertura.common.lock import hold, holder
+from apertura.common.progress import told_at
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.runs.expectation import Outlook, Told, expected_seconds
+from apertura.pipeline.runs.failure import failures
+from apertura.pipeline.runs.inventory import print_list, states
+from apertura.pipeline.runs.journal import Job, Reader, Run, note
+from apertura.pipeline.runs.removal import clean
+from apertura.pipeline.runs.screen import Bar, Screen, bars, table
+from apertura.pipeline.runs.status import print_status
 
 PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}
 
@@ -330,7 +330,7 @@ def test_clean_waits_for_no_run_and_no_step(finished):
     before = files(finished.results)
     with hold(finished.root), pytest.raises(CampaignError, match="another run holds this campaign"):
         clean(finished, unfinished_only=False, agreed=True)
-    from apertura.store import writing
+    from apertura.pipeline.store import writing
 
     with (
         writing(finished.stage("echo", "f01", "uav1-uav1")),

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from folders import copy_writable
 
-from apertura.campaign import Campaign
-from apertura.check.stale import stale_results
-from apertura.lock import hold
+from apertura.common.lock import hold
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.stale import stale_results
 
 ROOT = Path(__file__).parents[1]
 

@@ -20,10 +20,10 @@ from folders import copy_writable, edit_config, run_steps
 from test_43_terrain import write_plane
 from typer.main import get_command
 
-from apertura.cli import app
-from apertura.errors import CampaignError
-from apertura.settings.template import config_schema
-from apertura.store.chunks import array_of
+from apertura.common.errors import CampaignError
+from apertura.pipeline.config.template import config_schema
+from apertura.pipeline.store.chunks import array_of
+from apertura.views.cli import app
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -441,9 +441,9 @@ UNUSED = {
 IN_ONE_PROCESS = """
 import sys, traceback, yaml
 from pathlib import Path
-from apertura.isolation import leave_working_folder
+from apertura.common.isolation import leave_working_folder
 leave_working_folder()
-from apertura.check import as_line, problems
+from apertura.pipeline.check import as_line, problems
 root = Path(sys.argv[1])
 for path in sorted(Path(sys.argv[2]).iterdir()):
     (root / "config/config.yaml").write_bytes(path.read_bytes())

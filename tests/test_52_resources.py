@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 from folders import ROOT, copy_writable, edit_config
 
-from apertura.campaign import Campaign
-from apertura.resources import DEMANDS, Resources
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.resources import DEMANDS, Resources
 
 BESIDE_MB = 2 * 135
 """Snakemake, which starts the job, and Snakemake again, which starts the step: measured."""

@@ -18,11 +18,11 @@ import yaml
 from folders import SHARED, copy_writable
 from matplotlib import image
 
-from apertura.echo.dechirp import Sweep
-from apertura.inspection.command import inspect_path
-from apertura.inspection.look import look
-from apertura.inspection.pictures import draw_history
+from apertura.core.echo.dechirp import Sweep
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
+from apertura.views.inspection.command import inspect_path
+from apertura.views.inspection.look import look
+from apertura.views.inspection.pictures import draw_history
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from folders import SHARED, copy_writable
 
-from apertura.errors import CampaignError
-from apertura.ingest.names import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
-from apertura.inspection.command import inspect_path
-from apertura.inspection.look import look
+from apertura.common.errors import CampaignError
+from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
+from apertura.views.inspection.command import inspect_path
+from apertura.views.inspection.look import look
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"

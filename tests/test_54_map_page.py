@@ -18,9 +18,9 @@ from folders import copy_writable, run_steps
 from matplotlib.image import imread
 from pyproj import Transformer
 
+from apertura.pipeline.store import record_files
 from apertura.simulation import preset, simulate
-from apertura.store import record_files
-from apertura.webmap.page import is_built
+from apertura.views.webmap.page import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"
 CHROMIUM = Path("/usr/bin/chromium")

@@ -6,13 +6,13 @@ import shutil
 import pytest
 from folders import complaint, contents, copy_writable
 
-from apertura.audit.products import manifests
-from apertura.audit.reproduce import print_reproduced
-from apertura.lock import hold
-from apertura.workflow import run_workflow
+from apertura.common.lock import hold
+from apertura.pipeline.workflow import run_workflow
+from apertura.views.verification.products import manifests
+from apertura.views.verification.reproduce import print_reproduced
 
 PAIR = "results/f01/uav1-uav2"
-RUN = "apertura.audit.reproduce.run_workflow"
+RUN = "apertura.views.verification.reproduce.run_workflow"
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from folders import copy_writable, edit_config
 from PIL import Image, PngImagePlugin
 from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
-from apertura.audit.verify import verify
-from apertura.code_imports import PACKAGE
-from apertura.provenance import canonical_json, sha256_file
+from apertura.common.code_imports import PACKAGE
+from apertura.common.provenance import canonical_json, sha256_file
+from apertura.views.verification.verify import verify
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ VERIFY = """
 import sys
 sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in type(finder).__module__]
 sys.path.insert(0, sys.argv.pop(1))
-from apertura.cli import main
+from apertura.views.cli import main
 main()
 """
 

@@ -9,8 +9,8 @@ import pytest
 from folders import complaint, copy_writable
 from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
-from apertura.audit.verify import print_verified, verify
-from apertura.provenance import canonical_json, sha256_file
+from apertura.common.provenance import canonical_json, sha256_file
+from apertura.views.verification.verify import print_verified, verify
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 from crate import validator
 from folders import copy_writable
 
-from apertura.catalog import CRATE
+from apertura.formats.catalog import CRATE
 
 
 @pytest.fixture

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from folders import complaint, run_steps
 
-from apertura.campaign import Campaign
-from apertura.check import problems
-from apertura.ingest.optitrack import body_position
-from apertura.steps.align import align, keep
-from apertura.steps.score import score
-from apertura.store import open_stage
+from apertura.formats.tracks.optitrack import body_position
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.steps.align import align, keep
+from apertura.pipeline.store import open_stage
+from apertura.views.score import score
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

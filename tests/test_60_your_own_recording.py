@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apertura.ingest import open_recording, read_track
+from apertura.formats.reading import open_recording, read_track
 from apertura.simulation import ImageGrid, preset, simulate
 
 HOWTO = Path(__file__).parents[1] / "docs/howto/your_own_recording.md"

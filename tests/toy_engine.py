@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from apertura.focus.engines.engine import EngineOptions, Setting
-from apertura.focus.inputs import Profiles
-from apertura.focus.job import Job
+from apertura.core.focus.engines.engine import EngineOptions, Setting
+from apertura.core.focus.inputs import Profiles
+from apertura.core.focus.job import Job
 
 READS = "profiles"
 CALLS: list[str] = []

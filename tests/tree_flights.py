@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import tree
-from apertura.focus.engines.engine import Setting
-from apertura.focus.engines.tree_surface import surfaces_of
-from apertura.focus.engines.tree_track import subaperture_sizes
-from apertura.focus.engines.tree_view import counts_of, look
-from apertura.focus.job import Job, Signal
-from apertura.geometry.aperture import Aperture
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import tree
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.engines.tree_surface import surfaces_of
+from apertura.core.focus.engines.tree_track import subaperture_sizes
+from apertura.core.focus.engines.tree_view import counts_of, look
+from apertura.core.focus.job import Job, Signal
+from apertura.core.geometry.aperture import Aperture
 
 STEP_M = C / BANDWIDTH_HZ / 2
 WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * BANDWIDTH_HZ / C}

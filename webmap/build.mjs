@@ -1,13 +1,13 @@
 // Bundles the map's page and the window around it into the package: index.html, app.js, app.css and shell.*, which name
 // no other host.
-// `node build.mjs [folder]`; without a folder, into src/apertura/webmap/page.
+// `node build.mjs [folder]`; without a folder, into src/apertura/views/webmap/page.
 import { build } from 'esbuild';
 import { copyFile, mkdir, rename, rm } from 'node:fs/promises';
 import { dirname, join, resolve } from 'node:path';
 import { fileURLToPath } from 'node:url';
 
 const here = dirname(fileURLToPath(import.meta.url));
-const folder = resolve(process.argv[2] ?? join(here, '../src/apertura/webmap/page'));
+const folder = resolve(process.argv[2] ?? join(here, '../src/apertura/views/webmap/page'));
 const beside = `${folder}.wip`;
 
 await rm(beside, { recursive: true, force: true });

@@ -25,7 +25,7 @@ _OF = {
     "RecordedFlight": "Campaigns",
     "RecordedNode": "Campaigns",
 }
-_GIVEN = {"open_campaign": "apertura.load.results.OpenCampaign"}
+_GIVEN = {"open_campaign": "apertura.pipeline.opening.results.OpenCampaign"}
 """Public function → what it returns, which is made by nobody else."""
 
 _OTHERS = "Geometry and ground"

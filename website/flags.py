@@ -2,7 +2,7 @@
 
 import re
 
-from apertura.flags import FLAGS
+from apertura.common.flags import FLAGS
 
 _HEAD = """# Flags
 
@@ -18,7 +18,7 @@ _FOOT = """
 Limits and how they follow: [echo methods](theory/echo_methods.md), [tracks](theory/tracks.md),
 [planner](theory/planner.md), [terrain](theory/terrain.md), [waveforms](theory/waveforms.md),
 [FMCW](theory/fmcw.md). Files are below `src/apertura`.
-Written by `make pages` from `FLAGS` in `src/apertura/flags/__init__.py`.
+Written by `make pages` from `FLAGS` in `src/apertura/common/flags/__init__.py`.
 """
 
 _PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.simulation import Straight, Waypoints, Wobble
 from apertura.simulation.scene import Vector
 from apertura.simulation.trajectory import Track

@@ -5,7 +5,7 @@ from math import ceil, log10
 
 import numpy as np
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.simulation import Impairments, SimulatedNode, WaveformSpecification
 from apertura.simulation.impairments import Clock, TimeTag, Timing, UniformPhase
 from apertura.simulation.trajectory import Track

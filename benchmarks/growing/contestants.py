@@ -8,15 +8,15 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.focus.engines import ENGINES, load_engine
-from apertura.focus.inputs import Profiles
-from apertura.focus.job import Job
-from apertura.focus.reach import pulse_blocks_of
-from apertura.imaging.job import imaging_job
-from apertura.imaging.range_profiles import range_compress
-from apertura.planning.planner import make_plan
-from apertura.scene.ground_models import GroundModels
-from apertura.scene.terrain import FlatGround
+from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.focus.inputs import Profiles
+from apertura.core.focus.job import Job
+from apertura.core.focus.reach import pulse_blocks_of
+from apertura.core.imaging.job import imaging_job
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.planning.planner import make_plan
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import FlatGround
 from growing.scene import TILE_PX, Scene, Window
 
 Image = NDArray[np.complex64]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.scene.terrain import FlatGround
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.scene.terrain import FlatGround
 from growing.contestants import PATIENCE, Contestant, Image, SkippedError, share_of
 from growing.scene import Scene
 

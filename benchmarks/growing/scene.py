@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.fft import fft
 from scipy.ndimage import gaussian_filter
 
-from apertura.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.focus.engines import reference
-from apertura.focus.inputs import PhaseHistory
-from apertura.geometry.aperture import Aperture
-from apertura.scene.grid import SceneGrid
-from apertura.scene.terrain import FlatGround, GridHeights, Terrain
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.focus.engines import reference
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
 
 Geometry = Literal["monostatic", "bistatic", "low", "spotlight"]
 Surface = Literal["flat", "smooth", "rough"]

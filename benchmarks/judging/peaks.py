@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.quality.point_targets import find_peak
-from apertura.scene.grid import SceneGrid
+from apertura.core.quality.point_targets import find_peak
+from apertura.core.scene.grid import SceneGrid
 
 REACH_M = 1.5
 """How far from its place a target is looked for, where no other stands nearer than twice that."""

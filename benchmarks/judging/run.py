@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign import Campaign
-from apertura.errors import CampaignError
-from apertura.load.scene import settled_scene
-from apertura.scene.grid import SceneGrid
-from apertura.settings import Flight
-from apertura.steps import cube, echo, export, image, ingest, profile, scene, terrain
-from apertura.store import open_stage
+from apertura.common.errors import CampaignError
+from apertura.core.scene.grid import SceneGrid
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Flight
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.steps import cube, echo, export, image, ingest, profile, scene, terrain
+from apertura.pipeline.store import open_stage
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,12 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
         terrain.terrain(campaign)
     for pair in flight.pairs:
         profile.profile(campaign, flight.name, pair)
-    if util.find_spec("apertura.steps.refine"):
-        import_module("apertura.steps.refine").refine(campaign, flight.name)
+    if util.find_spec("apertura.pipeline.steps.refine"):
+        import_module("apertura.pipeline.steps.refine").refine(campaign, flight.name)
     for pair in flight.pairs:
         image.image(campaign, flight.name, pair, threads=1)
-    if util.find_spec("apertura.steps.assess"):
-        import_module("apertura.steps.assess").assess(campaign, flight.name)
+    if util.find_spec("apertura.pipeline.steps.assess"):
+        import_module("apertura.pipeline.steps.assess").assess(campaign, flight.name)
     cube.cube(campaign)
     for pair in flight.pairs:
         export.export(campaign, flight.name, pair)

@@ -16,18 +16,18 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from apertura_research.study.refinement.cases import Case, case
+from apertura_research.study.refinement.measures import UNCORRECTED, image_seconds, judge
+from apertura_research.study.refinement.scenes import GRID
 
-from apertura.refinement.agreement import Ground
-from apertura.refinement.blocks import Blocks
-from apertura.refinement.outcome import Refinement
-from apertura.refinement.prior import NodePrior, Prior
-from apertura.refinement.refine import refine
-from apertura.refinement.speckle import refined_by_speckle
-from apertura.refinement.tiles import tiles
-from apertura.scene.terrain import FlatGround
-from apertura.study.refinement.cases import Case, case
-from apertura.study.refinement.measures import UNCORRECTED, image_seconds, judge
-from apertura.study.refinement.scenes import GRID
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.agreement import Ground
+from apertura.methods.autofocus.blocks import Blocks
+from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.prior import NodePrior, Prior
+from apertura.methods.autofocus.refine import refine
+from apertura.methods.autofocus.speckle import refined_by_speckle
+from apertura.methods.autofocus.tiles import tiles
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")

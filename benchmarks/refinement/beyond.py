@@ -7,15 +7,15 @@ mended, refused, or what is left.
 import dataclasses
 
 import numpy as np
+from apertura_research.study.refinement.cases import PAIRS, PROBES_M, Case, sighting
+from apertura_research.study.refinement.flights import FLIGHTS, NODES, drawn_errors
+from apertura_research.study.refinement.measures import judge
+from apertura_research.study.refinement.scenes import GRID, SCENES, Scatterers
 
-from apertura.geometry.track_correction import TrackCorrection
-from apertura.refinement.inputs import TrackErrors
-from apertura.refinement.refine import refine
-from apertura.scene.terrain import FlatGround
-from apertura.study.refinement.cases import PAIRS, PROBES_M, Case, sighting
-from apertura.study.refinement.flights import FLIGHTS, NODES, drawn_errors
-from apertura.study.refinement.measures import judge
-from apertura.study.refinement.scenes import GRID, SCENES, Scatterers
+from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.inputs import TrackErrors
+from apertura.methods.autofocus.refine import refine
 
 SIGMA_M = 0.01
 OTHERS = {

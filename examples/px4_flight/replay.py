@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apertura.geometry.geodesy import geodetic_from_ecef, ned_axes
-from apertura.ingest import read_track
+from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
+from apertura.formats.reading import read_track
 from apertura.simulation import simulate
 from apertura.simulation.scene import Origin, PointTarget
 from apertura.simulation.specification import (

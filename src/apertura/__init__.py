@@ -6,34 +6,34 @@ Examples
 --------
 >>> import apertura as ap
 >>> ap.SceneGrid.__module__
-'apertura.scene.grid'
+'apertura.core.scene.grid'
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from apertura.focus.inputs import Profiles as Profiles
-    from apertura.scene.grid import SceneGrid as SceneGrid
+    from apertura.core.focus.inputs import Profiles as Profiles
+    from apertura.core.scene.grid import SceneGrid as SceneGrid
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
-    "Aperture": "apertura.geometry.aperture",
-    "Dem": "apertura.scene.dem",
-    "FlatGround": "apertura.scene.terrain",
-    "PhaseHistory": "apertura.focus.inputs",
-    "Plane": "apertura.scene.terrain",
-    "Profiles": "apertura.focus.inputs",
-    "RecordedFlight": "apertura.load.writing",
-    "RecordedNode": "apertura.load.writing",
-    "SceneGrid": "apertura.scene.grid",
-    "backproject": "apertura.imaging.backproject",
-    "gradient": "apertura.imaging.gradient",
-    "open_campaign": "apertura.load.results",
-    "open_dem": "apertura.scene.dem_file",
-    "range_compress": "apertura.imaging.range_profiles",
+    "Aperture": "apertura.core.geometry.aperture",
+    "Dem": "apertura.core.scene.dem",
+    "FlatGround": "apertura.core.scene.terrain",
+    "PhaseHistory": "apertura.core.focus.inputs",
+    "Plane": "apertura.core.scene.terrain",
+    "Profiles": "apertura.core.focus.inputs",
+    "RecordedFlight": "apertura.pipeline.opening.writing",
+    "RecordedNode": "apertura.pipeline.opening.writing",
+    "SceneGrid": "apertura.core.scene.grid",
+    "backproject": "apertura.core.imaging.backproject",
+    "gradient": "apertura.core.imaging.gradient",
+    "open_campaign": "apertura.pipeline.opening.results",
+    "open_dem": "apertura.core.scene.dem_file",
+    "range_compress": "apertura.core.imaging.range_profiles",
     "simulate": "apertura.simulation",
-    "write_campaign": "apertura.load.writing",
+    "write_campaign": "apertura.pipeline.opening.writing",
 }
 """Public name → module that defines it."""
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from apertura.isolation import leave_working_folder
+from apertura.common.isolation import leave_working_folder
 
 _ENCODING, _BACKEND = "PYTHONIOENCODING", "MPLBACKEND"
 _PROJ = ("PROJ_DATA", "PROJ_LIB")
@@ -32,7 +32,7 @@ def main() -> None:
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     os.environ[_ENCODING] = f"{os.environ.get(_ENCODING, '').partition(':')[0]}:backslashreplace"
     os.environ[_BACKEND] = "agg"  # pictures are files; a backend of the caller's may be none that is here
-    from apertura.cli import main as run
+    from apertura.views.cli import main as run
 
     run()
 

@@ -79,10 +79,18 @@ def may_mount() -> bool:
 
 
 def _campaign_of_faults(asked: argparse.Namespace) -> int:
-    for module in ("apertura.cli", "matplotlib.pyplot", "rasterio", "zarr", "xarray", "scipy.signal", "dask.array"):
+    for module in (
+        "apertura.views.cli",
+        "matplotlib.pyplot",
+        "rasterio",
+        "zarr",
+        "xarray",
+        "scipy.signal",
+        "dask.array",
+    ):
         importlib.import_module(module)
     for step in {step.split()[0] for step in STEPS} - {"tiles", "calibrate"}:
-        importlib.import_module(f"apertura.steps.{MODULES.get(step, step)}")
+        importlib.import_module(f"apertura.pipeline.steps.{MODULES.get(step, step)}")
     with tempfile.TemporaryDirectory() as folder:
         bench, began = Bench(make_campaign(Path(folder).resolve()), shared_page()), time.perf_counter()
         bench.prepare(tuple(asked.steps))

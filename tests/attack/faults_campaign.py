@@ -46,7 +46,7 @@ STEPS = (
 """Every command of a run in its order."""
 
 MODULES = {"map": "webmap", "ro-crate": "ro_crate"}
-"""Command → module of `apertura.steps`, where the names differ."""
+"""Command → module of `apertura.pipeline.steps`, where the names differ."""
 
 TARGETS = (
     "ingest f01 uav2",

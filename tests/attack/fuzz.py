@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
 
 from .difference import kinds, leaves
 from .mutators import mutated

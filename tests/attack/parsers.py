@@ -6,40 +6,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apertura.campaign import Campaign
-from apertura.errors import CampaignError, shown
-from apertura.ingest import (
-    ardupilot,
-    cphd,
-    cphd_fields,
-    dataflash_fields,
-    hdf5_history,
-    history_layout,
-    open_recording,
-    phase_history,
-    px4_ulog,
-    read_track,
-    ulog_fields,
-    zarr_history,
-)
-from apertura.ingest.afrl import joined
-from apertura.ingest.beam_pattern import read_beam_pattern
-from apertura.ingest.log_options import AS_IT_SAYS, LogOptions
-from apertura.ingest.mat_fields import read_fields
-from apertura.ingest.names import recording_files
-from apertura.ingest.pulson import read_pulson
-from apertura.ingest.sigmf_collection import check_listed
-from apertura.load.results import OpenCampaign, assessment_of
-from apertura.load.scene import settled_scene
-from apertura.load.transmitted import read_codes, read_framing, read_pulse
-from apertura.scene.dem_file import open_dem
-from apertura.scene.geoid import geoid_file
-from apertura.scene.geoid_grid import undulation
-from apertura.scene.grid import SceneGrid
-from apertura.settings import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
+from apertura.common.errors import CampaignError, shown
+from apertura.core.scene.dem_file import open_dem
+from apertura.core.scene.geoid import geoid_file
+from apertura.core.scene.geoid_grid import undulation
+from apertura.core.scene.grid import SceneGrid
+from apertura.formats.beam_pattern import read_beam_pattern
+from apertura.formats.names import recording_files
+from apertura.formats.phase_histories import cphd, hdf5_history, history_layout, phase_history, zarr_history
+from apertura.formats.phase_histories.afrl import joined
+from apertura.formats.phase_histories.mat_fields import read_fields
+from apertura.formats.phase_histories.pulson import read_pulson
+from apertura.formats.reading import cphd_fields, dataflash_fields, open_recording, read_track, ulog_fields
+from apertura.formats.recordings.sigmf_collection import check_listed
+from apertura.formats.tracks import ardupilot, px4_ulog
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
+from apertura.pipeline.opening.results import OpenCampaign, assessment_of
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.opening.transmitted import read_codes, read_framing, read_pulse
+from apertura.pipeline.steps.calibration import calibrated
+from apertura.pipeline.store import manifest_of, read_manifest, record_files
 from apertura.simulation.specification import read_specification
-from apertura.steps.calibration import calibrated
-from apertura.store import manifest_of, read_manifest, record_files
 
 from . import beats, mutators, products, seeds
 

@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 from rasterio import Affine
 
-from apertura.audit.contents import sections_of
-from apertura.audit.tags import document, hashes, read_tags
-from apertura.export.cog import write_slc
+from apertura.formats.export.cog import write_slc
+from apertura.views.verification.contents import sections_of
+from apertura.views.verification.tags import document, hashes, read_tags
 
 _TOLD = {"raw/f01/uav1.sigmf-data": "0f" * 32, "results/scene.manifest.json": "1e" * 32}
 _TAGS = {

@@ -14,11 +14,11 @@ import zarr
 from rasterio.transform import from_origin
 from scipy.io import savemat
 
-from apertura.export.cphd import write_cphd
-from apertura.export.cphd_collection import Collection
-from apertura.geometry.geodesy import ecef_from_geodetic
-from apertura.ingest.pulson import MESSAGE
-from apertura.settings.template import config_template, flights_template
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.export.cphd import write_cphd
+from apertura.formats.export.cphd_collection import Collection
+from apertura.formats.phase_histories.pulson import MESSAGE
+from apertura.pipeline.config.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
 from tests.autopilot_logs import (

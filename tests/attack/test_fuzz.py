@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
 
 from . import fuzz
 from .parsers import PARSERS, Parser

@@ -1,4 +1,4 @@
-# A row of `apertura.export.EXPORTS` is all that a product needs: the outputs follow from it.
+# A row of `apertura.formats.export.EXPORTS` is all that a product needs: the outputs follow from it.
 rule export:
     input:
         lambda wildcards: result_of(campaign, "export", wildcards.flight, wildcards.pair).sources,

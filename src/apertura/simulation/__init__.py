@@ -6,7 +6,8 @@ from pathlib import Path
 
 from numpy.random import Generator, default_rng
 
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
+from apertura.common.validation import validated
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments
@@ -22,7 +23,6 @@ from apertura.simulation.specification import (
 )
 from apertura.simulation.trajectory import GaussianBeam, Straight, Track, Waypoints, Wobble
 from apertura.simulation.waveforms import PulseSpecification, WaveformSpecification
-from apertura.validation import validated
 
 __all__ = [
     "CampaignSpecification",

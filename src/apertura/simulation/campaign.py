@@ -10,8 +10,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.campaign_files import new_folder, write_config, write_csv_log, write_recording
-from apertura.geometry.geodesy import geodetic_from_ecef
+from apertura.core.geometry.geodesy import geodetic_from_ecef
+from apertura.formats.campaign_files import new_folder, write_config, write_csv_log, write_recording
 from apertura.simulation.continuous import continuous_blocks, recording_start_s
 from apertura.simulation.draw import independent_streams
 from apertura.simulation.files import flight_truth, targets_truth, write_pos_log

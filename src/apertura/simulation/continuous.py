@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from apertura.errors import CampaignError
+from apertura.common.errors import CampaignError
 from apertura.simulation.draw import independent_streams
 from apertura.simulation.impairments import STRICT_KEYS, Adc, Floats
 from apertura.simulation.radar import TransmitWaveform

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.random import default_rng
 from numpy.typing import NDArray
 
-from apertura.geometry.geodesy import projected_from_ecef
-from apertura.leap_seconds import gps_from_utc
+from apertura.common.leap_seconds import gps_from_utc
+from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import pulse_samples
 from apertura.simulation.impairments import Floats
 from apertura.simulation.observation import Observation

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
-from apertura.echo.dechirp import Sweep
-from apertura.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.dechirp import Sweep
+from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 
 Floats = NDArray[np.float64]
 Place = tuple[float, float, float]

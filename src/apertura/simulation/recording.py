@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.draw import ImpairmentDraw
 from apertura.simulation.impairments import Adc, ChannelName, Floats, Impairments, Ripple
 from apertura.simulation.radar import Paths, TransmitWaveform, direct_path, echo_paths

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from apertura.geometry.geodesy import ecef_from_geodetic, ned_axes
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.simulation.impairments import STRICT_KEYS, Floats
 
 Vector = tuple[float, float, float]

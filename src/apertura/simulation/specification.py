@@ -13,8 +13,9 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
-from apertura.documents import read_yaml
-from apertura.geometry.geodesy import projected_from_ecef
+from apertura.common.documents import read_yaml
+from apertura.common.validation import validated
+from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
 from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Floats, Impairments, RadarPoint
@@ -22,7 +23,6 @@ from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
 from apertura.simulation.waveforms import TransmittedSpecification
-from apertura.validation import validated
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
 

@@ -1,0 +1,199 @@
+"""Every cause that spoils an image, from negligible to destructive, and what the budget expects of it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+
+from apertura.core.quality.budget import NodePositions, offset_line, position_lines
+from apertura.core.quality.path_errors import Effect
+from apertura.core.scene.terrain import FlatGround, GridHeights
+from apertura_research.error_atlas.flight import GRID, Flight, Told, flight
+from apertura_research.error_atlas.logs import Log, between_epochs, told_by
+
+Tell = Callable[[Flight, float, Generator], Told]
+Expect = Callable[[Flight, str, float], Effect]
+
+_CM, _MS = 1e-2, 1e-3
+_WHOLE_FLIGHT_S = 1e3
+_DEM_CORRELATION_M = 3.0
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One cause and the sizes at which it is tried, from negligible to destructive.
+
+    Attributes
+    ----------
+    tell
+        Flight, size and generator → what the pipeline is told.
+    expect
+        Flight, pair and size → what the budget says when the size is stated.
+    stated
+        How it is stated to the budget, in a few words.
+    draws
+        How often it is drawn.
+    added
+        It shows in the coherent sum of both pairs, and its loss is that of the sum.
+    pulses
+        Of the 10 s.
+    """
+
+    title: str
+    unit: str
+    sizes: tuple[float, ...]
+    tell: Tell
+    expect: Expect
+    stated: str
+    draws: int = 4
+    beamed: bool = False
+    added: bool = False
+    pulses: int = 300
+
+    def flight(self) -> Flight:
+        """Return what was flown."""
+        return flight(pulses=self.pulses, beamed=self.beamed)
+
+
+def nothing(flown: Flight, pair: str, size: float) -> Effect:  # noqa: ARG001
+    """Return that the budget has no line for it."""
+    return Effect(0.0, 0.0, 0.0)
+
+
+def positions(flown: Flight, pair: str, *known: NodePositions) -> Effect:
+    """Return the line of positions: of one or both nodes of a pair, in the order a, b; a node not given is exact."""
+    exact = NodePositions((1e-9,) * 3, 1.0, "truth")
+    nodes = [*known, exact, exact]
+    return position_lines(flown.paths(pair), nodes[: len(set(pair.split("-")))], sidelink=pair == "a-b")[0].effect
+
+
+def offset(flown: Flight, pair: str, slope: Callable[..., np.ndarray], size: float, *, common: bool = False) -> Effect:
+    """Return the line of a constant error, whose path per unit follows from the paths of a point."""
+    paths = flown.paths(pair)
+    return offset_line(paths, "", slope(paths), size, unit="", common=common).effect
+
+
+def _noise(size: float, correlation_s: float) -> NodePositions:
+    return NodePositions((_CM * size,) * 3, correlation_s, "truth")
+
+
+def _wander(flown: Flight, log: Log, generator: Generator) -> Told:
+    return told_by(flown, generator, a=log, b=log)
+
+
+def _late(flown: Flight, pair: str, late_ms: float) -> Effect:
+    return offset(flown, pair, lambda paths: -_MS * paths.rate_m_s, late_ms, common=True)
+
+
+def _higher(flown: Flight, pair: str, higher_cm: float) -> Effect:
+    return offset(flown, pair, lambda paths: -_CM * paths.gradient[:, 2], higher_cm, common=True)
+
+
+def _only(pair: str, effect: Callable[..., Effect]) -> Expect:
+    """Return an expectation that touches one pair."""
+    return lambda flown, asked, size: effect(flown, asked, size) if asked == pair else Effect(0.0, 0.0, 0.0)
+
+
+def _late_receiver(flown: Flight, size: float, _: Generator) -> Told:
+    moved = flown.antenna("b", flown.time_s + _MS * size)
+    return replace(flown.truth, apertures=flown.apertures(b=moved))
+
+
+def _late_nodes(flown: Flight, size: float, _: Generator) -> Told:
+    moved = {node: flown.antenna(node, flown.time_s + _MS * size) for node in flown.nodes}
+    return replace(flown.truth, apertures=flown.apertures(**moved))
+
+
+def _rough(flown: Flight, size: float, generator: Generator) -> Told:
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(generator.standard_normal(GRID.shape), _DEM_CORRELATION_M / GRID.spacing_m, mode="wrap")
+    return replace(flown.truth, terrain=GridHeights(GRID, _CM * size * field / field.std()))
+
+
+def _every(flown: Flight, size: float, _: Generator) -> Told:
+    return replace(flown.truth, used=np.arange(len(flown.time_s)) % round(size) == 0)
+
+
+def _mispaired(flown: Flight, size: float, _: Generator) -> Told:
+    late_s = flown.time_s + size * flown.time_s[1]
+    moved = flown.apertures(**{node: flown.antenna(node, late_s) for node in flown.nodes})
+    return replace(flown.truth, apertures={**flown.apertures(), "a-b": moved["a-b"]})
+
+
+CAUSES: Mapping[str, Cause] = {
+    "track_noise": Cause(
+        "Noise of the tracks, correlated over 1 s, σ per axis", "cm", (0.1, 0.3, 0.6, 1, 1.5, 2, 3, 5),
+        lambda flown, size, generator: _wander(flown, Log(wander_m=_CM * size), generator),
+        lambda flown, pair, size: positions(flown, pair, *[_noise(size, 1.0)] * 2), "positions", draws=6,
+    ),
+    "track_noise_time": Cause(
+        "Correlation time of track noise of 1.5 cm", "s", (0.1, 0.3, 1, 3, 10, 30),
+        lambda flown, size, generator: _wander(flown, Log(wander_m=0.015, correlation_s=size), generator),
+        lambda flown, pair, size: positions(flown, pair, *[_noise(1.5, size)] * 2), "positions", draws=6,
+    ),
+    "track_gap": Cause(
+        "Gap in the transmitter's log", "s", (0.1, 0.3, 0.6, 1, 2, 3, 5, 8),
+        lambda flown, size, generator: told_by(flown, generator, a=Log(gap_s=size), b=Log()),
+        nothing, "missing pulses (no loss)",
+    ),
+    "log_rate": Cause(
+        "Epochs per second of both logs", "Hz", (50, 20, 10, 5, 2, 1, 0.5, 0.3),
+        lambda flown, size, generator: _wander(flown, Log(rate_hz=size), generator),
+        lambda flown, pair, size: positions(flown, pair, *[between_epochs(flown, Log(rate_hz=size))] * 2),
+        "interpolation_m as positions",
+    ),
+    "tags_common": Cause(
+        "Tags of both nodes late", "ms", (1, 3, 10, 30, 60, 100, 300, 1000), _late_nodes, _late, "time tags", draws=2,
+    ),
+    "tags_of_one": Cause(
+        "Log of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
+        "time tags", draws=2,
+    ),
+    "height": Cause(
+        "Ground taken too high", "cm", (0.3, 1, 3, 10, 20, 40, 100),
+        lambda flown, size, _: replace(flown.truth, terrain=FlatGround(_CM * size)),
+        _higher, "heights", draws=2,
+    ),
+    "dem": Cause(
+        "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 60), _rough, _higher, "heights",
+    ),
+    "arm": Cause(
+        "Lever arm of the transmitting node off, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),
+        lambda flown, size, _: replace(
+            flown.truth, apertures=flown.apertures(a=flown.antenna("a", arm_m=(_CM * size,) * 3))
+        ),
+        lambda flown, pair, size: positions(flown, pair, _noise(size, _WHOLE_FLIGHT_S)),
+        "positions, one error for the whole flight", draws=2,
+    ),
+    "prf": Cause(
+        "One pulse imaged of so many, of 30 per metre", "1", (1, 2, 3, 4, 6, 8, 12, 16), _every, nothing,
+        "missing pulses (no loss)", draws=2,
+    ),
+    "presum": Cause(
+        "Pulses made one, of 120 per metre", "1", (1, 2, 3, 4, 5, 6, 8),
+        lambda flown, size, _: replace(flown.truth, presum=round(size)), nothing, "arithmetic, as measured", draws=1,
+        pulses=1200,
+    ),
+    "antenna": Cause(
+        "Boresight off in azimuth, beam of 60°", "deg", (1, 3, 6, 10, 20, 30, 45, 60),
+        lambda flown, size, _: replace(flown.truth, beams=flown.beams(size)), nothing, "no line", draws=2, beamed=True,
+    ),
+    "calibration": Cause(
+        "Path offset of the bistatic pair off", "cm", (0.1, 0.3, 1, 2, 3, 6, 10, 30),
+        lambda flown, size, _: replace(flown.truth, longer_m={"a-b": _CM * size}),
+        _only("a-b", lambda flown, pair, size: offset(flown, pair, lambda p: np.full(len(p.time_s), _CM), size)),
+        "calibration", draws=2,
+    ),
+    "association": Cause(
+        "Receiver's pulses paired late", "pulses", (1, 2, 3, 5, 10, 20, 30), _mispaired,
+        _only("a-b", lambda flown, pair, size: _late(flown, pair, size * flown.time_s[1] / _MS)), "time tags", draws=2,
+    ),
+    "fusion_phase": Cause(
+        "Phase between the pairs", "rad", (0.1, 0.3, 0.6, 0.8, 1, 1.3, 1.6, 2.4, 3.1),
+        lambda flown, size, _: replace(flown.truth, turned_rad={"a-b": size}),
+        lambda _, __, size: Effect(20 * float(np.log10(max(abs(np.cos(size / 2)), 1e-3))), 0.0, size),
+        "phase of a pair", draws=2, added=True,
+    ),
+}  # fmt: skip

@@ -1,0 +1,216 @@
+"""What each stage holds: dimensions, dtype and unit of every variable, and what is written beside it.
+
+Stages are nouns and data flows one way: raw → echo → profile → image → cube → files; `track` joins
+at echo. `check` refuses a dataset that breaks its contract.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apertura.common.cube_variables import COORDINATES, MEASURED, QUOTED, RASTERS
+from apertura.common.errors import ContractError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Window = tuple[slice, slice]
+"""Rows and columns of a part of an image."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of a stage."""
+
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One station of the road: its arrays, the attributes that must stand beside them, and arrays that may."""
+
+    variables: Mapping[str, Variable]
+    attributes: Mapping[str, str]
+    optional: Mapping[str, Variable] = field(default_factory=dict)
+
+
+_PULSE_GEOMETRY = {
+    "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the pulse, transmitter's clock"),
+    "tx_position": Variable(("pulse", "axis"), "float64", "m", "transmitting phase centre, in `frame`"),
+    "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
+}
+_KNOTS = "node", "knot", "axis"
+_FRAME = {
+    "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
+    "pair": "transmitter-receiver",
+    "flags": "edges crossed so far: flag name → what was measured, in one line",
+}
+
+STAGES: Mapping[str, Stage] = {
+    "raw": Stage(
+        {
+            "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
+            "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, node's own clock"),
+            "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload, -1 without"),
+        },
+        {
+            "node": "node name",
+            "samples": "the recorder's file, relative to the campaign folder: channels interleaved per sample",
+            "channels": "names of the channels",
+            "capture_samples": "samples of each capture",
+            "sample_rate_hz": "complex samples per second",
+            "datatype": "of the numbers in the file, as SigMF names it",
+            "trailing_bytes": "at the end of the file that are no samples",
+            "mixing": "of real samples: if_hz, sample_rate_hz, restarts; null: they are complex",
+        },
+        {
+            "segment_start": Variable(("segment",), "int64", "1", "first samples behind bytes that are no samples"),
+            "segment_skipped": Variable(("segment",), "int64", "1", "how many such bytes the file holds before each"),
+        },
+    ),
+    "track": Stage(
+        {
+            "time": Variable(("epoch",), "datetime64[ns]", "", "UTC"),
+            "position": Variable(("epoch", "axis"), "float64", "m", "logged point, in `frame`"),
+            "attitude": Variable(
+                ("epoch", "axis"), "float64", "rad", "roll, pitch, yaw of forward-right-down axes; NaN where not logged"
+            ),
+        },
+        {
+            "node": "node name",
+            "frame": _FRAME["frame"],
+            "dropped": "epochs of the log that were left out: reason → how many",
+        },
+        {
+            "position_std": Variable(
+                ("epoch", "axis"), "float64", "m", "what the log states of its error: north, east, up; NaN where none"
+            ),
+            "fix": Variable(("epoch",), "int8", "1", "solution, RTKLIB's Q: 1 fix, 2 float …; 0 where not logged"),
+        },
+    ),
+    "echo": Stage(
+        {
+            **_PULSE_GEOMETRY,
+            "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
+            "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
+            "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
+            "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
+        },
+        _FRAME,
+        {
+            "sidelink_delay": Variable(
+                ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
+            ),
+            "sidelink_snr": Variable(("pulse",), "float64", "dB", "of the sidelink per subcarrier; NaN: no lock"),
+            "sidelink_phase": Variable(("pulse",), "float64", "rad", "of the sidelink at mid-band; NaN: no lock"),
+            "sidelink_vector": Variable(
+                ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
+            ),
+        }
+        | {
+            f"{leg}_axes": Variable(
+                ("pulse", "axis", "body"), "float64", "1", f"forward, right, down of the {node}'s body, in `frame`"
+            )
+            for leg, node in (("tx", "transmitter"), ("rx", "receiver"))
+        },
+    ),
+    "profile": Stage(
+        {
+            **_PULSE_GEOMETRY,
+            "profile": Variable(
+                ("pulse", "range"), "complex64", "1", "range profile; times exp(+j2πf_mid·path/c) it is in phase"
+            ),
+            "start": Variable(("pulse",), "float64", "m", "total path (tx → scene → rx) of range sample 0"),
+        },
+        {
+            **_FRAME,
+            "step_m": "total path between range samples, m",
+            "centre_frequency_hz": "f_mid, to which the profile is referenced, Hz",
+            "oversampling": "samples per resolution cell c/B of total path",
+            "window": "weighting over the subcarriers",
+        },
+    ),
+    "refined_track": Stage(
+        {
+            "time": Variable(("knot",), "datetime64[ns]", "", "UTC, transmitter's clock; between knots linear"),
+            "further": Variable(
+                ("pair", "knot"), "float64", "m", "total path by which all echoes of the pair lie further, to be added"
+            ),
+            "correction": Variable(_KNOTS, "float64", "m", "to be added to every point of the node, in `frame`"),
+            "std": Variable(_KNOTS, "float64", "m", "standard deviation of what is left, along each axis of `frame`"),
+            "position": Variable(_KNOTS, "float64", "m", "radar phase centre as the log has it, in `frame`"),
+        },
+        {
+            "frame": _FRAME["frame"],
+            "flags": "edges crossed by the refinement: flag name → what was measured, in one line",
+            "nodes": "names along `node`",
+            "pairs": "names along `pair`: those that have an offset of their own, or none",
+            "decisions": "autofocus, and autofocus_method where it is on: value and reason",
+            "accepted": "whether images are formed with the correction; why: a line; report: what was measured",
+            "left": "what is left of errors of position does to an image: loss_db, shift_m, phase_rad",
+        },
+    ),
+    "terrain": Stage(
+        {"height": Variable(("y", "x"), "float64", "m", "ground at the pixel: above the ellipsoid, or z of the frame")},
+        {"frame": _FRAME["frame"], "terrain": "the DEM: file, datum, geoid grid, lowest and highest ground"},
+    ),
+    "image": Stage(
+        {
+            "image": Variable(
+                ("y", "x"), "complex64", "1", "focused scene, carrier kept; 1 is the echo's amplitude; NaN: not formed"
+            )
+        },
+        {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
+    ),
+    "cube": Stage(
+        {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()},
+        {
+            "fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why",
+            "coherence_window": "pixels along a side of the window that coherence is measured in",
+        },
+    ),
+}
+
+
+def check(dataset: "xr.Dataset", stage: str) -> "xr.Dataset":
+    """Return `dataset` unchanged if it keeps the contract of `stage`.
+
+    Parameters
+    ----------
+    dataset
+        Arrays and attributes to be passed on; dask arrays are not computed.
+    stage
+        A key of `STAGES`.
+
+    Raises
+    ------
+    ContractError
+        Listing every variable or attribute that is missing or has other dimensions or dtype.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> check(xr.Dataset(), "image")
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.ContractError: image: no variable 'image'; no attribute 'frame'; ...
+    """
+    contract = STAGES[stage]
+    wrong = [f"no variable '{name}'" for name in contract.variables if name not in dataset.variables]
+    for name, promise in {**contract.variables, **contract.optional}.items():
+        if name not in dataset.variables:
+            continue
+        array = dataset[name]
+        if array.dims != promise.dims:
+            wrong.append(f"{name} has dims {array.dims}, not {promise.dims}")
+        if array.dtype != np.dtype(promise.dtype):
+            wrong.append(f"{name} is {array.dtype}, not {promise.dtype}")
+    wrong += [f"no attribute '{name}'" for name in contract.attributes if name not in dataset.attrs]
+    if wrong:
+        raise ContractError(f"{stage}: {'; '.join(wrong)}")
+    return dataset

@@ -1,0 +1,246 @@
+"""From a stranger's file to text or to a document, or to the one message that says what is wrong.
+
+Nothing that a file holds is trusted: sizes, depths and aliases are counted before anything is built of them.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from apertura.common.errors import CampaignError, quoted
+
+LARGEST_YAML = 1_000_000
+"""Bytes of a YAML file."""
+
+DEEPEST = 32
+"""Levels of a YAML document."""
+
+MOST_NODES = 100_000
+"""Keys and values of a YAML document, each alias counted as all that it stands for."""
+
+LARGEST_JSON = 64_000_000
+"""Bytes of a JSON file."""
+
+DAMAGED = "Delete it and run the workflow again."
+"""What to do about a result that is not as it was written."""
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_KINDS = ("null", "bool", "int", "float", "str", "timestamp", "seq", "map", "merge")
+_PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in _KINDS}
+_LONGEST_INTEGER = 25
+
+
+def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
+    """Return the UTF-8 text of a file, without its byte-order mark.
+
+    Parameters
+    ----------
+    path
+        The file.
+    expected, remedy
+        What the message says where there is no such file.
+    largest
+        Bytes that it may have.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, is too large or is not UTF-8.
+    """
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
+    with path.open("rb") as stream:
+        data = stream.read(largest + 1)
+    if len(data) > largest:
+        found = f"{path.stat().st_size} bytes"
+        raise CampaignError(found, path, f"a file of at most {largest} bytes", "Is it the right file? Shorten it.")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        found = f"byte {data[error.start]:#04x} in line {line} is not UTF-8"
+        raise CampaignError(found, path, "UTF-8 text", "Save the file as UTF-8.") from error
+
+
+def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
+    """Return the document in a YAML file: plain values, each key once, no more than the limits above.
+
+    Parameters
+    ----------
+    path
+        The file.
+    expected, remedy
+        What the message says where there is no such file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, is not YAML, or is larger or deeper than a document of ours can be.
+    """
+    text = read_text(path, expected=expected, remedy=remedy, largest=LARGEST_YAML)
+    try:
+        _count_nodes(text)
+        root = yaml.compose(text, Loader=_LOADER)
+        if root is None:
+            return None
+        _check_nodes(root)
+        document: object = yaml.constructor.SafeConstructor().construct_document(root)
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
+        raise CampaignError(
+            f"not readable as YAML ({_problem(error)})", where=path, expected="YAML", remedy="Correct the line named."
+        ) from error
+    return document
+
+
+def _problem(error: Exception) -> str:
+    mark: Any = getattr(error, "problem_mark", None)
+    if mark is None:
+        return quoted(" ".join(str(error).split()), 200)[1:-1]
+    return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', '')}"
+
+
+def _wrong(problem: str, at: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+
+
+def _count_nodes(text: str) -> None:
+    """Raise YAMLError where a document is deeper or holds more than the limits, before it is built."""
+    sizes, names, anchors = [0], [""], dict[str, int]()
+    for event in yaml.parse(text, Loader=_LOADER):
+        if isinstance(event, yaml.CollectionStartEvent):
+            sizes.append(1)
+            names.append(event.anchor or "")
+            if len(sizes) > DEEPEST + 1:
+                raise _wrong(f"nested more than {DEEPEST} levels deep", event)
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            size, name = sizes.pop(), names.pop()
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchors:
+                raise _wrong(f"alias {quoted(event.anchor)} stands for nothing before it, or for itself", event)
+            size, name = anchors[event.anchor], ""
+        elif isinstance(event, yaml.ScalarEvent):
+            size, name = 1, event.anchor or ""
+        else:
+            continue
+        if name:
+            anchors[name] = size
+        sizes[-1] += size
+        if sizes[-1] > MOST_NODES:
+            raise _wrong(f"more than {MOST_NODES} values, with all that aliases stand for", event)
+
+
+def _check_nodes(root: yaml.Node) -> None:
+    """Raise YAMLError where a key stands twice, a tag asks for more than plain values, or a number is endless."""
+    seen, waiting = set[int](), [root]
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        if node.tag not in _PLAIN:
+            raise _wrong(f"tag {quoted(node.tag)}, where a plain value belongs", node)
+        if isinstance(node, yaml.ScalarNode):
+            if node.tag.endswith(":int") and len(node.value) > _LONGEST_INTEGER:
+                raise _wrong(f"a number of {len(node.value)} digits", node)
+            continue
+        if isinstance(node, yaml.MappingNode):
+            keys = set[tuple[str, str]]()
+            for key, _ in node.value:
+                if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in keys:
+                    raise _wrong(f"key {quoted(key.value)} a second time", key)
+                keys.add((key.tag, str(key.value) if isinstance(key, yaml.ScalarNode) else ""))
+            waiting += [part for pair in node.value for part in pair]
+        else:
+            waiting += node.value
+
+
+def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    expected, remedy
+        What the message says where there is no such file.
+    largest
+        Bytes that it may have.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there or is no JSON object.
+    """
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
+    text = read_text(path, expected=expected, remedy=DAMAGED, largest=largest)
+    with undamaged(path, expected=expected, remedy=DAMAGED):
+        document = json.loads(text, parse_constant=_refuse_constant)
+        if not isinstance(document, dict):
+            raise TypeError(f"{quoted(document)} instead of an object")
+        return document
+
+
+@contextmanager
+def undamaged(path: Path, *, expected: str, remedy: str) -> Iterator[None]:
+    """Turn what goes wrong while a document is taken apart into one message about its file.
+
+    Parameters
+    ----------
+    path
+        The file that the document was read from.
+    expected, remedy
+        For the message; the remedy of a result is to delete it and run again.
+
+    Raises
+    ------
+    CampaignError
+        For every error that a missing key, a wrong type or a wild number causes in the block.
+    """
+    try:
+        yield
+    except CampaignError:
+        raise
+    except (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError) as error:
+        found = f"key {quoted(error.args[0])} missing" if isinstance(error, KeyError) and error.args else str(error)
+        raise CampaignError(f"damaged ({quoted(found, 200)[1:-1]})", path, expected, remedy) from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+CODECS = frozenset({"bytes", "transpose", "zstd", "gzip", "blosc", "crc32c", "sharding_indexed", "vlen-utf8"})
+"""How chunks of zarr may be packed. Others may do anything: that of numcodecs called pickle runs code out of them."""
+
+
+def other_codec(metadata: object) -> str | None:
+    """Return a codec that a document of zarr, version 3, names wherever it stands and that is none of `CODECS`.
+
+    Parameters
+    ----------
+    metadata
+        A ``zarr.json`` as it was read: of an array, or of a group that repeats those of its arrays.
+
+    Examples
+    --------
+    >>> shard = {"name": "sharding_indexed", "configuration": {"codecs": [{"name": "numcodecs.pickle"}]}}
+    >>> other_codec({"codecs": [shard]}), other_codec({"codecs": ["bytes"]}), other_codec({"codecs": 3})
+    ('numcodecs.pickle', None, '3')
+    """
+    listed = metadata if isinstance(metadata, list) else []
+    for key, value in metadata.items() if isinstance(metadata, Mapping) else enumerate(listed):
+        if key in {"codecs", "index_codecs"}:
+            for codec in value if isinstance(value, list) else [value]:
+                name = codec.get("name") if isinstance(codec, Mapping) else codec
+                if name not in CODECS:
+                    return str(name)
+        found = other_codec(value)
+        if found is not None:
+            return found
+    return None

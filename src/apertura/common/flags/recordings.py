@@ -1,0 +1,156 @@
+"""Flags of recordings, logs, clocks and sidelinks: what stands before an image."""
+
+from apertura.common.flags.flag import Flag
+
+OF_RECORDINGS = {
+    "association_ambiguous": Flag(
+        "how far the tags of the two nodes are apart, in s and in repetition intervals",
+        "time tags are nearly half a repetition interval apart: every pair may be off by one pulse",
+        "frame counters; the nodes' clocks", "core/echo/association_edges.py"),
+    "association_sparse": Flag(
+        "pulses paired, of those of the shorter recording", "less than half of the shorter recording found a partner",
+        "flights and nodes in flights.tsv; missed triggers", "core/echo/association_edges.py"),
+    "frame_counter_conflict": Flag(
+        "pulses dropped", "frame counter and time tags disagree at some pulses, which were dropped",
+        "the counter's bits", "core/echo/association_edges.py"),
+    "time_tags_apart": Flag(
+        "how far the tags of the two nodes are apart, in s and in m flown",
+        "tags of the two nodes are more than 20 ms apart: positions are those of another moment",
+        "the time system of a node", "core/echo/association_edges.py"),
+    "time_tag_outlier": Flag(
+        "pulses left out, of all, and how far their tags are off",
+        "single tags leave the line through all; their pulses were dropped", "triggers of both nodes",
+        "core/echo/association_edges.py"),
+    "pulses_unpaired": Flag(
+        "pulses of the transmitter before and after the other recording",
+        "more than 5 % of the transmitter's pulses lie before or after the other recording",
+        "start and end of recordings; tags late by whole intervals", "core/echo/association_edges.py"),
+    "fix_poor": Flag(
+        "pulses left out, of all, per node", "pulses were dropped where the log's solution is poorer than asked",
+        "the log; nodes.<n>.worst_fix", "pipeline/opening/positions.py"),
+    "alignment_ambiguous": Flag(
+        "the other offset, and how many dB it is worse", "another clock offset focuses nearly as well, or all do",
+        "a reflector (apertura align --point), a flight with changes of speed",
+        "methods/synchronisation/clock_alignment.py"),
+    "alignment_at_edge": Flag(
+        "the offset, and the range of those tried", "the best clock offset lies at an end of those tried",
+        "--search-s", "methods/synchronisation/clock_alignment.py"),
+    "alignment_uncertain": Flag(
+        "how many dB the best offset stands above the others", "the best clock offset hardly stands out",
+        "the place of the point, the path, or which log belongs to the recording",
+        "methods/synchronisation/clock_alignment.py"),
+    "scans_incomplete": Flag(
+        "scans left out, of all",
+        "scans of the radar of which a message is missing or damaged, or in which the file ends, were left out",
+        "the recorder, or the copy", "formats/phase_histories/pulson.py"),
+    "sweep_motion": Flag(
+        "wavelengths of path within a sweep, and m that echoes are off",
+        "antennas move so far while frequency is swept that envelopes of echoes are elsewhere than their phases say",
+        "waveform.sweep_s; fly slower or stand still while sweeping", "core/echo/dechirp.py"),
+    "track_epochs_dropped": Flag(
+        "epochs left out, by reason", "epochs of the log were left out: without a fix, damaged, doubled",
+        "nothing where track_gap does not come with it; else the log", "pipeline/opening/positions.py"),
+    "track_gap": Flag(
+        "pulses left out, of all, and the longest gap",
+        "pulses were dropped in a gap of the log that a spline does not bridge", "the log's rate and losses",
+        "pipeline/opening/positions.py"),
+    "track_outlier": Flag(
+        "pulses left out, outliers found, and the worst of them",
+        "epochs of the log were not used, or pulses dropped at a step of it",
+        "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
+    "track_frozen": Flag(
+        "pulses left out, epochs found, and the worst of them",
+        "epochs of the log repeat the position before them and were not used",
+        "rate of the receiver against that of the log", "pipeline/opening/positions.py"),
+    "track_times": Flag(
+        "m along the flight that positions err by",
+        "times of the log are rounded so that positions err along the flight", "decimals of the log's times",
+        "pipeline/opening/positions.py"),
+    "time_tag_jitter": Flag(
+        "scatter of the tags in s rms, and the repetition interval",
+        "tags scatter so much that single pulses may be paired with a neighbour", "frame counters",
+        "core/echo/association_edges.py"),
+    "association_suspect": Flag(
+        "m by which the sidelink leaves its geometry, and at which pulse",
+        "the sidelink's path does not move as geometry says: pairs or positions are wrong", "tags, logs, lever arms",
+        "core/echo/transfer.py"),
+    "reference_point": Flag(
+        "s and m of path between reception and reference point, of the worst pulse",
+        "CPHD: positions and times of pulses contradict each other, by more than any atmosphere",
+        "who wrote the file; whether the image is sharp", "formats/phase_histories/cphd.py"),
+    "saturated_radar": Flag(
+        "share of the channel's samples at the end stops", "samples at the end stops of the converter", "gain",
+        "core/echo/captures.py"),
+    "saturated_sidelink": Flag(
+        "share of the channel's samples at the end stops", "samples at the end stops of the converter", "gain",
+        "core/echo/captures.py"),
+    "code_unconfirmed": Flag(
+        "dB of the strongest echo above what lies beyond the prefix",
+        "own echoes repeat from pulse to pulse and do not gather inside the prefix, or the listening time",
+        "waveform.codes, waveform.pulse; another transmitter", "core/echo/code_check.py"),
+    "phase_unstable": Flag(
+        "second differences of phase, rad rms, and steadiness of magnitude",
+        "own echoes keep their magnitude from pulse to pulse and not their phase: speckle",
+        "the node's oscillator; which node transmits", "core/echo/phase_check.py"),
+    "wrong_code": Flag(
+        "SNR of the sidelink",
+        "the sidelink is there but carries another code: this image is right without one, the transmitter's own "
+        "is wrong",
+        "waveform.codes", "core/echo/sidelink_state.py"),
+    "sidelink_lost": Flag(
+        "pulses dropped, of all", "pulses without a sidelink were dropped", "blockage, antenna",
+        "core/echo/sidelink_state.py"),
+    "second_arrival": Flag(
+        "dB of the second path beside the direct one, and its delay",
+        "a second path nearly as strong as the direct one", "two transmitters; reflections",
+        "core/echo/sidelink_state.py"),
+    "sidelink_nulls": Flag(
+        "share of subcarriers far below the mean", "parts of the band are attenuated instead of corrected",
+        "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
+    "sidelink_noisy": Flag(
+        "SNR of the sidelink, and the SNR needed", "the SNR is below what the correction needs",
+        "processing.sidelink, auto chooses another", "core/echo/sidelink.py"),
+    "sidelink_echo": Flag(
+        "dB of the echo beside the direct path", "an echo in the sidelink makes ghosts", "processing.sidelink",
+        "core/echo/sidelink.py"),
+    "sidelink_ripple": Flag(
+        "dB of ripple over the band that stay", "ripple of the transmitter stays after the correction",
+        "processing.sidelink", "core/echo/sidelink.py"),
+    "sidelink_ripple_or_echo": Flag(
+        "dB and m of the arrival beside the direct path",
+        "what arrives beside the direct path is an echo, or may be one and not the transmitter's ripple: paths "
+        "and phases may be wrong by what is said",
+        "reflections at the sidelink antenna", "core/echo/second_path.py"),
+    "sidelink_code": Flag(
+        "the correction that was asked for", "the correction needs the code, which the sidelink does not carry",
+        "waveform.codes", "core/echo/sidelink.py"),
+    "waveform_sidelobes": Flag(
+        "dB of sidelobes in range beside every point",
+        "the pulse's filter leaves the band uneven: energy of every point is scattered in range",
+        "waveform.filter, waveform.band_hz", "core/echo/pulse_filter.py"),
+    "waveform_noise": Flag(
+        "dB of signal to noise ratio lost, and the share of the band that lies low",
+        "dividing by the pulse amplifies noise: parts of the band hold little of its energy",
+        "waveform.band_hz; waveform.filter", "core/echo/pulse_filter.py"),
+    "pulse_cut": Flag(
+        "pulses whose captures cut the direct one, of all",
+        "captures of a receiver begin in the direct pulse, or end in it: divide leaves sidelobes and loses energy",
+        "waveform.lead_s; the receiver's trigger", "core/echo/pulse_filter.py"),
+    "clock_ambiguous": Flag(
+        "carrier offset in Hz, and half a subcarrier", "the carrier offset is close to half a subcarrier",
+        "the receiver's oscillator", "core/echo/clock.py"),
+    "clock_uncertain": Flag(
+        "uncertainty of the carrier offset in Hz, and the floor it makes",
+        "the clock is not known well enough for the accuracy asked", "SNR of the sidelink", "core/echo/clock.py"),
+    "clock_unmeasured": Flag(
+        "why it was not measured",
+        "captures are too short to measure the clock, or the pulse does not repeat itself and is not divided out",
+        "length of captures; processing.sidelink", "core/echo/transfer.py"),
+    "calibration_uncertain": Flag(
+        "path offset and its scatter, and what is needed", "the path offset scatters more than an image allows",
+        "the reflector; the track", "core/echo/calibration.py"),
+    "calibration_ambiguous": Flag(
+        "dB and path offset of the second reflector", "a second reflector is nearly as strong", "calibration.search_m",
+        "core/echo/calibration.py"),
+}  # fmt: skip
+"""Name → what it says; see `apertura.common.flags.FLAGS`."""

@@ -1,0 +1,216 @@
+"""Where a product comes from: settings, inputs and code, its own and those of the stages before it."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from apertura import __version__
+from apertura.common.code_imports import PACKAGE, built_from, import_closure, without_description
+
+_READ_BYTES = 1 << 20
+
+
+class Stage(Protocol):
+    """What `apertura.pipeline.steps.stamping.stamp` has stamped: its attributes say where it comes from."""
+
+    @property
+    def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a stage or a file comes from.
+
+    Attributes
+    ----------
+    runspec
+        Every setting that mattered to it and to the stages before it.
+    inputs
+        Role → sha256 of each file read from outside the results.
+    code_sha256
+        Chain of the code hashes of the stages before it and its own.
+    software
+        Name → version of what ran, now and in the stages before it; several where those differ.
+    """
+
+    runspec: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    code_sha256: str
+    software: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        modules: Sequence[str],
+        parents: Sequence[Stage] | Mapping[str, Stage] = (),
+        *,
+        settings: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, str] | None = None,
+        software: Mapping[str, str] | None = None,
+    ) -> "Provenance":
+        """Return what is inherited from `parents`, with what comes new.
+
+        Parameters
+        ----------
+        modules
+            Dotted names; their import closure is the code that ran.
+        parents
+            Stages of one line, whose settings agree; or name → stage of several lines, such as the pairs of a flight,
+            whose settings are kept apart under their names.
+        settings, inputs
+            What of the config mattered, and role → sha256 of files read, now.
+        software
+            Name → version of what runs now.
+
+        Raises
+        ------
+        ValueError
+            If two parents give one role different hashes.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> attributes = {"runspec": '{"window":"hann"}', "inputs": {"codes": "1f"}, "code_sha256": "0"}
+        >>> parent = SimpleNamespace(attrs=attributes)
+        >>> Provenance.of(["apertura.common.errors"], [parent], settings={"engine": "native"}).runspec
+        {'window': 'hann', 'engine': 'native'}
+        >>> Provenance.of(["apertura.common.errors"], {"a-a": parent, "a-b": parent}).runspec
+        {'a-a': {'window': 'hann'}, 'a-b': {'window': 'hann'}}
+        """
+        stages = list(parents.values() if isinstance(parents, Mapping) else parents)
+        specs = [json.loads(stage.attrs["runspec"]) for stage in stages]
+        runspec: dict[str, Any] = {}
+        if isinstance(parents, Mapping):
+            runspec = dict(zip(parents, specs, strict=True))
+        else:
+            for spec in specs:
+                runspec |= spec
+        return cls(
+            runspec | dict(settings or {}),
+            merged(*(stage.attrs["inputs"] for stage in stages), inputs or {}),
+            chained_sha256(code_sha256(*modules), (stage.attrs["code_sha256"] for stage in stages)),
+            joined(*(stage.attrs.get("software", {}) for stage in stages), software or {}),
+        )
+
+    def tags(self) -> dict[str, str]:
+        """Return the tags of a file, name → text."""
+        return {
+            "APERTURA_RUNSPEC": canonical_json(self.runspec),
+            "APERTURA_INPUTS": canonical_json(self.inputs),
+            "APERTURA_CODE_SHA256": self.code_sha256,
+            "APERTURA_SOFTWARE": canonical_json(self.software),
+            "APERTURA_VERSION": __version__,
+        }
+
+
+def canonical_json(value: object) -> str:
+    """Return the one JSON text of `value`: sorted keys, no spaces, no NaN.
+
+    Examples
+    --------
+    >>> canonical_json({"b": 1, "a": [1.5, None]})
+    '{"a":[1.5,null],"b":1}'
+    """
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def sha256_text(text: str) -> str:
+    """Return the sha256 of a text in UTF-8, hex."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sha256_file(path: Path) -> str:
+    """Return the sha256 of a file's bytes, hex.
+
+    Examples
+    --------
+    >>> len(sha256_file(Path(__file__)))
+    64
+    """
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
+    """Return algorithm → hash of a file's bytes, hex; it is read once."""
+    digests = {name: hashlib.new(name) for name in algorithms}
+    with path.open("rb") as stream:
+        while block := stream.read(_READ_BYTES):
+            for digest in digests.values():
+                digest.update(block)
+    return {name: digest.hexdigest() for name, digest in digests.items()}
+
+
+def sha256_tree(folder: Path) -> dict[str, str]:
+    """Return relative path → sha256 of every file below `folder`, sorted by path."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256_file(path) for path in files}
+
+
+def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
+    """Return the hash of the source of `modules` and of every apertura module they import, however deep.
+
+    A stage's hash therefore changes when, and only when, code it can run has changed: not with a comment or a
+    docstring. Compiled code counts by what it was built from: each ``*.sha256`` that was installed beside one of the
+    modules. Of tables whose rows name functions, ``module:function``, `modules` holds those that are called.
+
+    Parameters
+    ----------
+    *modules
+        Dotted names such as ``apertura.pipeline.steps.echo``. Of a module of another package that package counts, and
+        what it imports of apertura.
+    package
+        Folder of apertura's sources.
+
+    Examples
+    --------
+    >>> code_sha256("apertura.common.constants") != code_sha256("apertura.common.errors")
+    True
+    """
+    digest = hashlib.sha256()
+    closure = import_closure(modules, package=package)
+    for name, path in sorted(closure.items()):
+        run = without_description(path.read_text(encoding="utf-8")).split("\n")
+        digest.update("\n".join([f"{name}\0", *(line for line in run if line.strip() != "..."), ""]).encode())
+    for path in built_from(closure, package):
+        digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def chained_sha256(own: str, parents: Iterable[str]) -> str:
+    """Return one hash for a stage's own code and the chains of the stages it stands on."""
+    return hashlib.sha256("\n".join([own, *sorted(parents)]).encode()).hexdigest()
+
+
+def merged(*sources: Mapping[str, str]) -> dict[str, str]:
+    """Return the union of role → hash mappings, sorted by role.
+
+    Raises
+    ------
+    ValueError
+        If two sources give one role different hashes.
+    """
+    union: dict[str, str] = {}
+    for source in sources:
+        for role, digest in source.items():
+            if union.setdefault(role, digest) != digest:
+                raise ValueError(f"{role} has two hashes: {union[role]} and {digest}")
+    return dict(sorted(union.items()))
+
+
+def joined(*sources: Mapping[str, str]) -> dict[str, str]:
+    """Return name → version, all that were found where sources differ.
+
+    Examples
+    --------
+    >>> joined({"numpy": "2.4.6"}, {"numpy": "2.4.6", "zarr": "3.1.6"}, {"zarr": "3.2.0"})
+    {'numpy': '2.4.6', 'zarr': '3.1.6, 3.2.0'}
+    """
+    found: dict[str, set[str]] = {}
+    for source in sources:
+        for name, versions in source.items():
+            found.setdefault(name, set()).update(versions.split(", "))
+    return {name: ", ".join(sorted(versions)) for name, versions in sorted(found.items())}

@@ -1,0 +1,162 @@
+"""Where an antenna looks: the weight of each pulse at each pixel."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector
+
+
+@dataclass(frozen=True)
+class Beam:
+    """A separable pattern about axes that turn with the antenna; zero outside the sampled angles.
+
+    A direction with components (a, b, c) along the axes has azimuth atan2(b, a) and elevation
+    atan2(c, √(a² + b²)); its gain is the product of both patterns, linear between samples.
+
+    Attributes
+    ----------
+    axes
+        (pulse, 3, 3) float64, rows are unit vectors along boresight, growing azimuth and growing elevation,
+        at right angles, in the frame of the pixels.
+    azimuth_rad, elevation_rad
+        (n,) and (m,) float64, equally spaced and growing.
+    azimuth_gain, elevation_gain
+        (n,) and (m,) float64, field (not power) relative to boresight.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, angles are not equally spaced, or axes are no right-angled unit vectors.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Antennas".
+
+    Examples
+    --------
+    >>> angles = np.radians([-20.0, 0.0, 20.0])
+    >>> beam = Beam(np.eye(3)[None], angles, np.array([0.5, 1, 0.5]), angles, np.array([0.5, 1, 0.5]))
+    >>> tilted = np.array([[5.0, 0.0, 0.0], [5.0, 5 * np.tan(np.radians(10)), 0.0], [5.0, 5.0, 0.0]])
+    >>> beam.gain(np.zeros((1, 3)), tilted).round(3)
+    array([[1.  , 0.75, 0.  ]])
+    """
+
+    axes: NDArray[np.float64]
+    azimuth_rad: NDArray[np.float64]
+    azimuth_gain: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    elevation_gain: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.axes.ndim != 3 or self.axes.shape[1:] != (3, 3):
+            raise ValueError(f"{self.axes.shape=}: must be (pulse, 3, 3)")
+        if not np.allclose(self.axes @ self.axes.swapaxes(1, 2), np.eye(3), atol=1e-6):
+            raise ValueError("axes: rows must be unit vectors at right angles")
+        for name, angle, gain in self._patterns():
+            if angle.ndim != 1 or angle.size < 2 or gain.shape != angle.shape:
+                raise ValueError(f"{name}: {angle.shape=} and {gain.shape=} must be equal, with two samples or more")
+            step = (angle[-1] - angle[0]) / (angle.size - 1)
+            if not (step > 0 and np.allclose(np.diff(angle), step, rtol=1e-6, atol=1e-9) and np.isfinite(gain).all()):
+                raise ValueError(f"{name}: angles must grow in equal steps, gains be finite")
+
+    def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
+        """Return the beam over some pulses."""
+        return replace(self, axes=self.axes[pulses])
+
+    def gain(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gain of each pulse towards each pixel.
+
+        Parameters
+        ----------
+        position_m
+            (pulse, 3) float64, phase centres of this antenna, in the frame of the pixels.
+        pixels
+            (pixel, 3) float64, metres.
+
+        Returns
+        -------
+        ndarray
+            (pulse, pixel) float64.
+
+        Raises
+        ------
+        ValueError
+            If there is not one set of axes for each pulse.
+        """
+        angles = self.angles(position_m, pixels)
+        gains = [
+            np.interp(angle, samples, values, left=0, right=0)
+            for angle, (_, samples, values) in zip(angles, self._patterns(), strict=True)
+        ]
+        return np.asarray(gains[0] * gains[1])
+
+    def angles(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; else as `gain`."""
+        if len(self.axes) != len(position_m):
+            raise ValueError(f"{len(self.axes)=}: must be one for each of {len(position_m)} pulses")
+        away = pixels - position_m[:, None]
+        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes), -1, 0)
+        return np.stack([np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))])
+
+    @property
+    def cone_rad(self) -> float:
+        """Half the angle of the narrowest cone about the boresight that holds the pattern."""
+        widest = [float(np.cos(np.abs(angle[[0, -1]]).max())) for angle in (self.azimuth_rad, self.elevation_rad)]
+        return float(np.arccos(widest[0] if widest[0] < 0 else widest[0] * max(widest[1], 0.0)))
+
+    def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+        return [
+            ("azimuth", self.azimuth_rad, self.azimuth_gain),
+            ("elevation", self.elevation_rad, self.elevation_gain),
+        ]
+
+
+@dataclass(frozen=True)
+class Beams:
+    """What weighs pulses: beams of transmitter and receiver, and the sector that pixels are integrated over.
+
+    Attributes
+    ----------
+    transmit, receive
+        Each over the pulses that an image is formed from; None is isotropic.
+    sector
+        Over the same pulses; None integrates all of them.
+
+    Examples
+    --------
+    >>> Beams().weight(Aperture(np.zeros((2, 3)), np.zeros((2, 3))), np.ones((4, 3))).shape
+    (2, 4)
+    """
+
+    transmit: Beam | None = None
+    receive: Beam | None = None
+    sector: Sector | None = None
+
+    def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beams":
+        """Return the beams over some pulses."""
+        transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
+        return Beams(transmit, receive, self.sector and self.sector[pulses])
+
+    @property
+    def antennas(self) -> "Beams | None":
+        """The beams without the sector; None where there are none."""
+        return Beams(self.transmit, self.receive) if self.transmit or self.receive else None
+
+    @classmethod
+    def within(cls, sector: Sector | None, antennas: "Beams | None") -> "Beams | None":
+        """Return the beams of antennas inside a sector; None where there is neither."""
+        beams = antennas or cls()
+        return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
+
+    def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (pulse, pixel) float64, the product of both gains and the sector's; else as `Beam.gain`."""
+        total = np.ones((len(aperture), len(pixels)))
+        for beam, position_m in zip((self.transmit, self.receive), aperture.legs, strict=True):
+            if beam is not None:
+                total *= beam.gain(position_m, pixels)
+        if self.sector is not None:
+            total *= self.sector.weight(aperture, pixels)
+        return total

@@ -1,0 +1,171 @@
+"""What beams make of a scene: how many pulses see each place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.geometry.aperture import Aperture
+
+_PULSES = 1024
+_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """How many pulses see each point of a grid over the scene.
+
+    Attributes
+    ----------
+    seen
+        (place,) int64.
+    pulses
+        How many there are.
+
+    Examples
+    --------
+    >>> Illumination(np.array([0, 20, 40, 60]), 100).line
+    'of 100 pulses a place of the scene is seen by 0 to 60 (median 30); 25 % of places are seen by none'
+    """
+
+    seen: NDArray[np.int64]
+    pulses: int
+
+    @property
+    def unseen(self) -> float:
+        """Share of the places that no pulse sees."""
+        return float((self.seen == 0).mean())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Least, median and most pulses that see a place."""
+        least, median, most = np.quantile(self.seen, [0, 0.5, 1]).round().astype(int)
+        return {"least": int(least), "median": int(median), "most": int(most)}
+
+    @property
+    def line(self) -> str:
+        """All of it in a few words."""
+        least, median, most = self.counts.values()
+        line = f"of {self.pulses} pulses a place of the scene is seen by {least} to {most} (median {median})"
+        return f"{line}; {100 * self.unseen:.0f} % of places are seen by none" if self.unseen else line
+
+
+def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -> Illumination:
+    """Return how many pulses see each place.
+
+    Parameters
+    ----------
+    beams
+        Of every pulse.
+    aperture
+        Of more than 1024 pulses, evenly spread ones stand for all.
+    place_m
+        (place, 3) float64, metres.
+    """
+    some = slice(None, None, -(-len(aperture) // _PULSES))
+    few, beams = aperture[some], beams[some]
+    seen = np.zeros(len(place_m), np.int64)
+    for first in range(0, len(few), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        seen += (beams[part].weight(few[part], place_m) != 0).sum(axis=0)
+    return Illumination(np.rint(seen * (len(aperture) / len(few))).astype(np.int64), len(aperture))
+
+
+def reached(
+    beams: Beams | None,
+    aperture: Aperture,
+    middle_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+    *,
+    pulses: int,
+) -> NDArray[np.bool_]:
+    """Return which blocks of pulses may weigh anything inside balls about places.
+
+    Parameters
+    ----------
+    beams
+        Of every pulse; None reaches everything.
+    aperture
+        Of every pulse.
+    middle_m, radius_m
+        (place, 3) and (place,) float64, metres.
+    pulses
+        Of a block.
+
+    Returns
+    -------
+    ndarray
+        (block, place) bool. Where it is False the weight of each pulse is zero all over the ball.
+    """
+    count = -(-len(aperture) // pulses)
+    lit = np.ones((count, len(middle_m)), bool)
+    if beams is None:
+        return lit
+    for first in range(0, count, _AT_ONCE):
+        part = slice(first * pulses, (first + _AT_ONCE) * pulses)
+        lit[first : first + _AT_ONCE] = _reached(beams[part], aperture[part], middle_m, radius_m, pulses)
+    return lit
+
+
+def _reached(
+    beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
+) -> NDArray[np.bool_]:
+    starts = np.arange(0, len(aperture), pulses)
+    middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
+    block = np.arange(len(aperture)) // pulses
+    middle = aperture[middles]
+    radius = [
+        radius_m + np.maximum.reduceat(np.linalg.norm(leg - there[block], axis=1), starts)[:, None]
+        for leg, there in zip(aperture.legs, middle.legs, strict=True)
+    ]
+    lit = np.ones((len(starts), len(middle_m)), bool)
+    if beams.sector is not None:
+        there = beams.sector[middles]
+        turned = beams.sector.turned(there[block])
+        slack = there.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(turned, starts)[:, None]
+        lit &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
+    for beam, leg, around in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
+        if beam is not None:
+            lit &= _in_pattern(beam, middles, starts, middle_m - leg[:, None], around)
+    return lit
+
+
+def _in_pattern(
+    beam: Beam,
+    middles: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    away_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Return which balls (block, place) may touch the pattern at any pulse of a block: its cone and its elevations."""
+    range_m = np.linalg.norm(away_m, axis=-1)
+    near = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
+    off, above = (np.empty(range_m.shape) for _ in range(2))
+    for axis, angle in ((0, off), (2, above)):
+        each = beam.axes[:, axis]
+        there = each[middles]
+        turned = _angle((each * np.repeat(there, np.diff(starts, append=len(each)), axis=0)).sum(axis=1))
+        near += np.maximum.reduceat(turned, starts)[:, None]
+        angle[:] = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
+    elevation = np.pi / 2 - above
+    inside = (elevation + near > beam.elevation_rad[0]) & (elevation - near < beam.elevation_rad[-1])
+    return np.asarray((radius_m >= range_m) | (inside & (off - near < beam.cone_rad)))
+
+
+def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def decide_antennas(
+    beams: Beams | None, illumination: Illumination | None
+) -> tuple[list[tuple[str, str]], dict[str, str]]:
+    """Return which antennas have beams and what they see, in one line, and the flag `beam_misses`; neither without."""
+    if beams is None or beams.antennas is None or illumination is None:
+        return [], {}
+    looking = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
+    misses = f"{100 * illumination.unseen:.1f} % of the scene is seen by no pulse: its pixels are zero"
+    return (
+        [(", ".join(looking), illumination.line)],
+        {"beam_misses": misses} if illumination.unseen else {},
+    )

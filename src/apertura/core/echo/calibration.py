@@ -1,0 +1,229 @@
+"""What a reflector at a known place tells of a node: its path offset, and its phase from pulse to pulse."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import gammainccinv, gammaincinv
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.echo.captures import AT_ONCE
+
+Complexes = NDArray[np.complex64]
+Floats = NDArray[np.float64]
+
+FALSE_REFLECTOR = 1e-3
+"""Chance that clutter or noise alone passes for a reflector."""
+
+NEEDED_STD_M = 0.02
+"""A path offset less certain than this costs focus where several nodes are added coherently."""
+
+RIVAL_DB = -6.0
+"""A second reflector this strong makes it uncertain which of them is the known one."""
+
+_GROUPS = 16
+_OVERSAMPLING = 8
+
+
+class Pulses(Protocol):
+    """(pulse, subcarrier) complex64: an array, or what reads slices of one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, pulses: slice, /) -> Complexes: ...
+
+
+@dataclass(frozen=True)
+class PathOffset:
+    """Electrical path of a receiving node beyond geometry.
+
+    Attributes
+    ----------
+    offset_m
+        Metres of total path. Monostatic: `path_offset_m.radar`. Bistatic: radar minus sidelink, the only
+        combination that echoes divided by the sidelink contain.
+    std_m
+        Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite below 16 pulses.
+    contrast_db
+        Reflector above what surrounds it.
+    pulses
+        How many it rests on.
+    flags
+        Edge crossed → what was measured, in one line.
+    """
+
+    offset_m: float
+    std_m: float
+    contrast_db: float
+    pulses: int
+    flags: Mapping[str, str]
+
+
+def estimate_path_offset(
+    transfer: Pulses,
+    frequency_hz: Floats,
+    *,
+    path_m: Floats,
+    search_m: float = 10.0,
+    where: str = "calibration flight",
+) -> PathOffset:
+    """Return the path offset under which a reflector appears where it stands.
+
+    Parameters
+    ----------
+    transfer
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πfτ), absolute delay, no path offset taken out. An array, or what
+        reads slices of one from a file.
+    frequency_hz
+        (subcarrier,) float64, RF, equally spaced, ascending.
+    path_m
+        (pulse,) float64, predicted total path: tx → reflector → rx, less the sidelink's in a bistatic pair.
+    search_m
+        Offsets of either sign up to this are considered, metres.
+    where
+        What to call the flight in errors.
+
+    Raises
+    ------
+    CampaignError
+        If nothing stands out within `search_m`.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Calibration". Pulses are added coherently within a sixteenth of the flight,
+    over which errors of the track are constant, and in power beyond.
+
+    Examples
+    --------
+    >>> frequency, path = 1e9 + 1e6 * np.arange(200), np.hypot(20, np.linspace(-5, 5, 64)) * 2
+    >>> echo = np.exp(-2j * np.pi * frequency * (path[:, None] + 1.374) / SPEED_OF_LIGHT_M_S)
+    >>> calibration = estimate_path_offset(echo.astype(np.complex64), frequency, path_m=path)
+    >>> round(calibration.offset_m, 3), calibration.std_m < 0.001
+    (1.374, True)
+    """
+    groups = _aligned_groups(transfer, frequency_hz, path_m)
+    offset_m, power = _offset_profile(groups, frequency_hz, search_m)
+    peak = int(np.argmax(power))
+    surroundings = float(np.median(power)) * len(groups) / float(gammaincinv(len(groups), 0.5))  # mean of clutter
+    _require_visible(power, peak, surroundings, len(groups), search_m, where)
+    parts = _refine(groups, frequency_hz, offset_m[peak])
+    mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
+    contrast_db = 10 * float(np.log10(power[peak] / max(surroundings, 1e-30)))
+    flags = {}
+    if std_m > NEEDED_STD_M:
+        flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
+    rival_db, rival_m = _rival(offset_m, power, peak, frequency_hz)
+    if rival_db > RIVAL_DB:
+        flags["calibration_ambiguous"] = (
+            f"a second reflector {rival_db:.1f} dB beside the first, which is at {mean_m:.2f} m, at {rival_m:.2f} m"
+        )
+    return PathOffset(mean_m, std_m, contrast_db, len(transfer), flags)
+
+
+def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats) -> NDArray[np.complex128]:
+    """Return the echo (pulse,) complex128 of a reflector: its phase is constant if path and clocks are right.
+
+    Parameters
+    ----------
+    transfer, frequency_hz
+        As for `estimate_path_offset`.
+    path_m
+        (pulse,) float64, total path of the reflector, offsets included; constant in a static recording.
+
+    Examples
+    --------
+    >>> frequency, path = 1e9 + 1e6 * np.arange(200), np.array([40.0, 41.0])
+    >>> echo = 2 * np.exp(-2j * np.pi * frequency * path[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+    >>> reflector_history(echo, frequency, path_m=path).round(4) + 0.0
+    array([2.+0.j, 2.+0.j])
+    """
+    parts = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
+    return np.concatenate([_aligned(transfer[part], frequency_hz, path_m[part]).mean(axis=1) for part in parts])
+
+
+def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
+    turns = np.outer(path_m / SPEED_OF_LIGHT_M_S, frequency_hz)
+    return np.asarray(transfer * np.exp(2j * np.pi * (turns % 1.0)))
+
+
+def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
+    """Return (group, subcarrier): pulses turned to the predicted path, added within each part of the flight."""
+    taper = np.hanning(frequency_hz.size + 2)[1:-1]
+    edges = np.linspace(0, len(transfer), min(_GROUPS, len(transfer)) + 1).astype(int)
+    return np.array([_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in pairwise(edges)])
+
+
+def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
+    """Return (subcarrier,) the mean of pulses first to last, turned to the predicted path, a block at a time."""
+    total = np.zeros(len(frequency_hz), np.complex128)
+    for start in range(first, last, AT_ONCE):
+        part = slice(start, min(start + AT_ONCE, last))
+        total += _aligned(transfer[part], frequency_hz, path_m[part]).sum(axis=0)
+    return total / (last - first)
+
+
+def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search_m: float) -> tuple[Floats, Floats]:
+    """Return offsets within the search and the mean power of the groups there."""
+    length = fft.next_fast_len(_OVERSAMPLING * frequency_hz.size)
+    spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (frequency_hz.size - 1)
+    step_m = SPEED_OF_LIGHT_M_S / (spacing_hz * length)
+    reach = min(int(search_m / step_m), length // 2 - 1)
+    power = (np.abs(fft.ifft(groups, length, axis=1)) ** 2).mean(0)
+    cells = np.arange(-reach, reach + 1)
+    return cells * step_m, np.asarray(power[cells])
+
+
+def _require_visible(power: Floats, peak: int, surroundings: float, groups: int, search_m: float, where: str) -> None:
+    """Raise unless the peak is higher than the highest of as many cells of clutter would be, and inside."""
+    cells = power.size / _OVERSAMPLING
+    highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
+    ratio_db, needed_db = (
+        10 * float(np.log10(max(r, 1e-30))) for r in (power[peak] / max(surroundings, 1e-30), highest)
+    )
+    inside = 0 < peak < power.size - 1
+    if ratio_db > needed_db and inside:
+        return
+    place = "" if inside else " and lies at the edge of the search"
+    raise CampaignError(
+        f"no reflector: the highest echo within {search_m:g} m of its predicted path is {ratio_db:.1f} dB above "
+        f"the rest{place}",
+        where=where,
+        expected=f"more than {needed_db:.1f} dB, inside",
+        remedy="Check the reflector's coordinates and that it was in the beam, or widen the search.",
+    )
+
+
+def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float) -> Floats:
+    """Return (group,) offsets, metres: Newton's steps on each group's power, within half a cell of the start."""
+    cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
+    turn = 2j * np.pi * (frequency_hz - frequency_hz.mean()) / SPEED_OF_LIGHT_M_S
+    offset = np.full(len(groups), start_m)
+    for _ in range(8):
+        aligned = groups * np.exp(np.outer(offset, turn))
+        total, first, second = aligned.sum(1), aligned @ turn, aligned @ turn**2
+        slope = 2 * np.real(total.conj() * first)
+        curvature = 2 * (np.abs(first) ** 2 + np.real(total.conj() * second))
+        step = np.clip(-slope / np.where(curvature < 0, curvature, -np.inf), -cell_m / 8, cell_m / 8)
+        offset = np.clip(offset + step, start_m - cell_m / 2, start_m + cell_m / 2)
+    return offset
+
+
+def _deviation_of_mean(parts: Floats) -> float:
+    """Return the standard deviation of the mean of parts whose neighbours may share errors of the track."""
+    if len(parts) < _GROUPS:
+        return np.inf
+    quarters = parts.reshape(4, -1).mean(1)
+    return float(max(np.std(some, ddof=1) / np.sqrt(len(some)) for some in (parts, quarters)))
+
+
+def _rival(offset_m: Floats, power: Floats, peak: int, frequency_hz: Floats) -> tuple[float, float]:
+    """Return level (dB) and offset of the strongest echo beyond the main lobe, 2·c/B to either side."""
+    cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
+    beside = np.where(np.abs(offset_m - offset_m[peak]) > 2.5 * cell_m, power, 0.0)
+    second = int(np.argmax(beside))
+    return 10 * float(np.log10(max(beside[second] / power[peak], 1e-30))), float(offset_m[second])

@@ -1,0 +1,248 @@
+"""The receiver's clock against the transmitter's: measured on the sidelink, corrected in the samples where it matters.
+
+The symbol repeats itself after 1/Δf and lasts longer than that, so the beginning of a capture comes again at its
+end: turned by the carrier offset, and slid by the sampling offset. No code and no delay need be known.
+A pulse that is sent once repeats nothing: its clock is not measured, and division needs none (docs/theory/waveforms.md,
+"Clock").
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.core.echo.captures import AT_ONCE, spread
+from apertura.core.echo.demodulate import Numerology
+from apertura.core.echo.resampling import Complexes, Floats
+
+SIGMAS = 3.0
+"""A clock that is not this many standard deviations off is one that noise suggests; it is left alone."""
+
+AMBIGUOUS_SHARE = 0.4
+"""Offsets beyond this share of Δf could as well be of the other sign: half of Δf is where they wrap."""
+
+GROUPS = 16
+"""Parts of the flight whose scatter tells how well the clock is known."""
+
+_SMALLEST_REPEAT = 32
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """How fast the receiver's oscillators run.
+
+    Attributes
+    ----------
+    cfo_hz
+        Receiver's oscillator minus transmitter's at the middle of the flight, hertz.
+    cfo_slope_hz
+        Its growth per pulse, hertz; 0 where it is not significant.
+    sfo_ppm
+        Receiver's sampling rate above nominal, parts per million of the transmitter's.
+    cfo_std_hz, sfo_std_ppm
+        Standard deviations, from the scatter over the flight; that of `sfo_ppm` for its own measurement.
+    one_clock
+        Whether `sfo_ppm` was taken from the carrier, since its own measurement does not contradict.
+    """
+
+    cfo_hz: float
+    cfo_slope_hz: float
+    sfo_ppm: float
+    cfo_std_hz: float
+    sfo_std_ppm: float
+    one_clock: bool
+
+    def ppm(self, numerology: Numerology) -> tuple[float, float | None]:
+        """Return how fast the oscillator runs and the standard deviation of that, ppm; None where unknown."""
+        std_ppm = self.cfo_std_hz / numerology.carrier_hz * 1e6
+        return self.cfo_hz / numerology.carrier_hz * 1e6, std_ppm if np.isfinite(std_ppm) else None
+
+    def cfo_of_pulses_hz(self, pulses: int) -> Floats:
+        """Return (pulse,) float64, the carrier offset in each pulse of the flight, hertz."""
+        return np.asarray(self.cfo_hz + self.cfo_slope_hz * (np.arange(pulses) - (pulses - 1) / 2))
+
+
+@dataclass(frozen=True)
+class ClockDecision:
+    """Whether to correct, why, and the level of the floor if left alone."""
+
+    correct: bool
+    reason: str
+    floor_db: float
+    flags: dict[str, str]
+
+
+def estimate_clock(sidelink: Complexes, numerology: Numerology) -> ClockOffset:
+    """Measure the clock of a receiver on the (pulse, sample) complex64 sidelink of a whole flight; as `clock_of`.
+
+    Examples
+    --------
+    >>> numerology = Numerology(1e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
+    >>> tones = np.exp(2j * np.pi * np.outer(np.arange(32), np.arange(120) / 64) + 1j * np.arange(32)[:, None] ** 2)
+    >>> turning = tones.sum(0) * np.exp(-2j * np.pi * 5e3 * np.arange(120) / 64e6)
+    >>> clock = estimate_clock(np.tile(turning, (4, 1)).astype(np.complex64), numerology)
+    >>> round(clock.cfo_hz), round(clock.sfo_ppm), clock.one_clock
+    (5000, 0, False)
+    """
+    groups = spread(len(sidelink), groups=GROUPS, each=len(sidelink))
+    return clock_of((sidelink[some] for some in groups), numerology, pulses=len(sidelink))
+
+
+def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int) -> ClockOffset:
+    """Measure the clock of a receiver on its sidelink.
+
+    Parameters
+    ----------
+    groups
+        (pulse, sample) complex64 each, captures from the start of the cyclic prefix to the end of the symbol
+        (T_cp + T), no longer, amid equal parts of the flight; pulses without signal do no harm.
+    numerology
+        Of the symbol.
+    pulses
+        Of the whole flight.
+
+    Raises
+    ------
+    ValueError
+        If captures hold too little of the repetition, or what was sent does not repeat itself.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Clock". Unambiguous for |CFO| < Δf/2.
+    """
+    if not numerology.repeats:
+        raise ValueError("a pulse that is sent once repeats nothing: not measured, and division needs no clock")
+    period_s = 1 / numerology.spacing_hz
+    frequency_hz, parts = _repetition(groups, numerology)
+    phase, slope, centre_hz = _phase_and_slope(parts.sum(0), frequency_hz, start=(0.0, 0.0))
+    fits = np.array([_phase_and_slope(part, frequency_hz, start=(phase, slope))[:2] for part in parts])
+    growth, phase_std = _line(fits[:, 0])
+    ppm = 1e6 / (2 * np.pi * period_s)
+    sfo_ppm, sfo_std_ppm = -slope * ppm, _line(fits[:, 1])[1] * ppm
+    joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock feeds both
+    one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
+    sfo_ppm = joint_ppm if one_clock else sfo_ppm
+    return ClockOffset(
+        cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
+        cfo_slope_hz=-growth * len(parts) / (2 * np.pi * period_s * pulses),
+        sfo_ppm=sfo_ppm,
+        cfo_std_hz=phase_std / (2 * np.pi * period_s),
+        sfo_std_ppm=sfo_std_ppm,
+        one_clock=bool(one_clock),
+    )
+
+
+def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: float) -> ClockDecision:
+    """Say whether a clock needs correction for images whose errors may reach `accuracy_db` below the peak.
+
+    Examples
+    --------
+    >>> numerology = Numerology(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
+    >>> for ppm in (0.5, 8.0):
+    ...     clock = ClockOffset(1200 * ppm, 0.0, ppm, cfo_std_hz=1.0, sfo_std_ppm=0.1, one_clock=True)
+    ...     print(decide_clock(clock, numerology, accuracy_db=-60).reason)
+    clock 0.50 ± 0.00 ppm fast (CFO 600 Hz, SFO 0.50 ppm): floor -71.0 dB, -60 dB asked: left alone
+    clock 8.00 ± 0.00 ppm fast (CFO 9600 Hz, SFO 8.00 ppm): floor -47.0 dB, -60 dB asked: samples corrected
+    """
+    floor_db = interference_floor_db(offset.cfo_hz, offset.sfo_ppm, numerology)
+    ppm, std_ppm = offset.ppm(numerology)
+    left_db = 0.0
+    if std_ppm is not None:
+        sfo_std_ppm = std_ppm if offset.one_clock else offset.sfo_std_ppm
+        left_db = interference_floor_db(offset.cfo_std_hz, sfo_std_ppm, numerology)
+    significant = abs(offset.cfo_hz) > SIGMAS * offset.cfo_std_hz or (
+        not offset.one_clock and abs(offset.sfo_ppm) > SIGMAS * offset.sfo_std_ppm
+    )
+    correct = floor_db > accuracy_db and significant
+    what = "samples corrected" if correct else "left alone" if significant else f"left alone: below {SIGMAS:g} σ"
+    reason = (
+        f"clock {ppm:.2f} ± {0 if std_ppm is None else std_ppm:.2f} ppm fast (CFO {offset.cfo_hz:.0f} Hz, "
+        f"SFO {offset.sfo_ppm:.2f} ppm): floor {floor_db:.1f} dB, {accuracy_db:g} dB asked: {what}"
+    )
+    flags = {}
+    if abs(offset.cfo_hz) > AMBIGUOUS_SHARE * numerology.spacing_hz:
+        flags["clock_ambiguous"] = (
+            f"CFO {offset.cfo_hz:+.0f} Hz is close to half a subcarrier ({numerology.spacing_hz / 2:.0f} Hz): "
+            "it may be another by whole subcarriers"
+        )
+    if left_db > accuracy_db:
+        flags["clock_uncertain"] = (
+            f"clock known to {offset.cfo_std_hz:.0f} Hz only: floor of {left_db:.1f} dB, {accuracy_db:g} dB asked"
+        )
+    return ClockDecision(correct, reason, floor_db, flags)
+
+
+def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology) -> float:
+    """Return the floor that a clock leaves in a range profile, dB below its peak.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Clock": a tone δ bins off keeps sinc²(δ) of its power, the rest falls on
+    the other subcarriers, in the echo as in the sidelink, and compression spreads it over N cells.
+
+    Examples
+    --------
+    >>> numerology = Numerology(1.2e9, 1.024e9, np.arange(4096), prefix_samples=3200, dft_samples=10240)
+    >>> round(interference_floor_db(10e3, 0.0, numerology), 1)
+    -48.0
+    """
+    off_bin = (cfo_hz + numerology.numbers * numerology.spacing_hz * sfo_ppm * 1e-6) / numerology.spacing_hz
+    lost = float(np.mean(1 - np.sinc(off_bin) ** 2))
+    return float(10 * np.log10(max(2 * lost / numerology.numbers.size, 1e-30)))
+
+
+def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
+    """Return occupied frequencies and, per group of pulses, the cross-spectrum of the end with its first copy."""
+    crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
+    size = crosses[0].size
+    lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
+    frequency_hz = (
+        fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
+    ) % numerology.sample_rate_hz + lowest_hz
+    occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
+    return frequency_hz[occupied], np.array(crosses)[:, occupied]
+
+
+def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.complex128]:
+    period, prefix, count = numerology.dft_samples, numerology.prefix_samples, sidelink.shape[1]
+    start = prefix if count - period - prefix >= prefix // 2 else prefix // 2
+    length = count - period - start
+    if length < _SMALLEST_REPEAT:
+        raise ValueError(f"captures of {count} samples repeat only {length} of them; {_SMALLEST_REPEAT} are needed")
+    size = fft.next_fast_len(length)
+    cross = np.zeros(size, np.complex128)
+    for first in range(0, len(sidelink), AT_ONCE):
+        block = sidelink[first : first + AT_ONCE].astype(np.complex128)
+        early = fft.fft(block[:, start : start + length], size, axis=1)
+        late = fft.fft(block[:, start + period : start + period + length], size, axis=1)
+        cross += (late * early.conj()).sum(0)
+    return cross
+
+
+def _phase_and_slope(
+    cross: NDArray[np.complex128], frequency_hz: Floats, *, start: tuple[float, float]
+) -> tuple[float, float, float]:
+    """Return phase (rad) at the power-weighted mean frequency, slope (rad/Hz) and that frequency."""
+    weight = np.abs(cross)
+    centre_hz = float(np.average(frequency_hz, weights=weight))
+    off_hz = frequency_hz - centre_hz
+    phase, slope = start
+    for _ in range(6):
+        turned = cross * np.exp(-1j * (phase + slope * off_hz))
+        slope += float((off_hz * turned.imag).sum() / (off_hz**2 * turned.real).sum())
+        phase += float(np.angle(turned.sum()))
+    return phase, slope, centre_hz
+
+
+def _line(values: Floats) -> tuple[float, float]:
+    """Return growth per step, 0 unless four times its deviation, and the standard deviation of the mean."""
+    count = values.size
+    if count < 3:
+        return 0.0, np.inf
+    step = np.arange(count) - (count - 1) / 2
+    growth = float(step @ values / (step @ step))
+    scatter = float(np.sqrt(((values - values.mean() - growth * step) ** 2).sum() / (count - 2)))
+    growth_std = scatter / float(np.sqrt(step @ step))
+    return (growth if abs(growth) > 4 * growth_std else 0.0), scatter / float(np.sqrt(count))

@@ -1,0 +1,138 @@
+"""Captured symbols to transfer functions: a DFT over one period of 1/Δf, and code removal.
+
+A subcarrier n of the symbol s(t) = Σ c_n exp(j2πnΔf(t-T_cp)) that travelled a path of delay τ arrives as
+c_n·exp(-j2π(f_c+nΔf)τ), as long as τ stays inside the cyclic prefix (docs/theory.md, eq. 1 and 2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.core.echo.phasors import phasors, turned
+
+_PULSES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Numerology:
+    """How a receiver samples what was sent: an OFDM symbol that repeats itself, or a pulse that is sent once.
+
+    Attributes
+    ----------
+    carrier_hz, sample_rate_hz
+        Nominal RF frequency at baseband zero and complex samples per second.
+    numbers
+        (subcarrier,) int64, the n of each subcarrier in multiples of Δf from the carrier, ascending.
+    prefix_samples
+        T_cp·f_s, where the DFT window begins.
+    dft_samples
+        f_s/Δf, the length of the DFT window.
+    longest_samples
+        Of a pulse sent once: delay up to which captures hold its echoes whole. None: a symbol, which repeats itself
+        after 1/Δf, and whose echoes are held up to the prefix.
+    """
+
+    carrier_hz: float
+    sample_rate_hz: float
+    numbers: NDArray[np.int64]
+    prefix_samples: int
+    dft_samples: int
+    longest_samples: int | None = None
+
+    @property
+    def spacing_hz(self) -> float:
+        """Δf."""
+        return self.sample_rate_hz / self.dft_samples
+
+    @property
+    def middle_hz(self) -> float:
+        """Baseband frequency at the middle of the occupied band."""
+        return float(self.numbers[0] + self.numbers[-1]) / 2 * self.spacing_hz
+
+    @property
+    def frequency_hz(self) -> NDArray[np.float64]:
+        """(subcarrier,) float64, RF frequency of each subcarrier."""
+        return np.asarray(self.carrier_hz + self.numbers * self.spacing_hz, np.float64)
+
+    @property
+    def repeats(self) -> bool:
+        """Whether what was sent comes again after 1/Δf."""
+        return self.longest_samples is None
+
+    @property
+    def delay_cells(self) -> int:
+        """Delay cells of 1/B in which echoes are held whole: those inside the cyclic prefix, of a symbol."""
+        samples = self.prefix_samples if self.longest_samples is None else self.longest_samples
+        return round(samples * self.numbers.size / self.dft_samples)
+
+
+def subcarrier_numbers(count: int, *, carrier_is: str) -> NDArray[np.int64]:
+    """Return n of each subcarrier, ascending: 0…N-1 for band_start, -N/2…N/2-1 for band_centre.
+
+    Examples
+    --------
+    >>> subcarrier_numbers(4, carrier_is="band_centre")
+    array([-2, -1,  0,  1])
+    """
+    return np.arange(count) - (count // 2 if carrier_is == "band_centre" else 0)
+
+
+def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArray[np.complex64]:
+    """Return the received code symbols c_n·H_n, (pulse, subcarrier) complex64 in ADC counts per subcarrier.
+
+    Parameters
+    ----------
+    captures
+        (pulse, sample) complex64 ADC counts; sample 0 is the start of the cyclic prefix.
+    numerology
+        Of the symbol.
+
+    Raises
+    ------
+    ValueError
+        If a capture is shorter than prefix and DFT window together.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 2; the DFT length is f_s/Δf, not N.
+
+    Examples
+    --------
+    >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(16) / 16).astype(np.complex64)
+    >>> symbols = demodulate(tone[None], Numerology(1e9, 16e6, np.arange(8), prefix_samples=0, dft_samples=16))
+    >>> abs(symbols[0]).round().astype(int).tolist()
+    [0, 0, 0, 1000, 0, 0, 0, 0]
+    """
+    pulses, samples = captures.shape
+    start, stop = numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples
+    if samples < stop:
+        raise ValueError(f"{samples=}: a capture needs {stop} (prefix and DFT window)")
+    symbols = np.empty((pulses, numerology.numbers.size), np.complex64)
+    count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
+    below = min(count, numerology.dft_samples - lowest)  # of those from `lowest` on; the others lie at the beginning
+    for first in range(0, pulses, _PULSES_AT_ONCE):
+        spectrum = fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
+        rows = slice(first, first + len(spectrum))
+        symbols[rows, :below] = spectrum[:, lowest : lowest + below]
+        symbols[rows, below:] = spectrum[:, : count - below]
+    return symbols
+
+
+def remove_path(
+    transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
+) -> NDArray[np.complex64]:
+    """Return (pulse, subcarrier) `transfer` with a delay per pulse taken off every echo: times exp(+j2πf·delay).
+
+    Frequencies (subcarrier,) ascend in equal steps.
+
+    Examples
+    --------
+    >>> remove_path(np.ones((1, 2), np.complex64), np.array([1e9, 2e9]), delay_s=np.array([0.25e-9])).round(6)
+    array([[ 0.+1.j, -1.+0.j]], dtype=complex64)
+    """
+    count = len(frequency_hz)
+    spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
+    along = phasors(delay_s * spacing_hz, count)
+    return transfer * along * turned(np.ones(1), delay_s * frequency_hz[0])[:, None]

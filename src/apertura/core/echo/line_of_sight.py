@@ -1,0 +1,143 @@
+"""The direct path inside a sidelink: its delay, phase and amplitude in every pulse, and whether it is there at all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.core.echo.phasors import phasors
+
+Complexes = NDArray[np.complex64]
+Floats = NDArray[np.float64]
+
+LOCK_FALSE_ALARM = 1e-3
+"""Chance that a pulse of pure noise passes for one with a sidelink."""
+
+_PULSES_AT_ONCE = 64
+_GROUPS = 32
+_NOISE_CELLS = 256  # whose median is good to 0.4 dB
+
+
+@dataclass(frozen=True)
+class LineOfSight:
+    """The strongest path of each pulse, S_n = amplitude·exp(j(phase - 2π·n·delay/N)) with n counted from mid-band.
+
+    Attributes
+    ----------
+    delay_cells
+        (pulse,) float64, delay in cells of 1/B, -N/2…N/2.
+    phase_rad
+        (pulse,) float64, phase at the middle of the band.
+    amplitude
+        (pulse,) float64, per subcarrier, in the units of the sidelink.
+    noise_power
+        (pulse,) float64, per subcarrier.
+    locked
+        (pulse,) bool, whether the path stands out of the noise.
+    """
+
+    delay_cells: Floats
+    phase_rad: Floats
+    amplitude: Floats
+    noise_power: Floats
+    locked: NDArray[np.bool_]
+
+    def select(self, pulses: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "LineOfSight":
+        """Return the path of some pulses."""
+        return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
+
+
+def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
+    """Fit one path to each pulse of a sidelink, (pulse, subcarrier) complex64, by maximum likelihood.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Two parameters of a pulse" and "Lock".
+
+    Examples
+    --------
+    >>> centred = np.arange(64) - 31.5
+    >>> path = fit_line_of_sight(3 * np.exp(1j * (0.5 - 2 * np.pi * centred * 7.3 / 64))[None].astype(np.complex64))
+    >>> path.delay_cells.round(4), path.phase_rad.round(4), path.amplitude.round(4), path.locked
+    (array([7.3]), array([0.5]), array([3.]), array([ True]))
+    """
+    fitted = [fit_block(sidelink[i : i + _PULSES_AT_ONCE])[0] for i in range(0, len(sidelink), _PULSES_AT_ONCE)]
+    return joined(fitted)
+
+
+def joined(paths: Sequence[LineOfSight]) -> LineOfSight:
+    """Return the paths of pulses that follow each other."""
+    return LineOfSight(*(np.concatenate([getattr(one, field.name) for one in paths]) for field in fields(LineOfSight)))
+
+
+def phasor(path: LineOfSight, subcarriers: int) -> Complexes:
+    """Return (pulse, subcarrier) complex64 exp(j(phase - 2π·n·delay/N)) of the fitted paths."""
+    along = phasors(-path.delay_cells / subcarriers, subcarriers, first=-(subcarriers - 1) / 2)
+    return np.asarray(along * np.exp(1j * path.phase_rad)[:, None], np.complex64)
+
+
+def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
+    """Fit one path to each of a few pulses; return also their profile, aligned: the path lies in cell 0.
+
+    Parameters
+    ----------
+    sidelink
+        (pulse, subcarrier) complex64.
+
+    Returns
+    -------
+    tuple
+        The paths, and (pulse, cell) complex64.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Two parameters of a pulse". From the highest half cell, Newton's steps on sums
+    over groups of neighbouring subcarriers, within which a quarter of a cell turns the phase by less than 0.05 rad.
+    """
+    subcarriers = sidelink.shape[1]
+    coarse = np.abs(fft.ifft(sidelink, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
+    delay = np.where(coarse >= subcarriers / 2, coarse - subcarriers, coarse)
+    edges = np.unique(np.linspace(0, subcarriers, _GROUPS + 1).astype(int))
+    sums = np.add.reduceat(_aligned(sidelink, delay), edges[:-1], axis=1).astype(np.complex128)
+    delay = delay + _residual_cells(sums, (edges[:-1] + edges[1:] - subcarriers) / 2, subcarriers)
+    profile = fft.ifft(_aligned(sidelink, delay), axis=1)
+    direct = profile[:, 0].astype(np.complex128)
+    some = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
+    power = np.square(some.real) + np.square(some.imag)
+    # the median of an exponential variable is ln 2 of its mean; few strong cells (echoes, ripple) do not move it
+    noise = np.median(power, axis=1).astype(np.float64) / np.log(2) * subcarriers
+    amplitude = np.abs(direct)
+    locked = amplitude**2 > _lock_threshold(subcarriers) * noise / subcarriers
+    return LineOfSight(delay, np.angle(direct), amplitude, noise, locked), profile
+
+
+def _aligned(sidelink: Complexes, delay_cells: Floats) -> Complexes:
+    subcarriers = sidelink.shape[1]
+    return sidelink * phasors(delay_cells / subcarriers, subcarriers, first=-(subcarriers - 1) / 2)
+
+
+def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: int) -> Floats:
+    """Return (pulse,) the delay that is left in (pulse, group) sums, whose groups are centred on `number`."""
+    delay = np.zeros(len(sums))
+    for _ in range(4):  # Newton's steps on the power |Σ S_n exp(+j2πn·delay/N)|²
+        aligned = sums * np.exp(2j * np.pi / subcarriers * np.outer(delay, number))
+        total, first, second = aligned.sum(1), (aligned @ number), (aligned @ number**2)
+        slope = -2 * np.imag(total.conj() * first)
+        curvature = 2 * (np.abs(first) ** 2 - np.real(total.conj() * second))
+        step = -slope / np.where(curvature < 0, curvature, -np.inf) * subcarriers / (2 * np.pi)
+        delay = delay + np.clip(step, -0.25, 0.25)
+    return delay
+
+
+def _lock_threshold(subcarriers: int) -> float:
+    """Return how far above the mean noise of a delay cell the highest of pure noise rises once in 1/P_fa pulses.
+
+    |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per 1/B, and there are N of these.
+    """
+    alone = float(np.log(subcarriers / LOCK_FALSE_ALARM))
+    threshold = alone
+    for _ in range(5):
+        threshold = alone + 0.5 * float(np.log(np.pi * threshold / 3))
+    return threshold

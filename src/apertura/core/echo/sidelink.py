@@ -1,0 +1,214 @@
+"""Taking out of an echo what the direct path went through too: clocks, phases, timing and transmit ripple.
+
+Every method replaces the radar's transfer function R by R·A/S, S the sidelink or a model of it and A its amplitude
+in that pulse, so that images stay in the units of the radar channel, comparable with monostatic ones, and a
+sidelink that fades does not amplify its pulse. To add a method: one function, one row in `METHODS`, its edges.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.core.echo.line_of_sight import Complexes, LineOfSight, fit_line_of_sight, phasor
+from apertura.core.echo.sidelink_arrivals import GATE_CELLS
+from apertura.core.echo.sidelink_state import ECHO_DB, NULL_DB, SidelinkState, measure
+
+__all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
+
+DIVIDE_SNR_DB = 10.0
+WIENER_SNR_DB = 6.0
+RIPPLE_DB = 0.5
+FIT_SNR_DB = 13.4
+"""Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
+
+_PULSES_AT_ONCE = 64
+_Inverse = Callable[[Complexes, LineOfSight], Complexes]
+
+
+def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+    """Return R·A/S, (pulse, subcarrier) complex64 in the units of `radar`.
+
+    Where |S| falls more than 20 dB below A, in a spectral null or by noise, S is taken as 20 dB below A: a null
+    attenuates its subcarrier, it never amplifies one more than tenfold.
+
+    Parameters
+    ----------
+    radar, sidelink
+        (pulse, subcarrier) complex64 of the same captures.
+    path
+        The sidelink's direct path, where `measure` has fitted it already.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Corrections". The only method exact for any transmit ripple, and for a
+    wrong code.
+
+    Examples
+    --------
+    >>> sidelink = 2 * np.exp(1j * np.arange(8.0)).astype(np.complex64)[None]
+    >>> abs(divide(3 * sidelink, sidelink)).round(5)[0, :3]
+    array([6., 6., 6.], dtype=float32)
+    """
+
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+        return _bounded_inverse(symbols, _amplitude(symbols, path))
+
+    return _correct(radar, sidelink, path, inverse)
+
+
+def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+    """Return R·A·S*/(|S|² + σ²), rescaled so that the direct path keeps its amplitude.
+
+    Parameters and result as `divide`; σ² is the noise per subcarrier, measured beside the direct path.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Corrections". Without the rescaling the peak is biased by up to
+    SNR/(SNR + 1).
+    """
+
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+        amplitude = _amplitude(symbols, path)
+        noise = np.where(path.locked, path.noise_power, 0.0)[:, None]  # without lock the noise is unknown
+        weakest = _weakest(amplitude)
+        regular = symbols.conj() * amplitude / np.maximum(np.abs(symbols) ** 2 + noise, weakest**2)
+        kept = np.abs((regular * phasor(path, symbols.shape[1])).mean(1, keepdims=True))
+        return np.asarray(np.where(path.locked[:, None], regular / np.maximum(kept, 1e-30), regular), np.complex64)
+
+    return _correct(radar, sidelink, path, inverse)
+
+
+def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+    """Return R·A/S with S cleaned of all that arrives more than 16 cells from the direct path.
+
+    Parameters and result as `divide`.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Corrections". Of the noise, 33 cells of N stay.
+    """
+
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+        subcarriers = symbols.shape[1]
+        direct = phasor(path, subcarriers)
+        profile = fft.ifft(symbols * direct.conj(), axis=1)
+        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # nothing to cut below 33 subcarriers
+        clean = fft.fft(profile, axis=1) * direct
+        return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
+
+    return _correct(radar, sidelink, path, inverse)
+
+
+def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+    """Return R turned back by the delay and the phase of the direct path, one of each per pulse.
+
+    Parameters and result as `divide`.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Two parameters of a pulse".
+    """
+
+    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+        return phasor(path, symbols.shape[1]).conj()
+
+    return _correct(radar, sidelink, path, inverse)
+
+
+METHODS: Mapping[str, Callable[..., Complexes]] = {
+    "divide": divide,
+    "wiener": wiener,
+    "two_parameter": two_parameter,
+    "gated": gated,
+}
+"""Cheapest first."""
+
+
+DIVIDING = "divide", "wiener"
+"""Those that take out what was sent, whatever its spectrum; the others take the sidelink for one path of a flat one."""
+
+
+def edges(method: str, state: SidelinkState) -> dict[str, str]:
+    """Return the edges that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
+
+    Notes
+    -----
+    Source: the thresholds are derived and simulated in docs/theory/echo_methods.md, "Which correction".
+    """
+    snr_db = {
+        "divide": (state.snr_db, DIVIDE_SNR_DB, "per subcarrier"),
+        "wiener": (state.snr_db, WIENER_SNR_DB, "per subcarrier"),
+        "gated": (_gain_db(state, 2 * GATE_CELLS + 1), DIVIDE_SNR_DB, "inside the gate"),
+        "two_parameter": (_gain_db(state, 1), FIT_SNR_DB, "of the whole pulse"),
+    }
+    crossed = {}
+    measured, needed, of_what = snr_db[method]
+    if measured < needed:
+        crossed["sidelink_noisy"] = f"SNR of the sidelink {measured:.1f} dB {of_what}: {method} needs {needed:.1f} dB"
+    reach = {"divide": state.subcarriers, "wiener": state.subcarriers, "gated": GATE_CELLS, "two_parameter": 0}[method]
+    if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= reach:
+        crossed["sidelink_echo"] = (
+            f"an echo of {state.echo_db:.1f} dB in the sidelink makes ghosts as strong after {method}"
+        )
+    ripple_db = {"gated": state.fine_ripple_db, "two_parameter": max(state.ripple_db, state.fine_ripple_db)}
+    if ripple_db.get(method, 0.0) > RIPPLE_DB:
+        crossed["sidelink_ripple"] = f"ripple of {ripple_db[method]:.1f} dB over the band stays after {method}"
+    if method in ("gated", "two_parameter") and "wrong_code" in state.flags:
+        crossed["sidelink_code"] = f"{method} needs the code, which the sidelink does not carry"
+    return crossed
+
+
+def choose(state: SidelinkState) -> tuple[str, str]:
+    """Return the cheapest adequate method and why, in one line.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).normal(size=(2, 40, 256))
+    >>> choose(measure((10 + noise[0] + 1j * noise[1]).astype(np.complex64)))
+    ('divide', 'SNR 17.0 dB per subcarrier, echoes below -41.7 dB, ripple 0.0 dB: cheapest adequate')
+    """
+    crossed = {method: edges(method, state) for method in METHODS}
+    adequate = [method for method in METHODS if not crossed[method]]
+    seen = (
+        f"SNR {state.snr_db:.1f} dB per subcarrier, echoes {'of' if state.echo_cells else 'below'} "
+        f"{state.echo_db:.1f} dB, ripple {max(state.ripple_db, state.fine_ripple_db):.1f} dB"
+    )
+    if adequate:
+        return adequate[0], f"{seen}: cheapest adequate"
+    # every pulse that locks is coherent after two_parameter: it can leave ghosts, it cannot lose the image
+    fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
+    return fallback, f"{seen}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
+
+
+def _gain_db(state: SidelinkState, cells: int) -> float:
+    """Return the SNR after all but `cells` delay cells are cut away."""
+    return state.snr_db + 10 * float(np.log10(state.subcarriers / min(cells, state.subcarriers)))
+
+
+def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:
+    """Return (pulse, 1) amplitude of the direct path, or of all that arrives where it did not lock."""
+    rms = np.sqrt(np.mean(np.abs(symbols) ** 2, axis=1))
+    return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float32)
+
+
+def _bounded_inverse(symbols: Complexes, amplitude: NDArray[np.float32]) -> Complexes:
+    """Return A/S, where |S| counts as no weaker than `_weakest`."""
+    power = np.square(symbols.real) + np.square(symbols.imag)
+    scale = amplitude / np.maximum(power, np.square(_weakest(amplitude)))
+    return np.asarray(symbols.conj() * scale, np.complex64)
+
+
+def _weakest(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the |S| below which a subcarrier is attenuated instead of divided; never zero, nor is its square."""
+    return np.asarray(np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-15), np.float32)
+
+
+def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, inverse: _Inverse) -> Complexes:
+    path = path or fit_line_of_sight(sidelink)
+    corrected = np.empty(radar.shape, np.complex64)
+    for first in range(0, len(radar), _PULSES_AT_ONCE):
+        pulses = slice(first, first + _PULSES_AT_ONCE)
+        corrected[pulses] = radar[pulses] * inverse(sidelink[pulses], path.select(pulses))
+    return corrected

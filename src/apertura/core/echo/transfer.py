@@ -1,0 +1,251 @@
+"""Captures of a pair become transfer functions: by the code alone, or against the sidelink.
+
+In two passes: the first finds what a flight's captures have in common and a few numbers per pulse, the second forms
+transfer functions, block by block. No more than a block of captures is held, however long the flight is.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.progress import progress
+from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
+from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, spread
+from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of, decide_clock
+from apertura.core.echo.code_check import CodeEvidence, own_code
+from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.phase_check import phase_stability
+from apertura.core.echo.resampling import Complexes, Floats, correct_clock
+from apertura.core.echo.second_path import second_path_flags
+from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
+from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks
+
+_STRETCH = 128  # neighbouring pulses that own code and phase are looked for in
+_CLOCK_STRETCH = 256
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What the captures of a pair measured.
+
+    Attributes
+    ----------
+    kept
+        (capture,) bool, the captures that measured something.
+    flags
+        Edge crossed → what was measured, in one line.
+    report
+        What was decided on the way and why: clock, sidelink, code.
+    sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
+        (pulse,) float64, what was measured of the sidelink in the captures kept: delay times c, metres, SNR per
+        subcarrier and phase at mid-band; NaN where it did not lock, None without a sidelink.
+    form
+        Numbers of a few captures, ascending → their transfer functions, (pulse, subcarrier) complex64. The code is
+        removed; electrical paths are still in them.
+    saturation
+        Of the samples that transfer functions were formed from so far.
+    """
+
+    kept: NDArray[np.bool_]
+    flags: dict[str, str]
+    report: dict[str, Any]
+    sidelink_delay_m: Floats | None
+    form: Callable[[Pulses], Complexes]
+    saturation: Saturation
+    sidelink_snr_db: Floats | None = None
+    sidelink_phase_rad: Floats | None = None
+
+
+def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
+    """Return what a node received of its own pulses, whose clock is the transmitter's.
+
+    Parameters
+    ----------
+    read
+        Reads `radar`.
+    inverse, numerology
+        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
+    time_s
+        (capture,) float64, when each was sent, seconds of any origin.
+
+    Notes
+    -----
+    Code and phase are looked at in up to 2048 captures, 16 stretches spread over the flight.
+
+    Examples
+    --------
+    >>> numerology = Numerology(1e9, 16e6, np.arange(8), prefix_samples=4, dft_samples=16)
+    >>> tone = 1000 * np.exp(2j * np.pi * 3 * np.arange(20) / 16)
+    >>> iq = np.stack([tone.real, tone.imag], -1)[None].round().astype(np.int16)
+    >>> measured = transfer_by_code(lambda some: {"radar": iq[some]}, np.full(8, 0.5, np.complex64),
+    ...                             numerology, time_s=np.zeros(1))
+    >>> abs(measured.form(np.arange(1))).round(0)
+    array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
+    """
+    saturation = Saturation()
+
+    def demodulated(radar: Samples) -> Complexes:
+        return demodulate(as_complex(radar), numerology) * inverse
+
+    def form(captures: Pulses) -> Complexes:
+        radar = read(captures)["radar"]
+        saturation.count({"radar": radar})
+        return demodulated(radar)
+
+    some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
+    sample = np.concatenate([demodulated(read(block)["radar"]) for block in blocks_of(some)])
+    code = own_code(sample, prefix_cells=numerology.delay_cells)
+    phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
+    flags = {**code.flags, **(phase.flags if phase else {})}
+    report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
+    return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
+
+
+def transfer_by_sidelink(
+    read: Read,
+    inverse: Complexes,
+    numerology: Numerology,
+    *,
+    symbol_samples: int,
+    sidelink_m: Floats,
+    method: str,
+    accuracy_db: float,
+    where: str,
+) -> Transfer:
+    """Return what a secondary node received, less all that its two channels share.
+
+    Parameters
+    ----------
+    read
+        Reads `radar` and `sidelink`.
+    inverse, numerology
+        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
+    symbol_samples
+        (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
+    sidelink_m
+        (capture,) float64, distance between the antennas of the sidelink, metres; the path that comes off every echo.
+    method
+        A key of `METHODS`, or auto.
+    accuracy_db
+        Level below the peak that errors of the clock may reach, dB.
+    where
+        What to call the recording in errors.
+
+    Raises
+    ------
+    CampaignError
+        If the sidelink locks in no capture.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
+    flight, the state of the sidelink on all.
+    """
+    receiver = _Receiver.measured(read, inverse, numerology, symbol_samples, len(sidelink_m), accuracy_db)
+    with progress("sidelinks", len(sidelink_m)) as done:
+        state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
+    chosen, reason = choose(state) if method == "auto" else (method, "asked for")
+    unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
+    cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
+    delay_m = state.delay_cells * cell_m
+    residual = baseline_residual(delay_m, sidelink_m)
+    suspect = detect_wrong_association(residual)
+    flags = {
+        **unclocked,
+        **state.flags,
+        **edges(chosen, state),
+        **second_path_flags(state, cell_m=cell_m),
+        **({"association_suspect": suspect} if suspect else {}),
+    }
+    quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
+    saturation = Saturation()
+
+    def form(captures: Pulses) -> Complexes:
+        iq = read(captures)
+        saturation.count(iq)
+        radar, sidelink = (receiver.received(iq[name], captures) for name in ("radar", "sidelink"))
+        return METHODS[chosen](radar, sidelink, state.path.select(captures))
+
+    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
+    of_pulses = (values[state.locked] for values in (state.snr_of_pulses_db, state.phase_rad))
+    return Transfer(state.locked, flags, report, delay_m[state.locked], form, saturation, *of_pulses)
+
+
+def as_complex(iq: Samples) -> Complexes:
+    """Return (…, 2) I and Q as complex64."""
+    return np.ascontiguousarray(iq, np.float32).view(np.complex64)[..., 0]
+
+
+@dataclass(frozen=True)
+class _Receiver:
+    """How captures of a node with its own clock become symbols: as they are, or with its clock corrected."""
+
+    read: Read
+    inverse: Complexes  # of the code
+    numerology: Numerology
+    symbol_samples: int
+    clock: ClockOffset | None  # to be corrected
+    cfo_hz: Floats
+    report: dict[str, Any]
+    clock_flags: dict[str, str]
+
+    @classmethod
+    def measured(
+        cls, read: Read, inverse: Complexes, numerology: Numerology, symbol_samples: int, count: int, accuracy_db: float
+    ) -> "_Receiver":
+        """Measure the clock, and decide whether it is corrected in the samples."""
+        groups = spread(count, groups=GROUPS, each=_CLOCK_STRETCH)
+        sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :symbol_samples]) for some in groups)
+        kept = read, inverse, numerology, symbol_samples
+        try:
+            clock = clock_of(sidelink, numerology, pulses=count)
+        except ValueError as error:
+            report = {"corrected": False, "reason": str(error)}
+            return cls(*kept, None, np.zeros(count), report, {"clock_unmeasured": str(error)})
+        decision = decide_clock(clock, numerology, accuracy_db=accuracy_db)
+        ppm, std_ppm = clock.ppm(numerology)
+        report = {
+            "corrected": decision.correct,
+            "reason": decision.reason,
+            "floor_db": round(decision.floor_db, 2),
+            "ppm": round(ppm, 4),
+            "std_ppm": None if std_ppm is None else round(std_ppm, 4),
+        }
+        cfo_hz = clock.cfo_of_pulses_hz(count)
+        return cls(*kept, clock if decision.correct else None, cfo_hz, report, decision.flags)
+
+    def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
+        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, the code removed."""
+        for some in blocks_of(np.arange(len(self.cfo_hz))):
+            yield self.received(self.read(some)["sidelink"], some)
+            done(len(some))
+
+    def received(self, iq: Samples, captures: Pulses) -> Complexes:
+        """Return the symbols of some captures' samples."""
+        samples = as_complex(iq[:, : self.symbol_samples])
+        if self.clock is not None:
+            cfo_hz = self.cfo_hz[captures]
+            samples = correct_clock(samples, self.numerology, cfo_hz=cfo_hz, sfo_ppm=self.clock.sfo_ppm)
+        return demodulate(samples, self.numerology) * self.inverse
+
+
+def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:
+    report = {
+        "lock_rate": round(float(state.locked.mean()), 4),
+        "snr_db": round(state.snr_db, 2),
+        "echo_db": round(state.echo_db, 2),
+        "ripple_db": round(max(state.ripple_db, state.fine_ripple_db), 2),
+    }
+    if residual is not None:
+        report |= {"delay_residual_m": round(residual.residual_m, 4), "delay_noise_m": round(residual.noise_m, 4)}
+    return report
+
+
+def _sidelink_code(state: SidelinkState) -> CodeEvidence:
+    if "wrong_code" in state.flags:
+        return CodeEvidence(carried=False, evidence=state.flags["wrong_code"])
+    return CodeEvidence(True, f"by the code, the sidelink locks in {state.locked.mean():.0%} of the pulses")

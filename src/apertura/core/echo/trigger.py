@@ -1,0 +1,173 @@
+"""Finding the pulses in a recording that never stops: correlation with the preamble, at a set rate of false alarms."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from apertura.core.echo.framing import Framing
+
+Samples = NDArray[np.int16 | np.float32]
+Complexes = NDArray[np.complex64]
+
+_SMALLEST_TRANSFORM = 2**16
+_SILENT = 1e-10  # of the energy of a window, under a preamble: rounding of its transform
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A preamble in a recording.
+
+    Attributes
+    ----------
+    sample
+        Where it starts, counted from the start of the recording.
+    score
+        Share of the energy under the preamble that is the preamble, 0…1.
+    snr_db
+        Signal to noise per sample that follows from it.
+    """
+
+    sample: int
+    score: float
+    snr_db: float
+
+
+def find_preambles(
+    blocks: Iterable[Samples], framing: Framing, *, symbol_samples: int, false_alarms_per_s: float
+) -> Iterator[Detection]:
+    """Yield the preambles of a recording in order, holding a bounded number of its samples at a time.
+
+    Parameters
+    ----------
+    blocks
+        (sample, 2) each, I and Q of the trigger's channel, one after the other, of any length.
+    framing
+        What was sent before each symbol.
+    symbol_samples
+        (T_cp + T)·f_s; from a preamble to the end of its symbol nothing else is looked for.
+    false_alarms_per_s
+        How often noise alone may trigger.
+
+    Raises
+    ------
+    ValueError
+        If the rate of false alarms is not positive.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Trigger". The threshold does not depend on the level of the noise, which
+    is taken from the same samples.
+
+    Examples
+    --------
+    >>> framing = Framing(np.array([1, 1, 1, -1, 1, -1, -1] * 9), 2, 0.0, 1e6, counter_bits=0, bit_chips=0)
+    >>> noise = np.random.default_rng(1).normal(0, 50, (5000, 2))
+    >>> noise[1234 : 1234 + 126, 0] += 100 * framing.template().real
+    >>> detections = find_preambles([noise.astype(np.int16)], framing, symbol_samples=200, false_alarms_per_s=0.1)
+    >>> [detection.sample for detection in detections]
+    [1234]
+    """
+    template = framing.template()
+    threshold = score_threshold(template.size, false_alarms_per_s / framing.sample_rate_hz)
+    search = _PeakSearch(threshold, template.size, framing.lead_samples + symbol_samples)
+    for first, scores in _scores(blocks, template):
+        yield from search.feed(first, scores)
+    yield from search.finish()
+
+
+def score_threshold(template_samples: int, false_alarm: float) -> float:
+    """Return the score that noise passes with probability `false_alarm` at one sample.
+
+    Of white Gaussian noise the score is the squared cosine between two directions of which one is random: it is
+    distributed as Beta(1, L-1) whatever the level, so P(score > γ) = (1-γ)^(L-1).
+
+    Examples
+    --------
+    >>> round(score_threshold(4092, 1e-11), 5)
+    0.00617
+    """
+    if not 0 < false_alarm < 1:
+        raise ValueError(f"{false_alarm=}: must lie between 0 and 1 per sample")
+    return float(-np.expm1(np.log(false_alarm) / (template_samples - 1)))
+
+
+def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield first sample and score of every place the template fits, by overlap-save transforms."""
+    length = template.size
+    size = max(_SMALLEST_TRANSFORM, 1 << int(8 * length - 1).bit_length())
+    matched = fft.fft(template, size).conj() / np.sqrt((np.abs(template) ** 2).sum())
+    energy = np.zeros(size + 1)
+    for first, window in _windows(blocks, size, overlap=length - 1):
+        fitting = window.size - length + 1
+        matches = fft.ifft(fft.fft(window, size) * matched)[:fitting]
+        energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
+        under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
+        silence = np.float32(_SILENT * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit
+        yield first, np.asarray(_power(matches) / np.maximum(under, silence), np.float32)
+
+
+def _power(samples: Complexes) -> NDArray[np.float32]:
+    return np.square(samples.real) + np.square(samples.imag)
+
+
+def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[tuple[int, Complexes]]:
+    """Yield first sample and samples of windows of `size` that overlap, the last one shorter."""
+    window = np.empty(size, np.complex64)
+    parts = window.view(np.float32).reshape(size, 2)
+    first, filled, new = 0, 0, 0
+    for block in blocks:
+        taken = 0
+        while taken < len(block):
+            count = min(size - filled, len(block) - taken)
+            parts[filled : filled + count] = block[taken : taken + count]
+            taken, filled, new = taken + count, filled + count, new + count
+            if filled == size:
+                yield first, window
+                window[:overlap] = window[size - overlap :].copy()
+                first, filled, new = first + size - overlap, overlap, 0
+    if new and filled > overlap:
+        yield first, window[:filled]
+
+
+class _PeakSearch:
+    """The highest score within one preamble's length of the first that passes, then silence for a frame.
+
+    A strong preamble passes in its sidelobes already; its true place follows less than its own length later.
+    """
+
+    def __init__(self, threshold: float, reach: int, silence: int) -> None:
+        self.threshold, self.reach, self.silence = threshold, reach, silence
+        self.open_from = 0
+        self.best: tuple[int, float] | None = None
+        self.until = 0
+
+    def feed(self, first: int, scores: NDArray[np.float32]) -> Iterator[Detection]:
+        passed = np.flatnonzero(scores > self.threshold)
+        places = passed + first
+        at = 0
+        while True:
+            if self.best is None:
+                at = int(np.searchsorted(places, self.open_from))
+                if at == places.size:
+                    return
+                self.best, self.until = (int(places[at]), float(scores[passed[at]])), int(places[at]) + self.reach
+            end = int(np.searchsorted(places, self.until))
+            if end > at:
+                top = at + int(np.argmax(scores[passed[at:end]]))
+                if scores[passed[top]] > self.best[1]:
+                    self.best = int(places[top]), float(scores[passed[top]])
+            if self.until > first + scores.size:
+                return
+            yield from self.finish()
+
+    def finish(self) -> Iterator[Detection]:
+        if self.best is None:
+            return
+        sample, score = self.best
+        self.best, self.open_from = None, sample + self.silence
+        # the score of a signal of SNR ρ per sample is about (ρL + 1)/(L·(ρ + 1)), L the length of the preamble
+        ratio = max(score * self.reach - 1, 1e-3) / (self.reach * max(1 - score, 1e-9))
+        yield Detection(sample, score, float(10 * np.log10(ratio)))

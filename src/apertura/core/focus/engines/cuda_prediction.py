@@ -1,0 +1,120 @@
+"""What the GPU engine is predicted to do: how exactly, and at what cost: the seconds are not measured."""
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from apertura.core.focus.engines.cuda_constants import (
+    DEGREE,
+    FARTHEST,
+    FLOAT32_ERROR,
+    FLOAT32_RMS,
+    LAST_ORDER,
+    LAST_TERM,
+    SIDE,
+)
+from apertura.core.focus.engines.engine import Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.native_prediction import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
+from apertura.core.focus.engines.native_tables import design_table, ratio
+from apertura.core.focus.job import Job
+
+_WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
+_FLOAT32_RAD = 2e-6  # tables and their look-ups, as native
+
+# Seconds, not measured: a tenth of the rate that torchbp publishes for a card of 2022 (docs/theory/engine.md, "A GPU"),
+# float64 at 1/64 of float32's rate as on gaming cards, 10 GB/s there and back, and the wait for a first kernel.
+_PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact paths
+_CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pulse and sample
+_PLACE_S = 3.2e-9  # per pixel: position there, sum back
+_START_S = 3.0
+_SIMULATED_S = 1e-4  # per pixel and pulse, in Python: this one is measured
+
+
+def simulated() -> bool:
+    """Return whether numba's simulator stands for the device: for tests, thousands of times slower.
+
+    Examples
+    --------
+    >>> simulated()
+    False
+    """
+    return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+    """Yield settings of the GPU engine, as `apertura.core.focus.engines.engine.Engine` describes.
+
+    None where antennas or a sector weigh the pulses: it does not know how to.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "A GPU".
+    """
+    if job.weights:
+        return
+    view = view_of(job)
+    for oversampling in asked_or(asked, "oversampling", OVERSAMPLINGS[DEGREE]):
+        for tolerance_rad in asked_or(asked, "tolerance_rad", TOLERANCES_RAD):
+            yield _setting(job, view, pulses, oversampling, tolerance_rad)
+
+
+def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
+    """Return which part of pulses × patches takes exact paths, and the phase error of the paths of all.
+
+    Parameters
+    ----------
+    view
+        How the scene is seen.
+    wavenumber_rad_m
+        2πf_mid/c.
+    tolerance_rad
+        Largest phase error that the path series may make.
+
+    Returns
+    -------
+    exact : float
+        Part of patches × pulses.
+    error_rad : float
+        RMS over patches, pulses and pixels.
+
+    Examples
+    --------
+    >>> near, far = (View(np.full((2, 1, 1), m), np.full((2, 1, 1), 0.05), 0.05) for m in (1.0, 100.0))
+    >>> limits = {"wavenumber_rad_m": 25.0, "tolerance_rad": 1e-3}
+    >>> series(near, **limits)[0], series(far, **limits)[0]
+    (1.0, 0.0)
+    """
+    reach = np.sqrt(2) * (SIDE - 1) / 2 * view.spacing_m
+    most = reach * (2 * view.range_m + reach) / view.range_m**2
+    within = np.minimum(most, FARTHEST)
+    neglected = (LAST_TERM * view.range_m * within**LAST_ORDER / (1 - within)).sum(axis=0)
+    worst = wavenumber_rad_m * (neglected + 2 * FLOAT32_ERROR * reach)
+    taken = (worst <= tolerance_rad) & (most.max(axis=0) < FARTHEST)
+    error = wavenumber_rad_m * np.hypot(_WORST_TO_RMS * neglected, np.sqrt(2) * FLOAT32_RMS * reach)
+    return float(1 - taken.mean()), float(np.sqrt((np.where(taken, error, 0.0) ** 2).mean()))
+
+
+def _setting(job: Job, view: View, pulses: int, oversampling: int, tolerance_rad: float) -> Setting:
+    signal, k = job.signal, job.signal.wavenumber_rad_m
+    design = design_table(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=DEGREE)
+    table_db = design.error_db(signal.window)
+    exact, path_rad = series(view, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
+    paths_db = 20 * np.log10(path_rad + _FLOAT32_RAD)
+    up, down = ratio(signal.oversampling, oversampling)
+    coefficients = pulses * ((signal.samples - 1) * up // down + 1) * (DEGREE + 1)
+    each = _SIMULATED_S if simulated() else (1 - exact) * _PIXEL_S + exact * _EXACT_S
+    return Setting(
+        "cuda",
+        {"oversampling": oversampling},
+        {"tolerance_rad": tolerance_rad},
+        power_sum_db(table_db, paths_db),
+        job.pixels * (pulses * each + _PLACE_S),
+        table_seconds=_START_S + _CELL_S * coefficients + _SAMPLE_S * pulses * signal.samples,
+        table_bytes=8 * coefficients,
+        reasons={
+            "oversampling": f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB; seconds are not measured",
+            "tolerance_rad": f"of pixel·pulses {100 * exact:.0f} % take exact paths in float64",
+        },
+    )

@@ -1,0 +1,248 @@
+"""What a tree is predicted to do: how exactly, which pulses and tiles it cannot take, and what that costs."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from apertura.core.focus.engines import native_prediction
+from apertura.core.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.native_structs import TREE_DELAYS
+from apertura.core.focus.engines.tree_direct import directly
+from apertura.core.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample
+from apertura.core.focus.engines.tree_sheets import MOST_SHEETS, sheets_for
+from apertura.core.focus.engines.tree_survey import Seen, seen_of, weighed_directly
+from apertura.core.focus.engines.tree_track import LEAF, subaperture_sizes
+from apertura.core.focus.engines.tree_view import Counts, Looks, counts_of
+from apertura.core.focus.job import Job, Signal
+
+SETTINGS: Mapping[int, tuple[int, int]] = {
+    -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16),
+    -86: (64, 16), -92: (64, 16), -98: (64, 16),
+}  # fmt: skip
+"""Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
+
+PRESUMS_DB = (0, 6, 12)
+"""By how much pulses for which fewer stand may err more than an interpolation does."""
+
+SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
+"""Sides of tiles and pulses of the largest subaperture that are considered."""
+
+_FLOAT32_DB = -92.0
+_FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
+
+# Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
+_NODE_S = 7e-10  # a node that looks a pulse up
+_EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
+_EACH_EXPAND_S = 4.6e-9  # of pulses that go for themselves, whose cells tiles side by side share
+_ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
+_MIX_S = 5e-12  # a complex multiply-add of merges and pixels
+_SHEET_BYTES = 64  # a pixel's on one sheet
+_READ_S = 5e-8  # a pixel read from one of its sheets
+_PIXEL_S = 4.5e-9  # a pixel of a subaperture's
+_LEAF_S = 6e-6  # a leaf over a tile: its plan
+_SURFACE_S = 1.6e-8  # a pixel's place, fitted
+_TILE_S = 4e-5  # a tile of a chunk
+_APART = 1.1  # times as long as in one go for pixels and pulses that go directly, tile by tile and chunk by chunk
+_WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
+_FORM_S = 4e-4  # a block of pixels
+_SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
+_START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
+
+
+def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+    """Yield settings of trees, as `apertura.core.focus.engines.engine.Engine` describes.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Error" and "Cost".
+    """
+    for side_px, chunk in _cuts(job, pulses, asked):
+        seen = seen_of(job, pulses, side_px, chunk)
+        for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
+            oversampling, taps = SETTINGS[nodes_db]
+            oversampling = asked.get("oversampling") or oversampling
+            quickest = np.inf
+            for presum_db in asked_or(asked, "presum_db", [nodes_db + more for more in PRESUMS_DB]):
+                options = _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk, asked.get("sheets"))
+                setting = _setting(job, seen, pulses, options)
+                if setting.seconds < quickest:  # what may err more takes less time, or is not worth it
+                    quickest = setting.seconds
+                    yield setting
+
+
+def _cuts(job: Job, pulses: int, asked: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """Return sides of tiles and pulses of chunks to look at; one where the job is not worth a look at more."""
+    cuts = list(product(asked_or(asked, "side_px", SIDES_PX), asked_or(asked, "chunk", CHUNKS)))
+    most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
+    fitting = [(side, chunk) for side, chunk in cuts if side < most_px and chunk < most_pulses] or cuts[:1]
+    return fitting if job.pixels * pulses > _SMALL else fitting[-1:]
+
+
+@dataclass(frozen=True)
+class _Options:
+    oversampling: int
+    taps: int
+    nodes_db: int
+    presum_db: int
+    side_px: int
+    chunk: int
+    sheets: int | None  # as many as pay
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One tile and one chunk: pulses, pixels along a side, and how many such tiles lie along the side of a block."""
+
+    pulses: int
+    side: int
+    beside: float
+
+
+def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
+    signal, nodes_db = job.signal, options.nodes_db
+    carrier_rad = signal.wavenumber_rad_m * signal.step_m
+    design = cells(signal.oversampling, carrier_rad, float(options.oversampling), options.taps)
+    table_db, levels = design.error_db(signal.window), len(subaperture_sizes(options.chunk))
+    asked = {"degree": 2, **directly(nodes_db, signal.oversampling, carrier_rad)._asdict()}
+    direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
+    direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
+    cost = _cost(job, pulses, options, direct_s)
+    presum_db = float(10 * np.log10(cost.presum_rad2 + 1e-30))
+    interpolated_db = nodes_db + 10 * float(np.log10(2 * levels + 1 + (cost.layers > 1)))
+    phase_db = 20 * float(np.log10(_FLOAT32 * seen.phase_rad + 1e-9))
+    tree_db = power_sum_db(table_db, interpolated_db, presum_db, _FLOAT32_DB, phase_db)
+    powers = 10 ** (np.array([tree_db, direct.error_db]) / 10)
+    error_db = 10 * np.log10(powers @ [1 - cost.directly, cost.directly])
+    return Setting(
+        "tree",
+        {"oversampling": options.oversampling, "taps": options.taps},
+        {name: getattr(options, name) for name in ("nodes_db", "presum_db", "side_px", "chunk")}
+        | {"sheets": cost.sheets},
+        float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
+        cost.seconds,
+        table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
+        table_bytes=8 * pulses * signal.samples
+        + (direct.table_bytes if cost.directly else 0)
+        + _SHEET_BYTES * options.side_px**2 * (cost.layers if cost.layers > 1 else 0),
+        reasons={
+            "oversampling": f"table errs by {table_db:.1f} dB",
+            "taps": "of the table's filters",
+            "nodes_db": f"interpolation between nodes errs by {nodes_db} dB at each of {levels} levels",
+            "presum_db": f"pulses for which fewer stand err by {presum_db:.0f} dB",
+            "side_px": f"cheapest here; about {100 * cost.directly:.0f} % of pixel·pulses go directly",
+            "chunk": "pulses of the largest subaperture, cheapest here",
+            "sheets": f"more do not pay on rough ground; {cost.layers if cost.layers > 1 else 'none'} needed here",
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """Of an image, or of the tiles of one side.
+
+    Attributes
+    ----------
+    seconds
+        Of the whole; of tiles: if they took it all.
+    directly
+        Part that no tree takes.
+    presum_rad2
+        What pulses made fewer err by.
+    sheets
+        Between which a tile may be read, at most.
+    layers
+        Sheets that tiles looked at are read between, at most.
+    """
+
+    seconds: float
+    directly: float
+    presum_rad2: float
+    sheets: int
+    layers: int
+
+
+def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
+    """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
+    side = min(options.side_px, job.tile_px, *job.shape)
+    first = part = _by_tree(job, pulses, options, side, direct_s)
+    whole = _SURFACE_S * job.pixels + _FORM_S * job.tiles
+    left, presum = 1.0, 0.0  # what larger tiles did not take
+    while True:
+        weighed_s = job.weights * job.share * job.pixels / side**2 * pulses * _WEIGHTS * BEAM_S
+        taken = max(0.0, left - part.directly)
+        whole, presum = whole + taken * part.seconds + left * weighed_s, max(presum, part.presum_rad2)
+        left, side = left - taken, side // 2
+        if not left or side < LEAST_QUARTER_PX:
+            break
+        part = _by_tree(job, pulses, options, side, None)
+    whole += left * pulses * job.share * job.pixels * direct_s
+    return _Cost(whole, left, presum, first.sheets, first.layers)
+
+
+def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: float | None) -> _Cost:
+    """Return what tiles of one side take and cost; they are read between sheets where `direct_s` is given."""
+    seen, chunks = seen_of(job, pulses, side, options.chunk), -(-pulses // options.chunk)
+    work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
+    edge, limit = weighed_directly(job, seen, options.nodes_db), 10 ** (options.nodes_db / 20)
+    counted = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
+    counts = [[counted(one) for one in here] for here in seen.looks]
+    costs = [
+        [
+            chunks * sum(cost * amount for cost, amount in features(one, found, options, job.signal, work))
+            for one, found in zip(here, founds, strict=True)
+            if found.nodes
+        ]
+        for here, founds in zip(seen.looks, counts, strict=True)
+    ]
+    once, read_s = float(np.mean([one for each in costs for one in each] or [np.inf])), _READ_S * side**2
+    pay = min(MOST_SHEETS, int(pulses * side**2 * direct_s / (once + read_s))) if direct_s else 0
+    sheets = pay if options.sheets is None or not direct_s else options.sheets
+    spent, share, presum, most, tiles = list[float](), list[float](), [0.0], 1, iter(zip(counts, costs, strict=True))
+    for surface, rough, (band, aside) in zip(seen.surfaces, seen.rough, seen.sheets_rad, strict=True):
+        founds, cost = next(tiles) if np.isfinite(surface.rough_m) else ([], [])
+        layers = 1 if rough <= 2 * limit**2 else sheets_for(band, options.nodes_db) if aside <= limit else sheets + 1
+        if layers > max(1, sheets):
+            cost = []
+        most = max(most, layers) if cost else most
+        share.append((1 - edge) * len(cost) / max(1, len(founds)))
+        spent += [layers * (one + (read_s if layers > 1 else 0.0)) for one in cost]
+        presum += [found.presum_rad**2 for found in founds if found.nodes and cost]
+    seconds = job.share * job.pixels / side**2 * float(np.mean(spent or [0.0]))
+    return _Cost(seconds, 1 - float(np.mean(share)), float(np.mean(presum)), sheets, most)
+
+
+def features(
+    looks: Looks, counts: Counts, options: _Options, signal: Signal, work: "_Work"
+) -> list[tuple[float, float]]:
+    """Return what one tile and one chunk take by tree: seconds each, and how many."""
+    leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
+    samples = looks.span_m / signal.step_m + 6
+    looked_up = leaves[0] * counts.fewer if counts.fewer else work.pulses
+    cells_of = cells_per_sample(signal.oversampling, options.oversampling)
+    aligned = work.pulses * (samples + options.taps) * (TREE_DELAYS + counts.fewer) if counts.fewer else 0.0
+    columns, rows = counts.nodes[0]
+    expand_s = _EXPAND_S if counts.fewer else _EACH_EXPAND_S / work.beside
+    return [
+        (_NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
+        (expand_s, looked_up * samples * cells_of * options.taps / 16),
+        (_ALIGN_S, aligned),
+        (_MIX_S, _mixed(counts, leaves, work.side)),
+        (_PIXEL_S, leaves[len(counts.nodes) - 1] * work.side**2),
+        (_LEAF_S, leaves[0]),
+        (_TILE_S, 1.0),
+    ]
+
+
+def _mixed(counts: Counts, leaves: list[int], side: int) -> float:
+    """Return the multiply-adds of all merges, the last one to pixels."""
+    targets = [*counts.nodes[1:], (side, side)]
+    return float(
+        sum(
+            count * (-(-wide // 8) * 8) * (rows * columns + tall * rows)
+            for count, (columns, rows), (wide, tall) in zip(leaves, counts.nodes, targets, strict=False)
+        )
+    )

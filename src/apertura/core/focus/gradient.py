@@ -1,0 +1,121 @@
+"""How an objective of an image changes with each phase centre and each path: the exact adjoint of forming it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.echoes import Echoes, job_of, pulses_at_once, tiles
+from apertura.core.focus.engines.native_binding import available, call
+from apertura.core.focus.inputs import Profiles
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """Derivatives of a real objective, pulse by pulse; all in the objective's unit per metre.
+
+    Attributes
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
+        centres. Where one node does both, its derivative is their sum.
+    path_m
+        (pulse,) float64, with respect to how much further all echoes of a pulse lie (`Profiles.moved`).
+    """
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    path_m: NDArray[np.float64]
+
+
+def path_gradient(
+    profiles: Profiles, places_m: NDArray[np.float64], slope: NDArray[np.complexfloating], *, beams: Beams | None = None
+) -> Gradient:
+    """Return the derivatives of an objective of Σ w·s(R)·exp(+j2πf_mid·R/c), the sum over all pulses at each place.
+
+    Parameters
+    ----------
+    profiles
+        At least twice oversampled; they may be read as they are asked for.
+    places_m
+        (place, 3) float64, metres, in the frame of the phase centres.
+    slope
+        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: what the objective gains as the sum changes, J + Re Σ G*·change.
+    beams
+        Weight of each pulse at each place; that it changes with the phase centres is neglected. None by default.
+
+    Returns
+    -------
+    Gradient
+        Exact for the sum as `block_contributions` forms it, rounded as float32 where a pulse and a place meet.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or places or slopes are not finite.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 6 to 8. Without the compiled library numpy does the same.
+    """
+    if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
+        raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (place, 3) and (place,)")
+    if not (np.isfinite(places_m).all() and np.isfinite(slope).all()):
+        raise ValueError("places and the objective's slopes there must be finite")
+    found, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
+    if largest:
+        # The library takes float32: an objective's own unit must not push it out of range.
+        places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
+        for first in range(0, len(profiles), pulses_at_once(profiles)):
+            part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))
+            found[:, part] = _of_pulses(profiles, part, places_m, slope, beams) * largest
+    return Gradient(found[:3].T.copy(), found[3:6].T.copy(), found[6])
+
+
+def _of_pulses(
+    profiles: Profiles,
+    part: slice,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    beams: Beams | None,
+) -> NDArray[np.float64]:
+    """Return (7, pulse): of transmitter, receiver and path."""
+    echoes = Echoes.read(profiles, [part])
+    found = np.zeros((7, len(echoes)))
+    add = _add_compiled if available() else _add
+    for tile in [slice(None)] if beams is None else tiles(len(places_m), len(echoes)):
+        weight = np.ones((1, len(echoes)), np.float32)
+        if beams is not None:
+            weight = beams[part].weight(profiles.aperture[part], places_m[tile]).T.astype(np.float32, order="C")
+        add(echoes, places_m[tile], slope[tile], weight, found)
+    return found
+
+
+def _add_compiled(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    weight: NDArray[np.float32],
+    found: NDArray[np.float64],
+) -> None:
+    job = job_of(echoes, places_m, weight)
+    job.objective, job.slopes = slope.ctypes.data, found.ctypes.data
+    call("apertura_differentiate", job)
+
+
+def _add(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    weight: NDArray[np.float32],
+    found: NDArray[np.float64],
+) -> None:
+    weight = np.broadcast_to(weight, (len(places_m), len(echoes)))
+    for tile in tiles(len(places_m), len(echoes)):
+        of_path = (np.conj(slope[tile]) * echoes.at(places_m[tile])[1]).real * weight[tile].T
+        for axis, leg in ((0, echoes.tx_m), (3, echoes.rx_m)):
+            apart = leg.T[:, None] - places_m[tile]
+            direction = apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+            found[axis : axis + 3] += np.einsum("px,pxa->ap", of_path, direction)
+        found[6] -= of_path.sum(axis=1)

@@ -1,0 +1,198 @@
+"""What an engine is given: the recorded history as plain arrays, without settings or files."""
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+
+
+class Turned:
+    """Samples of pulses, each times a factor of its own, as they are asked for.
+
+    Examples
+    --------
+    >>> np.asarray(Turned(np.ones((3, 2), np.complex64), np.array([1, 1j, -1]))[1:])
+    array([[ 0.+1.j,  0.+1.j],
+           [-1.+0.j, -1.+0.j]], dtype=complex64)
+    """
+
+    def __init__(self, samples: Any, factor: NDArray[np.complex128]):
+        self._samples, self._factor = samples, factor.astype(np.complex64)
+        self.shape, self.ndim, self.dtype = samples.shape, samples.ndim, samples.dtype
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self._samples)
+
+    def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
+        """Return the samples of some pulses."""
+        return np.asarray(self._samples[pulses]) * self._factor[pulses, None]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return all of them."""
+        return np.asarray(self[:], dtype)
+
+
+@dataclass(frozen=True)
+class PhaseHistory:
+    """Calibrated transfer functions, as `reference` sums them.
+
+    Attributes
+    ----------
+    transfer
+        (pulse, subcarrier) complex64: Σ a·exp(-j2πf(τ - reference_delay_s)).
+    frequency_hz
+        (subcarrier,) float64, RF frequency.
+    weight
+        (subcarrier,) float64, window over the subcarriers.
+    reference_delay_s
+        (pulse,) float64, delay already removed from `transfer`.
+    aperture
+        Phase centres in the frame of the pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not belong together.
+    """
+
+    transfer: NDArray[np.complex64]
+    frequency_hz: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    reference_delay_s: NDArray[np.float64]
+    aperture: Aperture
+
+    def __post_init__(self) -> None:
+        pulses, subcarriers = self.transfer.shape if self.transfer.ndim == 2 else (-1, -1)
+        if (len(self.aperture), self.reference_delay_s.shape) != (pulses, (pulses,)):
+            raise ValueError(
+                f"{self.transfer.shape=}, {self.reference_delay_s.shape=}, {len(self.aperture)=}: must be "
+                "(pulse, subcarrier), (pulse,) and as many pulses"
+            )
+        if not self.frequency_hz.shape == self.weight.shape == (subcarriers,):
+            raise ValueError(
+                f"{self.transfer.shape=}, {self.frequency_hz.shape=}, {self.weight.shape=}: must be "
+                "(pulse, subcarrier) and (subcarrier,) twice"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.transfer)
+
+    def __getitem__(self, pulses: slice) -> "PhaseHistory":
+        """Return the phase history of some pulses, as views."""
+        return replace(
+            self,
+            transfer=self.transfer[pulses],
+            reference_delay_s=self.reference_delay_s[pulses],
+            aperture=self.aperture[pulses],
+        )
+
+    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "PhaseHistory":
+        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+
+        As `Profiles.moved`.
+        """
+        delay_s = self.reference_delay_s + further_m / SPEED_OF_LIGHT_M_S
+        return replace(self, reference_delay_s=delay_s, aperture=aperture)
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Range profiles of a band-limited signal, cropped to the scene.
+
+    Sample i of pulse p lies at total path ``start_m[p] + i·step_m`` and holds
+    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/c) (with H_n for absolute delay), so that
+    profile·exp(+j2π f_mid·path/c) is in phase at a target.
+
+    Attributes
+    ----------
+    samples
+        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 against c/B of total path.
+    start_m
+        (pulse,) float64, total path tx → pixel → rx of sample 0, metres.
+    step_m
+        Total path between samples, metres.
+    centre_frequency_hz
+        f_mid.
+    oversampling
+        Nyquist cells per sample inverted: (c/B)/step_m.
+    aperture
+        Phase centres in the frame of the pixels.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not belong together, or the step is not positive.
+    """
+
+    samples: NDArray[np.complex64]
+    start_m: NDArray[np.float64]
+    step_m: float
+    centre_frequency_hz: float
+    oversampling: float
+    aperture: Aperture
+
+    def __post_init__(self) -> None:
+        pulses = len(self.samples) if self.samples.ndim == 2 else -1
+        if (len(self.aperture), self.start_m.shape) != (pulses, (pulses,)):
+            raise ValueError(
+                f"{self.samples.shape=}, {self.start_m.shape=}, {len(self.aperture)=}: must be (pulse, range), "
+                "(pulse,) and as many pulses"
+            )
+        if not 0 < self.step_m < np.inf:
+            raise ValueError(f"{self.step_m=}: must be positive")
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.samples)
+
+    def __getitem__(self, pulses: slice) -> "Profiles":
+        """Return the profiles of some pulses, as views; images of pulse blocks add up to the image of all."""
+        return replace(
+            self,
+            samples=self.samples[pulses],
+            start_m=self.start_m[pulses],
+            aperture=self.aperture[pulses],
+        )
+
+    def for_tables(self) -> tuple[NDArray[np.complex64], NDArray[np.float64], list[NDArray[np.float64]]]:
+        """Return samples, starts and phase centres of both legs as arrays that tables of polynomials can be made from.
+
+        Raises
+        ------
+        ValueError
+            If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+        """
+        if not self.oversampling >= 1.5:
+            raise ValueError(f"{self.oversampling=}: must be at least 1.5")
+        if not len(self):
+            raise ValueError(f"{self.samples.shape=}: holds no pulse")
+        start_m = np.ascontiguousarray(self.start_m, np.float64)
+        places = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
+        if not all(np.isfinite(values).all() for values in (start_m, *places)):
+            raise ValueError("phase centres and starts of the profiles must be finite")
+        return np.ascontiguousarray(self.samples, np.complex64), start_m, places
+
+    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "Profiles":
+        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+
+        Parameters
+        ----------
+        aperture
+            Of as many pulses.
+        further_m
+            (pulse,) float64, metres by which the measured path of every echo of a pulse grows.
+
+        Notes
+        -----
+        Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
+        """
+        wavenumber = 2 * np.pi * self.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        turned = Turned(self.samples, np.exp(-1j * wavenumber * further_m)) if np.any(further_m) else self.samples
+        samples = cast("NDArray[np.complex64]", turned)
+        return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)

@@ -1,0 +1,191 @@
+"""An imaging job as numbers: what the planner and the engines' predictions look at before anything is formed."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import Illumination
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import Terrain
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """What profiles hold.
+
+    Attributes
+    ----------
+    centre_hz
+        f_mid.
+    oversampling
+        Samples per cell c/B.
+    step_m
+        Total path between samples.
+    samples
+        Per pulse.
+    window
+        (subcarrier,) float64, weights over the band, of any scale; flat by default.
+    """
+
+    centre_hz: float
+    oversampling: float
+    step_m: float
+    samples: int
+    window: NDArray[np.float64] = field(default_factory=lambda: np.ones(1), repr=False)
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/c."""
+        return 2 * np.pi * self.centre_hz / SPEED_OF_LIGHT_M_S
+
+
+@dataclass(frozen=True, eq=False)
+class Integration:
+    """Over how much of a flight pixels are integrated.
+
+    Attributes
+    ----------
+    sector
+        None: every pulse counts for every pixel.
+    count
+        Pulses that 1 stands for: all, or the most that a place of the scene takes inside the sector.
+    value, reason
+        What was chosen, and why, in a few words.
+    share
+        Of pixels × pulses that are summed.
+    report
+        What image.json says of it.
+    flags
+        Limits crossed → what was found.
+    """
+
+    sector: Sector | None
+    count: int
+    value: str
+    reason: str
+    share: float = 1.0
+    report: Mapping[str, Any] = field(default_factory=dict)
+    flags: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What is to be imaged.
+
+    Attributes
+    ----------
+    aperture
+        Phase centres in the frame of the pixels.
+    ground_m
+        (row, column, 3) float64, metres: points spread evenly over the scene, corners included; rows go south.
+    shape
+        Rows and columns of the image.
+    spacing_m
+        Of the pixels.
+    centre_hz, bandwidth_hz, subcarriers
+        Of the waveform.
+    signal
+        What the profiles hold.
+    frame
+        'ecef' or 'local'.
+    tile_px, threads
+        Side of a tile; tiles formed at once.
+    terrain
+        The scene's ground and its cheaper models.
+    path_limit_m
+        Longest total path inside the cyclic prefix.
+    memory_bytes
+        What the imaging step may use.
+    content_db
+        How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
+        errors of tables weigh that much more. None before anything was recorded.
+    beams, illumination
+        Of the antennas, where they have any, and of the sector integrated; over all pulses.
+    integration
+        Over how much of the flight; None: all of it.
+    recorded
+        Whether the phase history is there, which the double sum reads.
+    patches_on
+        Ground → places of the pixels of some windows of the scene, each (y, x, 3) float64, metres; None: unknown.
+    patches_m
+        The same on the ground that is imaged on, once that is decided; none: a plane about points of `ground_m`.
+    """
+
+    aperture: Aperture
+    ground_m: NDArray[np.float64]
+    shape: tuple[int, int]
+    spacing_m: float
+    centre_hz: float
+    bandwidth_hz: float
+    subcarriers: int
+    signal: Signal
+    frame: str = "ecef"
+    tile_px: int = 256
+    threads: int = 1
+    terrain: GroundModels = field(default_factory=GroundModels.flat)
+    path_limit_m: float = np.inf
+    memory_bytes: float = np.inf
+    content_db: float | None = None
+    beams: Beams | None = None
+    illumination: Illumination | None = None
+    integration: Integration | None = None
+    recorded: bool = True
+    patches_on: Callable[[Terrain], tuple[NDArray[np.float64], ...]] | None = None
+    patches_m: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def pixels(self) -> int:
+        """How many the image has."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def tiles(self) -> int:
+        """How many the image is formed by."""
+        return -(-self.shape[0] // self.tile_px) * -(-self.shape[1] // self.tile_px)
+
+    @property
+    def antennas(self) -> int:
+        """How many of both antennas have a beam."""
+        return 0 if self.beams is None else sum(beam is not None for beam in (self.beams.transmit, self.beams.receive))
+
+    @property
+    def weights(self) -> int:
+        """How many weights a pulse has at a pixel."""
+        return self.antennas + (self.sector is not None)
+
+    @property
+    def sector(self) -> Sector | None:
+        """Inside which pulses count; None: all of them."""
+        return None if self.beams is None else self.beams.sector
+
+    @property
+    def share(self) -> float:
+        """Of pixels × pulses that are summed."""
+        return 1.0 if self.integration is None else self.integration.share
+
+    @property
+    def count(self) -> int:
+        """Pulses that 1 stands for."""
+        return len(self.aperture) if self.integration is None else self.integration.count
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency."""
+        return (self.centre_hz - self.bandwidth_hz / 2, self.centre_hz + self.bandwidth_hz / 2)
+
+    @property
+    def wavelength_m(self) -> float:
+        """Of the band centre."""
+        return SPEED_OF_LIGHT_M_S / self.centre_hz
+
+    @property
+    def points_m(self) -> NDArray[np.float64]:
+        """`ground_m` as (point, 3), its middle in the middle."""
+        return self.ground_m.reshape(-1, 3)

@@ -1,0 +1,260 @@
+"""An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.common.progress import progress
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.engines import load_engine
+from apertura.core.focus.engines.engine import Setting
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.presum import Presum, presummed
+from apertura.core.focus.reach import Reach, pulse_blocks_of
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import Terrain
+
+if TYPE_CHECKING:
+    from dask.array.core import Array
+
+_NOTHING = np.complex64(complex(np.nan, np.nan))
+
+
+def image_array(
+    inputs: PhaseHistory | Profiles,
+    setting: Setting,
+    grid: SceneGrid,
+    terrain: Terrain,
+    *,
+    side_px: int,
+    weighing: "Weighing | None" = None,
+) -> "Array":
+    """Return an image, the mean over the pulses, as a dask array whose chunks are square tiles.
+
+    Tables are prepared once per block of pulses and shared by all tiles; with several blocks each one's tables are
+    prepared when the tiles of the block before are done, so that one block's inputs and tables are held at a time. A
+    tile takes of a block the pulses that may add something to it, and of a block without any nothing. It is the
+    same to the bit whichever others are computed, in whatever order, by threads, processes or a cluster.
+
+    Parameters
+    ----------
+    inputs
+        What the setting's engine reads.
+    setting
+        Engine, options, and into how many blocks pulses are split.
+    grid, terrain
+        The scene; pixels lie on the terrain.
+    side_px
+        Of a tile, a multiple of 16 pixels.
+    weighing
+        What weighs and sums pulses before and beside the engine; by default every pulse counts once.
+
+    Returns
+    -------
+    dask.array.Array
+        (row, column) complex64; 1 is the amplitude of an echo that every pulse counted sees, 0 what none sees.
+    """
+    from dask.array.core import Array
+    from dask.highlevelgraph import HighLevelGraph
+
+    from apertura.core.focus.layer import TilesLayer
+
+    name, weighing = f"image-{uuid4().hex}", weighing or Weighing()
+    chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
+    places = list(product(range(len(chunks[0])), range(len(chunks[1]))))
+    reach = Reach.of(weighing.beams, inputs.aperture, grid, terrain, list(grid.tiles(side_px)))
+    forming = _Forming(name, setting, grid, terrain, side_px, weighing, reach)
+    layer = TilesLayer(name, partial(_graph, forming, inputs), places)
+    return Array(HighLevelGraph({name: layer}, {name: set()}), name, chunks, np.complex64)
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """How pulses count.
+
+    Attributes
+    ----------
+    beams
+        Weight of each pulse at each pixel by its antennas and the sector integrated; none by default.
+    presum
+        Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
+    count
+        Pulses that the sum is divided by; all of them by default.
+    ways
+        Way of the engine → pixels × pulses that went so in this process.
+    """
+
+    beams: Beams | None = None
+    presum: tuple[Presum, NDArray[np.float64]] | None = None
+    count: int | None = None
+    ways: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, eq=False)
+class _Forming:
+    """What the tasks of all tiles share."""
+
+    name: str
+    setting: Setting
+    grid: SceneGrid
+    terrain: Terrain
+    side_px: int
+    weighing: Weighing
+    reach: Reach
+
+    def window(self, place: tuple[int, int]) -> tuple[slice, slice]:
+        rows, columns = (slice(at * self.side_px, (at + 1) * self.side_px) for at in place)
+        return rows, columns
+
+    def index(self, place: tuple[int, int]) -> int:
+        return place[0] * -(-self.grid.shape[1] // self.side_px) + place[1]
+
+
+def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collection[tuple[int, int]]) -> dict[Any, Any]:
+    """Return the tasks of the tiles in some rows and columns of tiles, and of what they share."""
+    name, presum, beams = forming.name, forming.weighing.presum, forming.weighing.beams
+    count = np.float32(forming.weighing.count or len(inputs))
+    pulses = len(inputs) if presum is None else len(presum[0].at)
+    graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
+    sums: dict[tuple[int, int], Any] = {}  # place → key of what the blocks so far add up to
+    before: list[Any] = []  # what must be done before the next block's tables are prepared
+    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, whole=beams is None)):
+        parts = {place: forming.reach.within(forming.index(place), some) for place in places}
+        lit = {place: part for place, part in parts.items() if part is not None}
+        if not lit:
+            continue
+        first, last = min(part.start for part in lit.values()), max(part.stop for part in lit.values())
+        block = slice(some.start + first, some.start + last)  # what no tile takes is not even read
+        tables = f"{name}-tables-{number}"
+        graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
+        before = []
+        for place, reached in lit.items():
+            part = slice(reached.start - first, reached.stop - first)
+            form, key = partial(_form, forming, place, block, part, count), (f"{name}-{number}", *place)
+            graph[key] = (form, tables, f"{name}-beams", sums.get(place))
+            graph[f"{name}-done-{number}", *place] = (_nothing, key)
+            before.append((f"{name}-done-{number}", *place))
+            sums[place] = key
+    for place in places:
+        graph[name, *place] = sums[place] if place in sums else (partial(_unseen, forming.grid[forming.window(place)]),)
+    return graph
+
+
+def _prepare(
+    setting: Setting,
+    presum: tuple[Presum, NDArray[np.float64]] | None,
+    block: slice,
+    inputs: PhaseHistory | Profiles,
+    _before: list[None],
+) -> Any:
+    """Return what all tiles share of a block of pulses."""
+    if presum is not None and isinstance(inputs, Profiles):
+        some, pulses = presum[0].part(block)
+        return load_engine(setting.engine).prepare(presummed(inputs[pulses], some, presum[1]), **setting.options)
+    return load_engine(setting.engine).prepare(inputs[block], **setting.options)
+
+
+def _form(  # noqa: PLR0917
+    forming: _Forming,
+    place: tuple[int, int],
+    block: slice,
+    part: slice,
+    count: np.float32,
+    tables: Any,
+    beams: Beams | None,
+    sum_before: NDArray[np.complex64] | None,
+) -> NDArray[np.complex64]:
+    """Return one tile of the image of a block of pulses, added to that of the blocks before."""
+    setting, grid = forming.setting, forming.grid[forming.window(place)]
+    if part != slice(0, block.stop - block.start):
+        tables = tables[part]
+    some = beams and beams[block.start + part.start : block.start + part.stop]
+    engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
+    ways: tuple[str, ...] = getattr(engine, "WAYS", ())
+    counted = {"counts": np.zeros(len(ways), np.int64)} if ways else {}
+    image = engine.form(tables, pixels, beams=some, **setting.form_options, **counted)
+    forming.weighing.ways.update({way: int(counted["counts"][n]) for n, way in enumerate(ways)})
+    tile = np.asarray(image / count, np.complex64)
+    return tile if sum_before is None else sum_before + tile
+
+
+def _unseen(grid: SceneGrid) -> NDArray[np.complex64]:
+    """Return a tile that no pulse sees."""
+    return np.zeros(grid.shape, np.complex64)
+
+
+def _nothing(_done: Any) -> None:
+    """Return None once a tile is done."""
+
+
+def compute_tiles(
+    image: "Array",
+    windows: Sequence[Window],
+    target: Any,
+    *,
+    threads: int,
+    scheduler: str = "threads",
+) -> None:
+    """Compute some tiles of an image and write each as soon as it is done.
+
+    A pixel to which no pulse adds anything is written as NaN: nothing was measured there, and 0 would be a measure.
+
+    Parameters
+    ----------
+    image
+        From `image_array`.
+    windows
+        Tiles to compute: windows of chunks of the array.
+    target
+        (y, x) array that takes blocks: numpy or zarr.
+    threads
+        How many tiles are in work at once; the memory of pixel positions and results is theirs alone.
+    scheduler
+        'threads', or the address of a `distributed` scheduler whose workers form the tiles: the same bits.
+
+    Examples
+    --------
+    >>> import dask.array
+    >>> target = np.zeros((4, 6), np.complex64)
+    >>> compute_tiles(dask.array.ones((4, 6), chunks=2), [(slice(0, 2), slice(4, 6))], target, threads=1)
+    >>> target.sum().item()
+    (4+0j)
+    """
+    from dask.callbacks import Callback
+    from dask.threaded import get
+
+    places = [
+        {int(end - size): at for at, (end, size) in enumerate(zip(np.cumsum(sizes), sizes, strict=True))}
+        for sizes in image.chunks
+    ]
+    keys = [
+        (image.name, *(place[part.start] for place, part in zip(places, window, strict=True))) for window in windows
+    ]
+    graph = image.dask.cull(set(keys))
+    if scheduler != "threads":
+        from apertura.core.focus.cluster import formed_elsewhere
+
+        with progress("tiles", len(keys)) as done:
+            for number, tile in formed_elsewhere(graph, keys, scheduler):
+                _write(target, windows[number], tile)
+                done(1)
+        return
+    written = {
+        ("written", *key): (partial(_write, target, window), key) for key, window in zip(keys, windows, strict=True)
+    }
+    tasks = {**graph, **written}
+    with progress("parts of tiles", len(tasks)) as done, Callback(posttask=lambda *_: done(1)):
+        get(tasks, list(written), num_workers=threads)
+
+
+def _write(target: Any, window: Window, tile: NDArray[np.complex64]) -> None:
+    """Write one tile where it belongs."""
+    target[window] = np.where(tile == 0, _NOTHING, tile)

@@ -1,0 +1,237 @@
+"""The synthetic aperture of a pair: where both phase centres were at each pulse, and what follows from it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+
+Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
+"""Pulses and points (point, 3) → (pulse, point) float64."""
+
+_PULSES_AT_ONCE = 256
+_STEPS_IN_A_ROW = 63
+
+
+@dataclass(frozen=True, eq=False)
+class Aperture:
+    """Phase centres of a transmitter–receiver pair, pulse by pulse; one node that does both gives them twice.
+
+    Attributes
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, metres, in one Cartesian frame: ECEF or local.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ or are not (pulse, 3).
+
+    Examples
+    --------
+    >>> along = np.stack([np.arange(5.0), np.zeros(5), np.full(5, 3.0)], -1)
+    >>> aperture = Aperture(along, along)
+    >>> len(aperture), aperture.path(np.array([[0.0, 4.0, 0.0]]))[0], len(aperture[::2])
+    (5, array([10.]), 3)
+    """
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
+            raise ValueError(f"{self.tx_m.shape=}, {self.rx_m.shape=}: both must be (pulse, 3)")
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.tx_m)
+
+    def __getitem__(self, pulses: slice | NDArray[np.bool_] | NDArray[np.int64]) -> "Aperture":
+        """Return the aperture of some pulses; slices are views."""
+        return Aperture(self.tx_m[pulses], self.rx_m[pulses])
+
+    @property
+    def legs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Phase centres of the transmitter and of the receiver."""
+        return self.tx_m, self.rx_m
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """(pulse, 3) float64, midpoints between both phase centres."""
+        return (self.tx_m + self.rx_m) / 2
+
+    def sample(self, most: int) -> slice:
+        """Return a slice that takes evenly spread pulses, fewer than twice `most`.
+
+        Examples
+        --------
+        >>> track = np.zeros((100, 3))
+        >>> len(Aperture(track, track)[Aperture(track, track).sample(30)])
+        34
+        """
+        return slice(None, None, max(1, len(self) // most))
+
+    def blocks(self, count: int) -> list[slice]:
+        """Return slices of consecutive pulses that hold each pulse once, of equal length but for one pulse.
+
+        Examples
+        --------
+        >>> track = np.zeros((7, 3))
+        >>> Aperture(track, track).blocks(3)
+        [slice(0, 2, None), slice(2, 4, None), slice(4, 7, None)]
+        """
+        ends = [number * len(self) // count for number in range(count + 1)]
+        return [slice(*pair) for pair in pairwise(ends)]
+
+    def path(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the total path transmitter → point → receiver.
+
+        Parameters
+        ----------
+        points_m
+            (..., 3) float64, metres, in the frame of the phase centres.
+
+        Returns
+        -------
+        ndarray
+            (pulse, ...) float64, metres.
+
+        Notes
+        -----
+        Source: docs/theory.md, eq. 3.
+        """
+        tx, rx = (np.linalg.norm(points_m - self._against(leg, points_m), axis=-1) for leg in self.legs)
+        return np.asarray(tx + rx)
+
+    def path_gradient(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradient of the total path with respect to the point, (pulse, ..., 3) float64, metres per metre.
+
+        The sum of the unit vectors from both phase centres to the point: times 2πf/c the spatial frequency at which a
+        pulse samples the scene (docs/theory.md, eq. 8).
+        """
+        gradient = np.zeros((len(self), *points_m.shape))
+        for leg in self.legs:
+            apart = points_m - self._against(leg, points_m)
+            gradient += apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+        return gradient
+
+    def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
+        """Return the spread of phase rates over the scene, and the largest against its middle, cycles per pulse.
+
+        Parameters
+        ----------
+        points_m
+            (point, 3) float64, metres: spread over the scene, its middle at the middle of the array.
+        wavelength_m
+            Of the highest frequency.
+
+        Notes
+        -----
+        Source: docs/theory/planner.md, "Pulses". A spread above 1 makes azimuth ambiguities. It is the largest median
+        of 63 steps in a row, so that missed pulses and gaps are not taken for undersampling.
+
+        Examples
+        --------
+        >>> track = np.stack([0.05 * np.arange(50.0), np.zeros(50), np.full(50, 10.0)], -1)
+        >>> points = np.array([[-5.0, 10, 0], [1.25, 10, 0], [7.5, 10, 0]])
+        >>> spread, widest = Aperture(track, track).phase_rates(points, wavelength_m=0.25)
+        >>> 0.3 < spread < 0.4, widest < spread
+        (True, True)
+        """
+        if len(self) < 2:
+            return 0.0, 0.0
+        spread, widest = np.zeros(len(self) - 1), 0.0
+        for first in range(0, len(spread), _PULSES_AT_ONCE):
+            rate = np.diff(self[first : first + _PULSES_AT_ONCE + 1].path(points_m), axis=0)
+            spread[first : first + len(rate)] = np.ptp(rate, axis=1)
+            widest = max(widest, float(np.abs(rate - rate[:, [len(points_m) // 2]]).max()))
+        in_a_row = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
+        return float(np.median(in_a_row, axis=1).max()) / wavelength_m, widest / wavelength_m
+
+    def resolution_cell_m(
+        self, ground_m: NDArray[np.float64], *, band_hz: tuple[float, float], weigh: Weigh | None = None
+    ) -> float:
+        """Return the finest resolution cell of the scene along rows or columns, metres.
+
+        Parameters
+        ----------
+        ground_m
+            (row, column, 3) float64, metres: points spread over the scene, corners included; rows go south.
+        band_hz
+            Lowest and highest frequency.
+        weigh
+            Pulses and points → weights; points of which less than a half is left do not count. By default all count.
+
+        Notes
+        -----
+        Source: docs/theory.md, eq. 8: the inverse of the widest spatial spectrum of a point.
+        """
+        points, some = ground_m.reshape(-1, 3), self.sample(64 if weigh is None else 1024)
+        gradient = self[some].path_gradient(points)
+        if weigh is not None:
+            gradient[weigh(some, points) < 0.5] = np.nan
+        seen = np.isfinite(gradient).all(axis=-1).any(axis=0)
+        gradient, widest = gradient[:, seen], 1e-9
+        for side in (ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]):
+            slope = gradient @ side / max(float(np.linalg.norm(side)), 1e-9)
+            cycles = np.concatenate([slope * frequency / SPEED_OF_LIGHT_M_S for frequency in band_hz])
+            if cycles.size:
+                widest = max(widest, float((np.nanmax(cycles, axis=0) - np.nanmin(cycles, axis=0)).max()))
+        return 1 / widest
+
+    def spectrum(
+        self,
+        point_m: NDArray[np.float64],
+        axes: NDArray[np.float64],
+        *,
+        frequency_hz: NDArray[np.float64],
+        weigh: Weigh | None = None,
+    ) -> NDArray[np.float64]:
+        """Return how wide the spatial spectrum of a point is along some axes: its covariance, cycles² per m².
+
+        Parameters
+        ----------
+        point_m
+            (3,) float64, metres.
+        axes
+            (axis, 3) float64, unit vectors.
+        frequency_hz
+            (frequency,) float64, samples of the band, each counting alike.
+        weigh
+            As of `resolution_cell_m`.
+
+        Returns
+        -------
+        ndarray
+            (axis, axis) float64. The peak of a point whose noise power is ε of its own scatters by
+            ε/2·(4π²·spectrum)⁻¹ (docs/theory/focus.md, eq. 6).
+        """
+        some = self.sample(64 if weigh is None else 1024)
+        slope = self[some].path_gradient(point_m) @ axes.T
+        if weigh is not None:
+            slope = slope[weigh(some, point_m[None])[:, 0] >= 0.5]
+        cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
+        return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
+
+    @property
+    def wobble_m(self) -> float:
+        """RMS distance of the midpoints from their straight line, metres.
+
+        Examples
+        --------
+        >>> along = np.linspace(0, 30, 301)
+        >>> track = np.stack([along, 0.1 * np.sin(4 * np.pi * along / 3), 0 * along], -1)
+        >>> round(Aperture(track, track).wobble_m, 3)  # 0.1/√2
+        0.071
+        """
+        apart = self.middle_m - self.middle_m.mean(axis=0)
+        singular = np.linalg.svd(apart, compute_uv=False)
+        return float(np.sqrt((singular[1:] ** 2).sum() / len(apart)))
+
+    @staticmethod
+    def _against(leg_m: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return phase centres with as many axes more as the points have."""
+        return leg_m.reshape(-1, *(1,) * (points_m.ndim - 1), 3)

@@ -1,0 +1,211 @@
+"""Where things are on Earth: geodetic, projected and Earth-centred coordinates, and turning body axes.
+
+Positions are computed in ECEF (EPSG:4978) float64: no zone, no scale factor, no curvature to model.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Transformer
+
+from apertura.common.errors import CampaignError
+
+ECEF = "EPSG:4978"
+GEODETIC = "EPSG:4979"
+
+LOCAL = "local"
+"""CRS of a frame without a place on Earth: x east, y north, z up, metres."""
+
+LOCAL_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""North, east and down in a local frame, as columns."""
+
+Positions = NDArray[np.float64]
+
+
+def ecef_from_geodetic(latitude_deg: Positions, longitude_deg: Positions, height_m: Positions) -> Positions:
+    """Return ECEF positions of WGS 84 latitude, longitude and ellipsoidal height.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg
+        (...,) float64, degrees, north and east positive.
+    height_m
+        (...,) float64, metres above the ellipsoid.
+
+    Returns
+    -------
+    ndarray
+        (..., 3) float64, metres, ECEF.
+
+    Examples
+    --------
+    >>> ecef_from_geodetic(np.array(0.0), np.array(0.0), np.array(10.0))
+    array([6378147.,       0.,       0.])
+    """
+    transformer = _transformer(GEODETIC, ECEF)
+    return np.stack(transformer.transform(latitude_deg, longitude_deg, height_m), axis=-1)
+
+
+def geodetic_from_ecef(position: Positions) -> Positions:
+    """Return (..., 3) float64 latitude (deg), longitude (deg), ellipsoidal height (m) of ECEF positions (m).
+
+    Examples
+    --------
+    >>> geodetic_from_ecef(np.array([6378147.0, 0.0, 0.0])).round(6) + 0.0
+    array([ 0.,  0., 10.])
+    """
+    transformer = _transformer(ECEF, GEODETIC)
+    return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
+
+
+def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Positions) -> Positions:
+    """Return (..., 3) float64 ECEF positions (m) of easting, northing (m) in `crs` and ellipsoidal height (m).
+
+    Parameters
+    ----------
+    crs
+        Anything pyproj reads, with a geographic origin.
+    x, y
+        (...,) float64, metres, first easting then northing whatever the order the CRS declares.
+    height_m
+        (...,) float64, metres above the ellipsoid.
+
+    Raises
+    ------
+    CampaignError
+        If PROJ has no exact way from `crs` to ECEF or a position comes out infinite.
+
+    Examples
+    --------
+    >>> ecef_from_projected("EPSG:32632", *map(np.array, (500000.0, 0.0, 0.0))).round(2) + 0.0
+    array([6299611.55,  997760.45,       0.  ])
+    """
+    transformer = _transformer(crs, ECEF)
+    position = np.stack(transformer.transform(x, y, height_m), axis=-1)
+    if not np.isfinite(position).all():
+        raise CampaignError(
+            f"positions in {crs} that have no place on Earth",
+            where="scene",
+            expected="coordinates inside the area of use of the CRS",
+            remedy="Check scene.crs and scene.bounds_m.",
+        )
+    return position
+
+
+def projected_from_ecef(crs: str, position: Positions) -> Positions:
+    """Return (..., 3) float64 easting, northing, ellipsoidal height (m) in `crs` of ECEF positions (m)."""
+    transformer = _transformer(ECEF, crs)
+    return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
+
+
+def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) -> Positions:
+    """Return (..., 3) float64 positions (m) in the processing frame: ECEF, or the local axes themselves.
+
+    Parameters
+    ----------
+    crs
+        As `ecef_from_projected`, or 'local'.
+    x, y
+        (...,) float64, metres, easting and northing.
+    height_m
+        (...,) float64, metres above the ellipsoid, or z of the local frame.
+
+    Raises
+    ------
+    CampaignError
+        As `ecef_from_projected`.
+
+    Examples
+    --------
+    >>> frame_from_map("local", [1.0, 2.0], 5.0, 0.5)
+    array([[1. , 5. , 0.5],
+           [2. , 5. , 0.5]])
+    """
+    places = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, height_m)))
+    return np.stack(places, axis=-1) if crs == LOCAL else ecef_from_projected(crs, *places)
+
+
+def map_from_frame(crs: str, position: Positions) -> Positions:
+    """Return (..., 3) float64 easting, northing and height (m) of positions (..., 3) in the processing frame.
+
+    Examples
+    --------
+    >>> place = frame_from_map("EPSG:32632", 500000.0, 5300000.0, 700.0)
+    >>> map_from_frame("EPSG:32632", place).round(6)
+    array([5.0e+05, 5.3e+06, 7.0e+02])
+    """
+    return position if crs == LOCAL else projected_from_ecef(crs, position)
+
+
+@lru_cache(maxsize=64)
+def _transformer(source: str, target: str) -> Transformer:
+    """Return PROJ's way between two systems, kept: it takes milliseconds to find."""
+    if GEODETIC in (source, target):
+        return Transformer.from_crs(source, target)
+    here, there = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
+    return Transformer.from_crs(here, there, always_xy=True, allow_ballpark=False)
+
+
+def ned_axes(position: Positions) -> NDArray[np.float64]:
+    """Return the local geodetic north, east and down unit vectors at ECEF positions.
+
+    Parameters
+    ----------
+    position
+        (..., 3) float64, metres, ECEF.
+
+    Returns
+    -------
+    ndarray
+        (..., 3, 3) float64; columns are north, east, down in ECEF, so it turns NED vectors into ECEF ones.
+
+    Examples
+    --------
+    >>> ned_axes(np.array([6378137.0, 0.0, 0.0])) @ [0.0, 0.0, 1.0] + 0.0
+    array([-1.,  0.,  0.])
+    """
+    latitude, longitude = np.moveaxis(np.radians(geodetic_from_ecef(position)[..., :2]), -1, 0)
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], -1)
+    east = np.stack([-sin_lon, cos_lon, np.zeros_like(cos_lon)], -1)
+    down = np.stack([-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat], -1)
+    return np.stack([north, east, down], axis=-1)
+
+
+def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
+    """Return rotations of forward-right-down body vectors into north-east-down: Rz(yaw)·Ry(pitch)·Rx(roll).
+
+    Parameters
+    ----------
+    attitude_rad
+        (..., 3) float64: roll, pitch, yaw in radians, yaw clockwise from north.
+
+    Returns
+    -------
+    ndarray
+        (..., 3, 3) float64.
+
+    Examples
+    --------
+    >>> (body_axes(np.radians([0.0, 0.0, 90.0])) @ [1.0, 0.0, 0.0]).round(12) + 0.0  # nose east
+    array([0., 1., 0.])
+    """
+    from scipy.spatial.transform import Rotation  # slow to import, and most steps turn no body
+
+    flat = np.reshape(attitude_rad, (-1, 3))
+    matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()
+    return np.asarray(matrices.reshape(*np.shape(attitude_rad)[:-1], 3, 3))
+
+
+def local_crs(name: str) -> str:
+    """Return an engineering CRS for a frame without a place on Earth.
+
+    The form is WKT 1: GeoTIFF does not carry ENGCRS back and forth.
+
+    Examples
+    --------
+    >>> local_crs("gotcha")
+    'LOCAL_CS["gotcha",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    """
+    return f'LOCAL_CS["{name}",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'

@@ -1,0 +1,208 @@
+"""The sector a pixel is integrated over: which pulses of a long flight count for it, and how much."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.geometry.aperture import Aperture, Weigh
+
+TAPER = 0.1
+"""The weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER times the half width."""
+
+_SAMPLES = 4096  # of the window, and 64 times as many of its response
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """How far from the direction of flight's normal a pulse still counts for a pixel.
+
+    With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is how much shorter the total
+    path becomes per metre that both antennas fly together: 0 at the closest approach, 1 straight ahead. A pulse counts
+    for a pixel where s is within `half` of `centre`, with a smooth edge.
+
+    Attributes
+    ----------
+    tx_axis, rx_axis
+        (pulse, 3) float64: what each antenna flies, of the way that both fly together; their lengths sum to 1, or are 0
+        where nothing flies and every pixel is at its closest approach.
+    centre, half
+        Of s; at `centre` ± `half` the weight is one half.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or the half width is not positive.
+
+    Notes
+    -----
+    Source: docs/theory/integration.md, eq. 1 and 3.
+
+    Examples
+    --------
+    >>> track = np.stack([np.linspace(-50, 50, 101), np.zeros(101), np.full(101, 10.0)], -1)
+    >>> flown = Aperture(track, track)
+    >>> sector = Sector.of(flown, chord_m=2.0, centre=0.0, half=0.25)
+    >>> sector.weight(flown, np.array([[0.0, 30.0, 0.0]]))[[50, 40, 0], 0].round(2)
+    array([1., 0., 0.])
+    """
+
+    tx_axis: NDArray[np.float64]
+    rx_axis: NDArray[np.float64]
+    centre: float
+    half: float
+
+    def __post_init__(self) -> None:
+        if self.tx_axis.shape != self.rx_axis.shape or self.tx_axis.ndim != 2 or self.tx_axis.shape[1] != 3:
+            raise ValueError(f"{self.tx_axis.shape=}, {self.rx_axis.shape=}: both must be (pulse, 3)")
+        if not 0 < self.half < np.inf:
+            raise ValueError(f"{self.half=}: must be positive")
+
+    @classmethod
+    def of(cls, aperture: Aperture, *, chord_m: float, centre: float, half: float) -> "Sector":
+        """Return a sector about the directions of flight.
+
+        Parameters
+        ----------
+        aperture
+            In the frame of the pixels.
+        chord_m
+            Way over which a direction is taken: longer than positions err, shorter than the flight turns.
+        centre, half
+            As of a `Sector`.
+        """
+        return cls(*flight_axes(aperture, chord_m=chord_m), centre, half)
+
+    def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Sector":
+        """Return the sector of some pulses."""
+        return replace(self, tx_axis=self.tx_axis[pulses], rx_axis=self.rx_axis[pulses])
+
+    def turned(self, other: "Sector") -> NDArray[np.float64]:
+        """Return how far s may lie from that of a sector of as many other pulses for their axes alone, (pulse,)."""
+        axes = ((self.tx_axis, other.tx_axis), (self.rx_axis, other.rx_axis))
+        return np.asarray(sum(np.linalg.norm(mine - theirs, axis=1) for mine, theirs in axes))
+
+    @property
+    def inner(self) -> float:
+        """Distance from the centre up to which the weight is 1."""
+        return (1 - TAPER) * self.half
+
+    @property
+    def outer(self) -> float:
+        """Distance from the centre from which on it is 0."""
+        return (1 + TAPER) * self.half
+
+    def place(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return s less the centre, (pulse, ...) float64, of points (..., 3) in metres.
+
+        Raises
+        ------
+        ValueError
+            If the aperture is of other pulses.
+        """
+        if len(self.tx_axis) != len(aperture):
+            raise ValueError(f"{len(self.tx_axis)=}: must be one for each of {len(aperture)} pulses")
+        # Products of matrices, about a place so near that squares of distances lose nothing.
+        flat, middle = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
+        seen = flat - middle
+        place = np.full((len(aperture), len(flat)), -self.centre)
+        for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
+            antenna = leg - middle
+            square = antenna @ (-2 * seen.T)
+            square += (antenna**2).sum(axis=1)[:, None]
+            square += (seen**2).sum(axis=1)
+            along = axis @ seen.T
+            along -= (antenna * axis).sum(axis=1)[:, None]
+            along /= np.sqrt(square, out=square)
+            place += along
+        return place.reshape(len(aperture), *points_m.shape[:-1])
+
+    def weight(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the weight of each pulse at each point: as `place`, 0 to 1."""
+        return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
+
+    def over(self, aperture: Aperture) -> Weigh:
+        """Return what weighs some pulses of an aperture at points."""
+        return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
+
+    def slack(
+        self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how far s may lie from its value at a point within some radius of it: as `place`.
+
+        Parameters
+        ----------
+        aperture, points_m
+            As `place`.
+        radius_m
+            Of balls about the points, metres, in a shape that goes with (pulse, ...).
+        """
+        slack = np.zeros((len(aperture), *points_m.shape[:-1]))
+        for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
+            apart = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
+            length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))
+            # a direction turns by asin(radius/range) at most; of two unit vectors so far apart the difference is less
+            turn = np.minimum(1.0, radius_m / np.linalg.norm(apart, axis=-1))
+            slack += length * np.where(turn < 1, np.pi / 2 * turn, 2.0)
+        return slack
+
+
+def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weight at some depth inside a sector, in widths of its edge: 0 at 0, 1 at 1, level at both.
+
+    Examples
+    --------
+    >>> edge(np.array([-1.0, 0.0, 0.5, 1.0, 2.0]))
+    array([0. , 0. , 0.5, 1. , 1. ])
+    """
+    inside = np.clip(depth, 0.0, 1.0)
+    return np.asarray(inside**2 * (3 - 2 * inside))
+
+
+def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the axes of a `Sector`: of each pulse, over the way `chord_m` about it, clipped at the ends.
+
+    Examples
+    --------
+    >>> along = np.stack([np.arange(9.0), np.zeros(9), np.zeros(9)], -1)
+    >>> [axis[4].tolist() for axis in flight_axes(Aperture(along, 0 * along), chord_m=2.0)]
+    [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+    pulses = np.arange(len(aperture))
+    way = np.cumsum(np.linalg.norm(np.diff(aperture.middle_m, axis=0, prepend=aperture.middle_m[:1]), axis=1))
+    step = float(way[-1]) / max(1, len(aperture) - 1)
+    half = int(min(max(1.0, np.ceil(chord_m / 2 / step)), len(aperture))) if step else 1
+    before, after = np.maximum(pulses - half, 0), np.minimum(pulses + half, len(aperture) - 1)
+    flown = [leg[after] - leg[before] for leg in aperture.legs]
+    together = sum(np.linalg.norm(leg, axis=1) for leg in flown)
+    tx, rx = (leg / np.where(together > 0, together, 1.0)[:, None] for leg in flown)
+    return tx, rx
+
+
+def response() -> tuple[float, float]:
+    """Return what the smooth edges make of a point across the flight: width and highest sidelobe.
+
+    Returns
+    -------
+    width : float
+        -3 dB width times the width of the sector's spectrum between its half weights.
+    sidelobe_db : float
+        Highest sidelobe, dB.
+
+    Notes
+    -----
+    Source: docs/theory/integration.md, "Edges".
+
+    Examples
+    --------
+    >>> [round(value, 2) for value in response()]
+    [0.88, -13.44]
+    """
+    place = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * (1 + TAPER)
+    window = edge(((1 + TAPER) - place) / (2 * TAPER))
+    at = np.linspace(0, 4, 2001)  # in inverses of the width between half weights
+    power = np.abs(np.cos(np.pi * np.multiply.outer(at, place)) @ window) ** 2
+    power /= power[0]
+    first = int(np.argmax(np.diff(power) > 0))
+    width = 2 * float(np.interp(-0.5, -power[: first + 1], at[: first + 1]))
+    return width, float(10 * np.log10(power[first:].max()))

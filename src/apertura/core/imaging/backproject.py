@@ -1,0 +1,185 @@
+"""The front door from Python: one call from profiles or phase history to a planned, certified, lazy image."""
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.validation import validated
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import illuminate
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.job import Job
+from apertura.core.imaging.checks import check_inputs
+from apertura.core.imaging.choices import ImagingChoices
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import imaging_job, profiles_job
+from apertura.core.imaging.range_profiles import RangeWindow, range_compress
+from apertura.core.imaging.stages import inputs_of
+from apertura.core.planning.memory import memory_limit
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.budget import MOST_ACCURACY_DB
+from apertura.core.quality.error_bound import CONFIDENCE, ErrorBound, error_bound
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import Terrain, ground_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def backproject(
+    profiles: "Profiles | PhaseHistory | xr.Dataset",
+    grid: SceneGrid,
+    accuracy_db: float = MOST_ACCURACY_DB,
+    *,
+    terrain: Terrain | float | None = None,
+    engine: str = "auto",
+    beams: Beams | None = None,
+    certified_pixels: int = 64,
+    terrain_model: str = "auto",
+    **choices: Any,
+) -> "xr.DataArray":
+    """Return a focused image over a grid: planned for the accuracy asked, lazy until it is computed.
+
+    Parameters
+    ----------
+    profiles
+        Range profiles; or calibrated transfer functions, which are compressed in range first; or a stage `profile` or
+        `echo` of a campaign.
+    grid
+        Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
+    accuracy_db
+        Numerical error asked: RMS over all pixels relative to the exact sum, dB, -120 to -10.
+    terrain
+        Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
+        default.
+    engine
+        'auto' or a key of `apertura.core.focus.engines.ENGINES`.
+    beams
+        Of the antennas; isotropic by default.
+    certified_pixels
+        Random pixels computed both ways at once, for the certificate; 0 for none. A setting that misses the accuracy
+        asked on them gives way to the plan's next.
+    terrain_model
+        'auto', 'plane', 'tilted_plane' or 'dem': what stands for the ground.
+    **choices
+        The others of `apertura.core.imaging.choices.ImagingChoices`: engine_options, presum, pulse_blocks, integration,
+        tile_px (side of a tile, which is a chunk of the array, 256), window (over the subcarriers of a stage `echo`,
+        'hann').
+
+    Returns
+    -------
+    xarray.DataArray
+        (y, x) complex64, carrier kept, 1 is the amplitude of an echo seen by every pulse; a dask array on whatever
+        scheduler the caller has. Attributes: units; the plan: `setting`, `predicted_error_db`, and as JSON `models`
+        (choice → value and reason) and `flags` (limit crossed → what was found); the certificate: `numerical_error_db`,
+        an upper bound at `numerical_error_confidence` for the whole image, and `numerical_error_estimate_db`, against
+        the double sum over pulses and subcarriers, or from profiles alone against their band-limited interpolation in
+        float64.
+
+    Raises
+    ------
+    CampaignError
+        If a choice is not one, positions, samples or heights are not finite, an antenna is in the ground, no echo of
+        the scene arrives, or what is asked cannot run here.
+    ValueError
+        If the scene is deeper than the unambiguous range.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 4 to 6; docs/theory/planner.md.
+
+    Examples
+    --------
+    >>> import apertura as ap
+    >>> frequency = 1.2e9 + 1e6 * np.arange(256)
+    >>> track = np.stack([np.linspace(-4, 4, 128), np.full(128, -20.0), np.full(128, 10.0)], -1)
+    >>> flown = ap.Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = ap.PhaseHistory(echo, frequency, np.full(256, 1 / 256), np.zeros(128), flown)
+    >>> image = ap.backproject(history, ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100)), tile_px=64)
+    >>> image.chunks, image.attrs["numerical_error_db"] < -60
+    (((64, 36), (64, 36)), True)
+    >>> abs(float(abs(image).max()) - 1) < 0.05
+    True
+    """
+    import xarray as xr
+
+    asked = validated(
+        ImagingChoices,
+        {**choices, "accuracy_db": accuracy_db, "engine": engine, "terrain": terrain_model},
+        where="backproject",
+        expected="choices of ImagingChoices",
+    )
+    inputs = inputs_of(profiles, asked.window)
+    ground = ground_of(terrain, grid)
+    flags = check_inputs(inputs, grid, ground)
+    history = inputs if isinstance(inputs, PhaseHistory) else None
+    models = GroundModels.of(ground, None, grid)
+    job = replace(_job(inputs, grid, models, beams, asked.integrated), tile_px=asked.tile_px)
+    compressed = _compressed(inputs, grid, ground, job.beams)
+    plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
+    formation = Formation(history, compressed, grid, plan, asked.tile_px)
+    attributes: dict[str, Any] = {}
+    if certified_pixels:
+        formation, error = _certified(formation, accuracy_db, certified_pixels)
+        attributes = {
+            "numerical_error_db": round(error.bound_db, 2),
+            "numerical_error_confidence": CONFIDENCE,
+            "numerical_error_estimate_db": round(error.estimate_db, 2),
+            "certified_pixels": certified_pixels,
+        }
+        if error.bound_db > accuracy_db:
+            sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
+            flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
+    attributes |= {
+        "units": "1",
+        "long_name": "focused scene, carrier kept",
+        "grid_mapping": "spatial_ref",
+        "setting": formation.plan.setting.line,
+        "predicted_error_db": round(formation.plan.predicted_error_db, 2),
+        "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
+        "flags": json.dumps({**flags, **plan.flags}, ensure_ascii=False),
+    }
+    return xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
+
+
+def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
+    """Return the image by the first setting of the plan that meets the accuracy for sure, or by the last."""
+    pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
+    exact = formation.exact(pixels)
+    error = _error(formation, pixels, exact)
+    for setting in formation.plan.fallbacks:
+        if error.bound_db <= accuracy_db:
+            break
+        formation = replace(formation, plan=formation.plan.fallen_back(setting))
+        error = _error(formation, pixels, exact)
+    return formation, error
+
+
+def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
+    values, power = formation.values(pixels)
+    return error_bound(values, exact, np.ones(len(pixels)), power=power)
+
+
+def _compressed(inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: Terrain, beams: Beams | None) -> Profiles:
+    if isinstance(inputs, Profiles):
+        return inputs
+    window = RangeWindow.of(inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams)
+    return range_compress(inputs, grid, ground, window=window)
+
+
+def _job(
+    inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: GroundModels, beams: Beams | None, integration: Any
+) -> Job:
+    weighed: dict[str, Any] = {"beams": beams, "integration": integration}
+    if isinstance(inputs, Profiles):
+        job = profiles_job(inputs, grid, ground, **weighed)
+    else:
+        known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
+        job = imaging_job(*known, grid, ground, history=inputs, **weighed)
+    lit = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
+    return replace(job, illumination=lit, memory_bytes=memory_limit())

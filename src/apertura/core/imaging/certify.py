@@ -1,0 +1,133 @@
+"""What an image says of itself: its measured numerical error, and what its pixels and its brightest target tell."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.core.focus.tiles import compute_tiles
+from apertura.core.imaging.formation import Formation
+from apertura.core.quality.error_bound import CONFIDENCE, ErrorBound
+from apertura.core.quality.error_check import Brightness, Certificate, random_pixels
+from apertura.core.quality.measures import coherence_factor, survey
+from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.scene.grid import SceneGrid
+
+RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
+"""Recomputed by the reference: anywhere, a tile each as long as they last; and where the image is bright."""
+
+CUT_REACH_M = 3.0
+"""How far the cuts through the brightest target go to both sides."""
+
+
+def certified(
+    formation: Formation,
+    target: Any,
+    *,
+    accuracy_db: float,
+    threads: int,
+    scheduler: str = "threads",
+    rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Return what bounds the error; form tiles that are worse than asked again with the next better settings first.
+
+    Parameters
+    ----------
+    formation
+        What forms the image.
+    target
+        The image where it was written: (y, x) complex64, read and written by blocks.
+    accuracy_db
+        Error asked.
+    threads
+        Tiles in work at once.
+    scheduler
+        Who forms tiles again, as `compute_tiles` takes it.
+    rewriting
+        Told of tiles before they are formed again, so that a run that is killed meanwhile begins them as planned.
+    """
+    certificate = _drawn(formation)
+    settings, redone = iter(formation.plan.fallbacks), []
+    while True:
+        brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
+        uncertified, worse = certificate.failing(target, accuracy_db, power=brightness.mean_power)
+        if not worse or setting is None:
+            error = _error(formation, certificate, target, brightness)
+            if error.bound_db <= accuracy_db or setting is None:
+                break
+            worse = formation.windows  # each tile passes, all of them together do not
+        print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {setting.line}", flush=True)  # noqa: T201
+        image = formation.image_by(setting)
+        rewriting([*uncertified, *worse])
+        for tiles in (uncertified, worse):
+            compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
+        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
+    line = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure), {accuracy_db:.1f} dB asked"
+    return {
+        "numerical_error_db": round(error.bound_db, 2),
+        "numerical_error_confidence": CONFIDENCE,
+        "numerical_error_estimate_db": round(error.estimate_db, 2),
+        "peak_error_db": round(error.peak_db, 2),
+        "certified_pixels": RANDOM_PIXELS + BRIGHT_PIXELS,
+        "redone": redone,
+        "flags": {"accuracy_missed": line} if error.bound_db > accuracy_db else {},
+    }
+
+
+def _drawn(formation: Formation) -> Certificate:
+    pixels = random_pixels(formation.windows, RANDOM_PIXELS, np.random.default_rng(0))
+    return Certificate(formation.windows, pixels, formation.exact(pixels))
+
+
+def _error(formation: Formation, certificate: Certificate, target: Any, brightness: Brightness) -> ErrorBound:
+    """Return the error of the image as it stands; which bright pixels it looks at follows from the image alone."""
+    bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
+    return certificate.error(target, brightness, bright, formation.exact(bright))
+
+
+def measures(formation: Formation, target: Any) -> dict[str, Any]:
+    """Return what one pass over the pixels and a close look at the brightest target tell."""
+    overview, grid = survey(target, formation.windows), formation.grid
+    peak = find_peak(target, overview.row, overview.column)
+    x, y = map(float, grid.map_at(peak.row, peak.column))
+    along = _direction(grid, _flown(formation, peak.row, peak.column), peak.row, peak.column)
+    cuts = {
+        name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
+        for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
+    }
+    (terms,) = formation.contributions(peak.row, peak.column)
+    return {
+        "entropy": round(overview.entropy, 6),
+        "noise_floor_db": overview.noise_floor_db,
+        "brightest": {
+            "x_m": round(x, 4),
+            "y_m": round(y, 4),
+            "amplitude": float(abs(peak.value)),
+            "coherence_factor": coherence_factor(terms),
+            "cross_range_direction": [round(part / (float(np.hypot(*along)) or 1.0), 6) for part in along],
+            **{
+                f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
+                for name, cut in cuts.items()
+                for measure, value in asdict(cut).items()
+            },
+        },
+    }
+
+
+def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float64]:
+    """Return the vector from the transmitter's first to its last place that may see a pixel, metres."""
+    blocks = [(pulses, parts) for pulses, parts in formation.seeing(formation.positions_at([row], [column]))]
+    first, last = blocks[0][0].start + blocks[0][1][0][0].start, blocks[-1][0].start + blocks[-1][1][-1][0].stop - 1
+    track = formation.profiles.aperture.tx_m
+    return np.asarray(track[last] - track[first])
+
+
+def _direction(grid: SceneGrid, vector_m: NDArray[np.float64], row: float, column: float) -> tuple[float, float]:
+    """Return how far (east, north) along the grid's axes a vector of the processing frame points at a pixel."""
+    here, east, north = grid.positions_at([row, row, row - 1], [column, column + 1, column], 0.0)
+    axes = np.stack([east - here, north - here])
+    steps = axes @ vector_m / np.linalg.norm(axes, axis=1)
+    return float(steps[0]), float(steps[1])

@@ -1,0 +1,107 @@
+"""What a person may ask of an image, from Python or in section `processing` of a campaign."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from apertura.core.focus.engines import ENGINES, PATCH_PX, load_engine
+
+
+class Degrees(BaseModel):
+    """So much of a straight pass."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    degrees: float = Field(gt=0, le=180, description="integration angle of a straight pass, degrees")
+
+
+class Resolution(BaseModel):
+    """As much of a pass as a resolution needs."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    resolution_m: float = Field(gt=0, description="resolution along the flight that the angle shall give, m")
+
+
+PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
+"""Choices that are the planner's where they are 'auto'."""
+
+
+def _options_of_each_engine(schema: dict[str, Any]) -> None:
+    engines = {name: load_engine(name).Options.model_json_schema() for name in ENGINES}
+    schema.update(additionalProperties=False, properties=engines)
+
+
+class ImagingChoices(BaseModel):
+    """How to form an image; every choice has a default.
+
+    Examples
+    --------
+    >>> ImagingChoices(accuracy_db=-40).planned["presum"]
+    'auto'
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    window: Literal["hann", "none"] = Field("hann", description="weighting over the subcarriers")
+    accuracy_db: Annotated[float, Field(le=-10, ge=-120)] | Literal["auto"] = Field(
+        "auto",
+        description="numerical error asked of the image, dB; auto: 10 dB below what else spoils it, from -40 to -60",
+    )
+    engine: str = Field(
+        "auto",
+        description=f"backprojection engine: auto, {', '.join(ENGINES)}",
+        json_schema_extra={"enum": ["auto", *ENGINES]},
+    )
+    engine_options: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="options of engines that the planner shall not choose: engine → option → value",
+        examples=[{}],
+        json_schema_extra=_options_of_each_engine,
+    )
+    tile_px: int = Field(256, ge=PATCH_PX, multiple_of=PATCH_PX, description="side of a tile, pixels")
+    presum: Annotated[int, Field(ge=1, le=64)] | Literal["auto"] = Field(
+        "auto", description="pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all"
+    )
+    pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
+        "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
+    )
+    integration: Literal["auto", "all"] | Degrees | Resolution = Field(
+        "auto",
+        description="how much of a pass a pixel is integrated over: auto, what the pixels' spacing carries; all; "
+        "{degrees: x} of a straight pass; {resolution_m: x} along the flight",
+    )
+    terrain: Literal["auto", "plane", "tilted_plane", "dem"] = Field(
+        "auto", description="what stands for the ground; auto takes the simplest that keeps focus and place"
+    )
+
+    @property
+    def planned(self) -> dict[str, Any]:
+        """What the planner is asked."""
+        return {name: getattr(self, name) for name in PLANNED}
+
+    @property
+    def integrated(self) -> Any:
+        """How much of a pass is asked for: 'auto', 'all', or a mapping."""
+        return self.integration if isinstance(self.integration, str) else self.integration.model_dump()
+
+    @field_validator("engine")
+    @classmethod
+    def _engine_is_known(cls, name: str) -> str:
+        if name not in {"auto", *ENGINES}:
+            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
+        return name
+
+    @model_validator(mode="after")
+    def _options_are_those_of_engines(self) -> Self:
+        for name, options in self.engine_options.items():
+            if name not in ENGINES:
+                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
+            try:
+                load_engine(name).Options.model_validate(options)
+            except ValidationError as error:
+                first = error.errors()[0]
+                known = ", ".join(load_engine(name).Options.model_fields) or "none"
+                option = ".".join(map(str, first["loc"]))
+                raise ValueError(f"engine_options.{name}.{option}: {first['msg']} (its options: {known})") from error
+        return self

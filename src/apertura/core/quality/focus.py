@@ -1,0 +1,208 @@
+"""How well an image is focused, told without truth: what each pulse adds at isolated bright points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.quality.measures import coherence_factor
+from apertura.core.quality.sub_apertures import SubApertures
+
+LEAST_BLOCKS = 32
+"""Parts of the aperture that a point must dominate."""
+
+MOST_INTERFERENCE = 0.08
+"""Variance of the logarithm of a point's amplitude over the aperture, above which it does not dominate its cell."""
+
+LEAST_HERE = 0.35
+"""Amplitude at the point itself of the most that a place near it has: less is a sidelobe of an echo elsewhere."""
+
+DEFOCUSED_DB = -1.0
+"""A point that lost more is called defocused."""
+
+_TREND = 5  # degree of the polynomial that patterns, range and aspect draw into log-amplitude
+_PADDING = 8
+_SURE = 5.0
+
+
+@dataclass(frozen=True)
+class PointFocus:
+    """Focus of one point.
+
+    Attributes
+    ----------
+    loss_db
+        Peak power against that of the same contributions in phase, 0 or less, what noise and neighbours cost taken out.
+    interference
+        Power of noise and neighbours against the point's, as its amplitude's unrest tells.
+    pulses
+        Of a block; phase errors faster than that are not seen.
+    snr_db
+        Of the point in the image, from its even and its odd pulses; NaN with fewer than four.
+    coherence, coherence_allowed
+        |Σ s|²/(M Σ|s|²) of what the M pulses add, and what their noise alone would leave of it.
+    """
+
+    loss_db: float
+    interference: float
+    pulses: int
+    snr_db: float
+    coherence: float = 1.0
+    coherence_allowed: float = 1.0
+
+
+def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
+    """Return how well a point is focused; None where none dominates its range cell over the whole aperture.
+
+    Parameters
+    ----------
+    contributions
+        (pulse,) complex128, what each pulse adds at the point, in the order in which they were sent.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 1. Phase errors leave the amplitude of a contribution alone, noise and neighbours
+    turn it as much as they change it: the unrest of the amplitude says how much of the phase's is theirs. Pulses are
+    averaged in blocks, as long as it takes for the point to dominate them.
+
+    Examples
+    --------
+    >>> phase = 0.8 * np.sin(np.arange(400) / 9)
+    >>> focus = point_focus(np.exp(1j * phase))
+    >>> round(focus.loss_db, 1), focus.pulses
+    (-1.4, 1)
+    >>> noise = np.random.default_rng(1).standard_normal((2, 400))
+    >>> point_focus(noise[0] + 1j * noise[1]) is None
+    True
+    """
+    pulses = 1
+    while len(contributions) // pulses >= LEAST_BLOCKS:
+        count = len(contributions) // pulses
+        blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
+        amplitude = np.abs(blocks)
+        if amplitude.min() > 0:
+            unrest = _unrest(np.log(amplitude))
+            if unrest <= MOST_INTERFERENCE:
+                best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
+                if abs(complex(blocks.sum())) < LEAST_HERE * best:
+                    return None
+                loss = (best / amplitude.sum()) ** 2 * (1 + unrest * (1 - 2.5 * unrest) / 2) ** 2
+                snr_db = _snr_db(contributions)
+                allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
+                loss_db = 10 * float(np.log10(min(1.0, loss)))
+                return PointFocus(loss_db, unrest, pulses, snr_db, coherence_factor(contributions), allowed)
+        pulses *= 2
+    return None
+
+
+def _unrest(log_amplitude: NDArray[np.float64]) -> float:
+    along = np.linspace(-1, 1, len(log_amplitude))
+    trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, _TREND)(along)
+    return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))
+
+
+def _snr_db(contributions: NDArray[np.complex128]) -> float:
+    """Return the SNR of a pixel from neighbouring pulses, which differ by noise alone."""
+    count = len(contributions) // 2
+    if count < 2:
+        return float("nan")
+    even, odd = contributions[: 2 * count : 2], contributions[1 : 2 * count : 2]
+    noise = float((np.abs(even - odd) ** 2).mean()) / 2 / (2 * count)
+    power = abs(complex((even + odd).mean()) / 2) ** 2
+    if not power:
+        return float("-inf")
+    return 10 * float(np.log10(max(power - noise, 1e-3 * power) / max(noise, 1e-15 * power)))
+
+
+@dataclass(frozen=True)
+class Focus:
+    """What an image's bright points say of its focus.
+
+    Attributes
+    ----------
+    verdict
+        focused, defocused, or cannot tell.
+    loss_db, std_db
+        Median over the points, weighted by amplitude, and its standard deviation; NaN without points.
+    points
+        How many were measured.
+    why
+        One line: what the verdict rests on.
+    """
+
+    verdict: Literal["focused", "defocused", "cannot tell"]
+    loss_db: float
+    std_db: float
+    points: int
+    why: str
+
+
+def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
+    """Return what bright points say together.
+
+    Parameters
+    ----------
+    points
+        Amplitude and focus of each.
+
+    Examples
+    --------
+    >>> judge([(1.0, PointFocus(-3.0, 0.01, 1, 30.0)), (0.9, PointFocus(-3.2, 0.02, 1, 29.0))]).verdict
+    'defocused'
+    >>> judge([(1.0, None)]).verdict
+    'cannot tell'
+    """
+    seen = [(amplitude, focus) for amplitude, focus in points if focus is not None]
+    if not seen:
+        return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
+    losses = np.array([focus.loss_db for _, focus in seen])
+    own = np.array([_std_db(focus) for _, focus in seen])
+    weights = np.array([amplitude for amplitude, _ in seen])
+    loss = _weighted_median(losses, weights)
+    spread = 1.4826 * _weighted_median(np.abs(losses - loss), weights)
+    std = float(np.hypot(spread, np.median(own)) / np.sqrt(len(seen)))
+    bad = loss < DEFOCUSED_DB - 2 * std
+    line = f"{len(seen)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
+    if not bad and loss < DEFOCUSED_DB:
+        line += f", not more than {-DEFOCUSED_DB:g} dB by two standard deviations"
+    return Focus("defocused" if bad else "focused", loss, std, len(seen), line)
+
+
+def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
+    """Return what images of parts of the aperture say where no bright point says anything.
+
+    Parameters
+    ----------
+    parts
+        Of several patches.
+    cell_m
+        Resolution cell: parts that show a patch further apart cannot add up to a sharp image.
+
+    Examples
+    --------
+    >>> judge_parts(SubApertures(20.0, 0.9, 0.05, 7.0, 7.1), cell_m=0.3).verdict
+    'defocused'
+    >>> judge_parts(SubApertures(20.0, 0.9, 0.5, 7.0, 7.1), cell_m=0.3).verdict
+    'cannot tell'
+    """
+    nothing = float("nan"), float("nan"), 0
+    line = "no bright point dominates its range cell"
+    if parts.drift_m - _SURE * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
+        drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
+        return Focus("defocused", *nothing, f"{line}, and parts of the aperture show the scene {drift} apart")
+    if np.isfinite(parts.entropy):
+        line += f"; entropy {parts.entropy:.2f}, with random phases {parts.entropy_by_chance:.2f}"
+    return Focus("cannot tell", *nothing, line)
+
+
+def _std_db(focus: PointFocus) -> float:
+    """Return how far noise and neighbours may move the loss of one point."""
+    return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) - weights[order] / 2
+    return float(np.interp(weights.sum() / 2, share, values[order]))

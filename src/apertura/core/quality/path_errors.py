@@ -1,0 +1,198 @@
+"""What an error of the total path does to a point: how much peak it costs, where it moves, how it turns the phase."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.geometry.aperture import Aperture
+
+_MOST_PULSES = 200
+
+
+def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
+    """Return how alike errors of position are so far apart in time: what `position_correlation_s` means everywhere.
+
+    Parameters
+    ----------
+    lag_s
+        Any shape, float64, seconds; not negative.
+    correlation_s
+        How long an error lasts, seconds: the length of the moving average that makes it from white noise; 0: each
+        epoch errs for itself.
+
+    Returns
+    -------
+    ndarray
+        As `lag_s`; 1 at once, falling in a straight line to 0 at `correlation_s`.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 3.
+
+    Examples
+    --------
+    >>> autocorrelation(np.array([0.0, 0.5, 1.0, 2.0]), 1.0)
+    array([1. , 0.5, 0. , 0. ])
+    """
+    if correlation_s <= 0:
+        alone: NDArray[np.float64] = (lag_s == 0).astype(np.float64)
+        return alone
+    falling: NDArray[np.float64] = np.clip(1 - lag_s / correlation_s, 0, None)
+    return falling
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What an error does to the image of a point.
+
+    Attributes
+    ----------
+    loss_db
+        Of the peak's power, 0 or less.
+    shift_m
+        Over ground, metres.
+    phase_rad
+        At a place on the ground, against a pair without that error; NaN where that is not predicted.
+    """
+
+    loss_db: float
+    shift_m: float
+    phase_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class PointPaths:
+    """The total paths of one point of the scene, on at most a few hundred pulses.
+
+    Attributes
+    ----------
+    aperture
+        Phase centres.
+    time_s
+        (pulse,) float64, seconds.
+    point_m
+        (3,) float64, in the frame of the phase centres.
+    axes
+        (3, 3) float64, rows are the unit vectors east, north, up at the point.
+    wavelength_m
+        Of the band's middle.
+
+    Examples
+    --------
+    >>> along = np.linspace(-5, 5, 101)
+    >>> track = np.stack([along, np.full(101, -10.0), np.full(101, 10.0)], -1)
+    >>> paths = PointPaths(Aperture(track, track), along, np.zeros(3), np.eye(3), 0.2)
+    >>> higher = paths.of_offset(-paths.gradient[:, 2])  # the point lies a metre higher than it is taken to
+    >>> round(higher.shift_m, 2), round(higher.loss_db, 2) > -0.5
+    (1.0, True)
+    """
+
+    aperture: Aperture
+    time_s: NDArray[np.float64]
+    point_m: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    wavelength_m: float
+
+    @classmethod
+    def of(
+        cls,
+        aperture: Aperture,
+        time_s: NDArray[np.float64],
+        *,
+        point_m: NDArray[np.float64],
+        axes: NDArray[np.float64],
+        wavelength_m: float,
+    ) -> "PointPaths":
+        """Return the paths of a point at evenly spread pulses; parameters as the attributes, of all pulses."""
+        some = aperture.sample(_MOST_PULSES)
+        return cls(aperture[some], time_s[some], point_m, axes, wavelength_m)
+
+    @property
+    def gradient(self) -> NDArray[np.float64]:
+        """(pulse, 3) float64, growth of the path per metre that the point moves east, north, up."""
+        return self.aperture.path_gradient(self.point_m) @ self.axes.T
+
+    @property
+    def rate_m_s(self) -> NDArray[np.float64]:
+        """(pulse,) float64, growth of the path per second as the nodes fly, metres per second."""
+        return np.gradient(self.aperture.path(self.point_m), self.time_s)
+
+    def by_node(self, *, same: bool, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
+        """Return how the path measured grows per metre that a log is wrong, (pulse, 3) east, north, up of each node.
+
+        Parameters
+        ----------
+        same
+            Transmitter and receiver are one node, whose error acts on both legs: one array instead of two.
+        sidelink
+            The echo was divided by a sidelink whose length comes from the same logs.
+
+        Notes
+        -----
+        Source: docs/theory/focus.md, eq. 4.
+        """
+        legs = []
+        for leg in self.aperture.legs:
+            apart = leg - self.point_m
+            legs.append(apart / np.linalg.norm(apart, axis=1, keepdims=True))
+        if same:
+            return ((legs[0] + legs[1]) @ self.axes.T,)
+        if sidelink:
+            between = self.aperture.tx_m - self.aperture.rx_m
+            along = between / np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
+            legs = [legs[0] - along, legs[1] + along]
+        return tuple(leg @ self.axes.T for leg in legs)
+
+    def of_offset(self, error_m: NDArray[np.float64], *, common: bool = False) -> Effect:
+        """Return what an error of the path does.
+
+        Parameters
+        ----------
+        error_m
+            (pulse,) float64, metres by which paths are longer than the image takes them for.
+        common
+            All pairs share its cause, which moves their images nearly alike: what that leaves between their phases is
+            not predicted.
+
+        Notes
+        -----
+        Source: docs/theory/focus.md, eq. 2: what a move over ground explains moves the point, the rest defocuses it.
+        """
+        ground = self.gradient[:, :2]
+        moved = np.linalg.pinv(ground) @ error_m
+        rest = error_m - ground @ moved
+        wavenumber = 2 * np.pi / self.wavelength_m
+        loss_db = 20 * np.log10(max(abs(np.exp(1j * wavenumber * (rest - rest.mean())).mean()), 1e-6))
+        phase_rad = float("nan") if common else float(abs(wavenumber * error_m.mean()))
+        return Effect(float(loss_db), float(np.linalg.norm(moved)), phase_rad)
+
+    def of_noise(self, *parts: tuple[NDArray[np.float64], float]) -> Effect:
+        """Return what random errors of the path that do not know of each other do on average.
+
+        Parameters
+        ----------
+        *parts
+            Standard deviation at each pulse, (pulse,) float64 metres, and how long an error lasts, seconds, as
+            `autocorrelation` takes it.
+
+        Notes
+        -----
+        Source: docs/theory/focus.md, eq. 3.
+        """
+        lag = np.abs(np.subtract.outer(self.time_s, self.time_s))
+        covariance = np.zeros_like(lag)
+        for std_m, correlation_s in parts:
+            covariance += autocorrelation(lag, correlation_s) * np.multiply.outer(std_m, std_m)
+        ground = self.gradient[:, :2]
+        inverse = np.linalg.pinv(ground)
+        keep = np.eye(len(ground)) - ground @ inverse
+        rest = keep @ covariance @ keep
+        wavenumber = 2 * np.pi / self.wavelength_m
+        centred = rest - rest.mean(axis=0) - rest.mean(axis=1)[:, None] + rest.mean()
+        power = float(np.trace(centred)) / len(rest)
+        independent = float(np.trace(centred) ** 2 / max((centred**2).sum(), 1e-300))
+        kept = np.exp(-(wavenumber**2) * power)
+        loss_db = 10 * np.log10(kept + (1 - kept) ** 2 / max(independent, 1.0))
+        shift = np.sqrt(max(0.0, float(np.trace(inverse @ covariance @ inverse.T))))
+        return Effect(float(loss_db), float(shift), float(wavenumber * np.sqrt(covariance.mean())))

@@ -1,0 +1,116 @@
+"""Where `auto` puts the scene: UTM zone, bounds and spacing from the flight and the waveform."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import geodetic_from_ecef, map_from_frame
+from apertura.core.scene.grid import SceneGrid
+
+GRAZING_LIMIT_DEG = 10.0
+"""Ground seen at a lower grazing angle than this is left out of automatic bounds."""
+
+CELLS_PER_PIXEL = 3.0
+"""Pixels per finest resolution cell; 2 would be Nyquist for a band-limited magnitude."""
+
+
+def utm_crs(position: NDArray[np.float64]) -> str:
+    """Return the EPSG code of the WGS 84 UTM zone at an ECEF position; near the poles, of the polar stereographic map.
+
+    Examples
+    --------
+    >>> from apertura.core.geometry.geodesy import ecef_from_geodetic
+    >>> utm_crs(ecef_from_geodetic(*map(np.array, (48.4, 9.95, 600.0))))
+    'EPSG:32632'
+    >>> utm_crs(ecef_from_geodetic(*map(np.array, (-85.0, 9.95, 600.0))))
+    'EPSG:5042'
+    """
+    latitude, longitude, _ = geodetic_from_ecef(position)
+    zones = query_utm_crs_info("WGS 84", AreaOfInterest(longitude, latitude, longitude, latitude))
+    polar = "5041" if latitude > 0 else "5042"
+    return f"EPSG:{zones[0].code if zones else polar}"
+
+
+def auto_bounds(
+    aperture: Aperture,
+    *,
+    crs: str,
+    height_m: float,
+    path_limit_m: float,
+) -> tuple[float, float, float, float]:
+    """Return bounds of the ground that every pulse sees inside the prefix and above the grazing limit.
+
+    Parameters
+    ----------
+    aperture
+        In ECEF or the local frame.
+    crs
+        CRS of the bounds, or 'local'.
+    height_m
+        Ground height, ellipsoidal or z.
+    path_limit_m
+        Longest total path inside the cyclic prefix, metres; inf without.
+
+    Returns
+    -------
+    tuple
+        xmin, ymin, xmax, ymax, whole metres.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 8.
+    """
+    flat = map_from_frame(crs, np.concatenate(aperture.legs))
+    altitude = max(1.0, float(np.median(flat[:, 2])) - height_m)
+    slant = min(path_limit_m / 2, altitude / np.sin(np.radians(GRAZING_LIMIT_DEG)))
+    reach = np.sqrt(max(slant**2 - altitude**2, 1.0))
+    middle = (flat[:, :2].min(axis=0) + flat[:, :2].max(axis=0)) / 2
+    low, high = np.floor(middle - reach), np.ceil(middle + reach)
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def auto_spacing(
+    aperture: Aperture,
+    frequency_hz: NDArray[np.float64],
+    *,
+    crs: str,
+    bounds_m: tuple[float, float, float, float],
+    height_m: float,
+) -> float:
+    """Return a pixel spacing (m, of the series 1-2-5) that resolves the finest cell of the scene.
+
+    The spatial spectrum of a pixel is spanned by the gradient of the phase 2πf·path/c over pulses and
+    frequencies; its largest extent along x or y over all pixels of a coarse grid is the inverse of the cell.
+
+    Parameters
+    ----------
+    aperture
+        In ECEF or the local frame.
+    frequency_hz
+        (subcarrier,) float64.
+    crs, bounds_m, height_m
+        The scene.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 8.
+    """
+    xmin, ymin, xmax, ymax = bounds_m
+    grid = SceneGrid(crs, xmin, ymax, max(xmax - xmin, ymax - ymin) / 8, (8, 8))
+    row, column = np.mgrid[:8, :8]
+    points = grid.positions_at(row, column, height_m)
+    ahead = np.stack([grid.positions_at(row, column + 1e-3, height_m), grid.positions_at(row + 1e-3, column, height_m)])
+    axes = np.moveaxis(ahead - points, 0, -2) / (1e-3 * grid.spacing_m)
+    gradient = aperture[aperture.sample(64)].path_gradient(points)
+    slopes = np.einsum("pyxk,yxak->pyxa", gradient, axes)
+    cycles = np.stack([slopes * f / SPEED_OF_LIGHT_M_S for f in (frequency_hz[0], frequency_hz[-1])])
+    widest = float(np.ptp(cycles.reshape(-1, 8, 8, 2), axis=0).max())
+    return _one_two_five(1.0 / (CELLS_PER_PIXEL * widest))
+
+
+def _one_two_five(value: float) -> float:
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9)))

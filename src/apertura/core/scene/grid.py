@@ -1,0 +1,255 @@
+"""The scene grid as an immutable value: CRS, origin, spacing, shape; sliceable into windows. Heights come with it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apertura.core.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
+from apertura.core.scene.map_crs import axis_attributes, check_crs, grid_mapping
+from apertura.core.scene.pixel_positions import BLOCK_PX, block
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneGrid:
+    """North-up pixels on a map; `apertura.core.scene.terrain` says how high each one lies.
+
+    Attributes
+    ----------
+    crs
+        What pyproj reads, or 'local' for Cartesian axes without a place on Earth (x east, y north, z up).
+    west_m, north_m
+        Outer corner of the whole grid, metres in `crs`.
+    spacing_m
+        Pixel spacing, metres.
+    shape
+        Rows, columns.
+    first
+        Row and column of pixel (0, 0) in the whole grid: a window counts from the whole grid's corner, so that its
+        coordinates are the whole's to the bit.
+    name
+        What GIS software shows for a local frame.
+
+    Raises
+    ------
+    ValueError
+        If the spacing or a side is not positive, or a corner is not finite.
+
+    Examples
+    --------
+    >>> grid = SceneGrid("EPSG:32632", 500000.0, 100.0, 0.5, (40, 60))
+    >>> grid.bounds_m
+    (500000.0, 80.0, 500030.0, 100.0)
+    >>> grid[0:10, 5:10].shape, float(grid[0:10, 5:10].x_m[0]) == float(grid.x_m[5])
+    ((10, 5), True)
+    """
+
+    crs: str
+    west_m: float
+    north_m: float
+    spacing_m: float
+    shape: tuple[int, int]
+    first: tuple[int, int] = (0, 0)
+    name: str = LOCAL
+
+    def __post_init__(self) -> None:
+        if not (0 < self.spacing_m < np.inf and np.isfinite([self.west_m, self.north_m]).all() and min(self.shape) > 0):
+            raise ValueError(
+                f"{self.west_m=}, {self.north_m=}, {self.spacing_m=}, {self.shape=}: must be finite, the spacing and "
+                "both sides positive"
+            )
+
+    @classmethod
+    def from_bounds(
+        cls, crs: str, bounds_m: tuple[float, float, float, float], *, spacing_m: float, name: str = LOCAL
+    ) -> "SceneGrid":
+        """Return the grid anchored at (xmin, ymax) of `bounds_m` (outer pixel edges).
+
+        Raises
+        ------
+        CampaignError
+            If the CRS is unknown, is not in metres, or its area of use does not hold the bounds.
+        """
+        xmin, ymin, xmax, ymax = bounds_m
+        shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
+        if crs != LOCAL:
+            check_crs(crs, bounds_m)
+        return cls(crs, xmin, ymax, spacing_m, shape, name=name)
+
+    @property
+    def frame(self) -> str:
+        """'local', or 'ecef' (EPSG:4978): the frame of positions."""
+        return "local" if self.crs == LOCAL else "ecef"
+
+    @property
+    def crs_wkt(self) -> str:
+        """The CRS of rasters on this grid, as GDAL writes it."""
+        from rasterio.crs import CRS
+
+        return str(CRS.from_user_input(local_crs(self.name) if self.crs == LOCAL else self.crs).to_wkt())
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """Coordinates y, x and spatial_ref of an xarray raster on this grid, as CF wants them."""
+        step, _, west, _, _, north = self.transform
+        reference = {**grid_mapping(self.crs_wkt), "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+        y, x = (axis_attributes(side, projected=self.crs != LOCAL) for side in "yx")
+        return {"y": ("y", self.y_m, y), "x": ("x", self.x_m, x), "spatial_ref": ((), 0, reference)}
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """[xmin, ymin, xmax, ymax], outer pixel edges."""
+        (west, north), (rows, columns) = self._corner, self.shape
+        return (west, north - rows * self.spacing_m, west + columns * self.spacing_m, north)
+
+    @property
+    def transform(self) -> tuple[float, float, float, float, float, float]:
+        """Affine coefficients a…f of (column, row) → (x, y), as rasterio takes them."""
+        west, north = self._corner
+        return (self.spacing_m, 0.0, west, 0.0, -self.spacing_m, north)
+
+    @property
+    def _corner(self) -> tuple[float, float]:
+        return (self.west_m + self.first[1] * self.spacing_m, self.north_m - self.first[0] * self.spacing_m)
+
+    @property
+    def x_m(self) -> Floats:
+        """Pixel centres eastward, (column,) float64."""
+        return self._easting(np.arange(self.shape[1]))
+
+    @property
+    def y_m(self) -> Floats:
+        """Pixel centres from north to south, (row,) float64."""
+        return self._northing(np.arange(self.shape[0]))
+
+    def _easting(self, column: ArrayLike) -> Floats:
+        return np.asarray(self.west_m + (np.asarray(column) + self.first[1] + 0.5) * self.spacing_m, np.float64)
+
+    def _northing(self, row: ArrayLike) -> Floats:
+        return np.asarray(self.north_m - (np.asarray(row) + self.first[0] + 0.5) * self.spacing_m, np.float64)
+
+    def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
+        """Return the grid of a window of rows and columns, without steps."""
+        rows, columns = (range(size)[part] for part, size in zip(window, self.shape, strict=True))
+        first = (self.first[0] + rows.start, self.first[1] + columns.start)
+        return replace(self, first=first, shape=(len(rows), len(columns)))
+
+    def tiles(self, side_px: int) -> Iterator[tuple[slice, slice]]:
+        """Yield the windows of square tiles, row by row; those at the south and east edges may be smaller."""
+        for row in range(0, self.shape[0], side_px):
+            for column in range(0, self.shape[1], side_px):
+                yield (
+                    slice(row, min(row + side_px, self.shape[0])),
+                    slice(column, min(column + side_px, self.shape[1])),
+                )
+
+    def coarse(self, count: int) -> "SceneGrid":
+        """Return the grid of square blocks of pixels, at least `count` along the longer side if it has so many.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 40)).coarse(8)
+        SceneGrid(crs='local', west_m=0.0, north_m=8.0, spacing_m=2.5, shape=(3, 8), first=(0, 0), name='local')
+        """
+        west, north = self._corner
+        side = max(1, max(self.shape) // count)
+        rows, columns = (max(1, size // side) for size in self.shape)
+        return SceneGrid(self.crs, west, north, self.spacing_m * side, (rows, columns), name=self.name)
+
+    def positions(self, height_m: ArrayLike) -> Floats:
+        """Return the pixel centres in the processing frame.
+
+        Parameters
+        ----------
+        height_m
+            Scalar or (row, column) float64: height of all pixels or of each, metres above the ellipsoid of `crs` (z in
+            a local frame).
+
+        Returns
+        -------
+        ndarray
+            (row, column, 3) float64 metres: ECEF, or the local frame's own axes.
+        """
+        height = np.asarray(height_m, np.float64)
+        if self.crs == LOCAL:
+            return frame_from_map(self.crs, *np.meshgrid(self.x_m, self.y_m), height)
+        positions = np.empty((*self.shape, 3))
+        for rows, columns in self._blocks():
+            part = height[rows, columns] if height.ndim else height
+            positions[rows, columns] = self[rows, columns]._positions_in_block(part)
+        return positions
+
+    def _blocks(self) -> Iterator[tuple[slice, slice]]:
+        """Yield the parts of blocks of the whole grid that this window holds."""
+        rows, columns = (
+            [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
+            for first, size in zip(self.first, self.shape, strict=True)
+        )
+        return product(rows, columns)
+
+    def _positions_in_block(self, height_m: Floats) -> Floats:
+        index = (self.first[0] // BLOCK_PX, self.first[1] // BLOCK_PX)
+        polynomials = block(self.crs, (self.north_m, self.west_m), self.spacing_m, index)
+        if not polynomials.exact:
+            return frame_from_map(self.crs, *np.meshgrid(self.x_m, self.y_m), height_m)
+        row, column = (np.arange(size) + at % BLOCK_PX for size, at in zip(self.shape, self.first, strict=True))
+        return polynomials.positions(row, column, height_m)
+
+    def positions_at(self, row: ArrayLike, column: ArrayLike, height_m: ArrayLike) -> Floats:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices; (0, 0) is the first pixel's centre.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 6)).positions_at([0], [1], 2.5)
+        array([[1.5, 3.5, 2.5]])
+        """
+        return frame_from_map(self.crs, self._easting(column), self._northing(row), height_m)
+
+    def map_at(self, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return (..., 2) float64 easting and northing (m) in `crs` of fractional pixel indices."""
+        return np.stack([self._easting(column), self._northing(row)], -1)
+
+    def pixel_of(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Floats, Floats]:
+        """Return fractional row and column of map coordinates (m): what `map_at` takes.
+
+        Examples
+        --------
+        >>> row, column = SceneGrid("local", 0.0, 4.0, 1.0, (4, 6)).pixel_of(1.5, 3.25)
+        >>> float(row), float(column)
+        (0.25, 1.0)
+        """
+        row = (self.north_m - np.asarray(y_m, np.float64)) / self.spacing_m - 0.5 - self.first[0]
+        column = (np.asarray(x_m, np.float64) - self.west_m) / self.spacing_m - 0.5 - self.first[1]
+        return np.asarray(row), np.asarray(column)
+
+    def pixel_below(self, position: Floats) -> Floats:
+        """Return (..., 3) float64 row, column (fractional) and height (m) of positions (..., 3) of the frame.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)).pixel_below(np.array([0.25, 7.75, 3.0]))
+        array([0., 0., 3.])
+        """
+        place = map_from_frame(self.crs, position)
+        return np.stack([*self.pixel_of(place[..., 0], place[..., 1]), place[..., 2]], -1)
+
+    def sample_pixels(self, count: int) -> tuple[Floats, Floats]:
+        """Return rows and columns, (count, count) float64 each, of pixels evenly spread over the grid, with corners.
+
+        Examples
+        --------
+        >>> SceneGrid("local", 0.0, 4.0, 1.0, (4, 7)).sample_pixels(3)[1][0]
+        array([0., 3., 6.])
+        """
+        row, column = (np.linspace(0, size - 1, min(size, count)) for size in self.shape)
+        rows, columns = np.meshgrid(row, column, indexing="ij")
+        return rows, columns
+
+    def sample_points(self, count: int, height_m: float) -> Floats:
+        """Return (count, count, 3) float64 positions (m) of `sample_pixels` at one height; rows go south."""
+        return self.positions_at(*self.sample_pixels(count), height_m)

@@ -1,0 +1,225 @@
+"""Which pulses make a pixel: how many looks it has, and where its aperture is centred, on a lattice over the scene."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import reached
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.lattice import BLOCK_PX, Lattice
+from apertura.core.scene.swath import balls
+from apertura.core.scene.terrain import Terrain
+
+SPREAD = 17
+"""Pulses, evenly spread over those that make a pixel, from which shadow is decided."""
+
+_PULSES = 1024  # that tell the sums of a block of the lattice, or up to twice as many
+_AT_ONCE = 64  # pulses of which reach is decided together
+_EXACT = (64, 8, 1)  # a pulse of so many is asked, until one sees the pixel
+_DARK_PULSES = 64  # that tell the centres of a block that no pulse reaches, for its neighbours
+_UNLIT = 1e6  # how much worse a pulse without weight is as a centre
+_JUMP_PITCHES = 4.0  # between nodes a centre moves less, unless it goes over to another pass
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """What the pulses of an image make of each place; windows are read tile by tile.
+
+    Attributes
+    ----------
+    grid, terrain
+        The scene.
+    aperture, beams
+        Every pulse, and what weighs it; None: all count alike.
+    lattice
+        Nodes at which the following are known.
+    total, squares
+        (node row, node column) float32, Σ|w| and Σw² over the pulses.
+    centres
+        (node row, node column, 2, 3) float64, metres: transmitter and receiver at the closest approach.
+    pulses
+        (node row, node column, `SPREAD`) int32, some of those that weigh half or more; all pulses where none does.
+
+    Notes
+    -----
+    Source: docs/theory/layers.md, sections 1, 2 and 4.
+    """
+
+    grid: SceneGrid
+    terrain: Terrain
+    aperture: Aperture
+    beams: Beams | None
+    lattice: Lattice
+    total: NDArray[np.float32]
+    squares: NDArray[np.float32]
+    centres: Floats
+    pulses: NDArray[np.int32]
+    _asked: dict[tuple[int, int], NDArray[np.uint8] | bool] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, grid: SceneGrid, terrain: Terrain, aperture: Aperture, beams: Beams | None, *, threads: int = 1
+    ) -> "Looks":
+        """Return those of a scene.
+
+        Parameters
+        ----------
+        grid, terrain, aperture, beams
+            As of `Looks`; positions in the grid's processing frame.
+        threads
+            Blocks of the lattice in work at once.
+
+        Examples
+        --------
+        >>> from apertura.core.scene.terrain import FlatGround
+        >>> grid = SceneGrid("local", -4.0, 24.0, 0.5, (8, 16))
+        >>> track = np.stack([np.linspace(-9, 9, 37), np.zeros(37), np.full(37, 10.0)], -1)
+        >>> looks = Looks.of(grid, FlatGround(0.0), Aperture(track, track), None)
+        >>> window = (slice(0, 8), slice(4, 6))
+        >>> looks.effective(window)[0, 0].item(), looks.centre(window)[0][0, 0].round(2).tolist()
+        (37.0, [-1.75, 0.0, 10.0])
+        """
+        lattice = Lattice.of(grid.shape)
+        looks = cls(
+            grid,
+            terrain,
+            aperture,
+            beams,
+            lattice,
+            np.zeros(lattice.shape, np.float32),
+            np.zeros(lattice.shape, np.float32),
+            np.zeros((*lattice.shape, 2, 3)),
+            np.zeros((*lattice.shape, SPREAD), np.int32),
+        )
+        tiles = list(grid.tiles(BLOCK_PX))
+        lit = reached(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(looks._fill, lattice.blocks, lit.T))
+        return looks
+
+    def _fill(self, block: Window, lit: NDArray[np.bool_]) -> None:
+        """Compute the nodes of a block of the lattice from the pulses that may reach it."""
+        rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
+        points = self.terrain.positions_at(self.grid, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
+        some = _reaching(lit, len(self.aperture))
+        every = max(1, (some.stop - some.start) // (_PULSES if lit.any() else _DARK_PULSES))
+        few = slice(some.start, some.stop, every)
+        aperture, beams = self.aperture[few], self.beams and self.beams[few]
+        weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
+        shape, stands_for = (len(rows), len(columns)), (some.stop - some.start) / len(aperture)
+        self.total[block] = (np.abs(weight).sum(axis=0) * stands_for).reshape(shape)
+        self.squares[block] = ((weight**2).sum(axis=0) * stands_for).reshape(shape)
+        self.centres[block] = _centres(aperture, beams, points, weight).reshape(*shape, 2, 3)
+        self.pulses[block] = (some.start + every * _spread(weight)).reshape(*shape, SPREAD)
+
+    def seen(self, tile: Window) -> NDArray[np.bool_]:
+        """Return whether any pulse makes the pixels of a tile, exactly, (row, column).
+
+        Parameters
+        ----------
+        tile
+            One of the grid's tiles of `BLOCK_PX` pixels.
+        """
+        shape = (tile[0].stop - tile[0].start, tile[1].stop - tile[1].start)
+        if self.beams is None:
+            return np.ones(shape, bool)
+        key = (tile[0].start, tile[1].start)
+        if key not in self._asked:
+            seen = self.lattice.amid_positive(self.total, tile)
+            self._ask(seen, tile)
+            self._asked[key] = bool(seen[0, 0]) if (seen == seen[0, 0]).all() else np.packbits(seen)
+        known = self._asked[key]
+        if isinstance(known, bool):
+            return np.full(shape, known)
+        return np.unpackbits(known, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+
+    def _ask(self, seen: NDArray[np.bool_], tile: Window) -> None:
+        """Ask every pulse that may reach them of the pixels of a tile that are not known to be seen, cell by cell."""
+        part, pitch = self.grid[tile], self.lattice.pitch_px
+        cells = [cell for cell in part.tiles(pitch) if not seen[cell].all()]
+        if not cells or self.beams is None:
+            return
+        lit = reached(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=_AT_ONCE)
+        positions = self.terrain.positions(part)
+        for cell, blocks in zip(cells, lit.T, strict=True):
+            unseen = ~seen[cell]
+            mine = np.flatnonzero(np.repeat(blocks, _AT_ONCE)[: len(self.aperture)])
+            seen[cell][unseen] = _any(self.beams, self.aperture, positions[cell][unseen], mine)
+
+    @cached_property
+    def _lit(self) -> NDArray[np.float32]:
+        return (self.total > 0).astype(np.float32)
+
+    def _sums(self, tile: Window) -> list[Floats]:
+        """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
+        lit = self.lattice.between(self._lit, tile)
+        lit[lit == 0] = np.inf
+        return [self.lattice.between(values, tile) / lit for values in (self.total, self.squares)]
+
+    def effective(self, tile: Window) -> NDArray[np.float32]:
+        """Return the looks of the pixels of a tile, (row, column) float32; 0 where none makes them."""
+        total, squares = self._sums(tile)
+        looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
+        return np.where(self.seen(tile), looks, 0).astype(np.float32)
+
+    def centre(self, tile: Window) -> tuple[Floats, Floats]:
+        """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
+        limit_m = _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
+        centre = self.lattice.between(self.centres, tile, farthest=limit_m)
+        return centre[..., 0, :], centre[..., 1, :]
+
+
+def _reaching(lit: NDArray[np.bool_], pulses: int) -> slice:
+    """Return the first to the last pulse of blocks that are lit; all where none is."""
+    blocks = np.flatnonzero(lit)
+    if not blocks.size:
+        return slice(0, pulses)
+    return slice(int(blocks[0]) * _AT_ONCE, min(int(blocks[-1] + 1) * _AT_ONCE, pulses))
+
+
+def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return at which points (point, 3) any of some pulses has a weight."""
+    seen = np.zeros(len(points), bool)
+    for every in _EXACT:
+        for first in range(0, len(pulses), _AT_ONCE * every):
+            some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~seen)
+            if not left.size:
+                return seen
+            seen[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)
+    return seen
+
+
+def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
+    """Return both antennas (point, 2, 3) where each point is passed closest, between pulses too."""
+    sector = None if beams is None else beams.sector
+    apart = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
+    dark = weight == 0
+    apart = apart + _UNLIT * dark
+    column, best = np.arange(len(points)), apart.argmin(axis=0)
+    legs = np.stack(aperture.legs, axis=1)
+    if len(aperture) < 3:
+        return np.asarray(legs[best])
+    inner = np.clip(best, 1, len(aperture) - 2)
+    before, here, after = (apart[inner + step, column] for step in (-1, 0, 1))
+    alike = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
+    bend = before - 2 * here + after
+    fit = (inner == best) & (bend > 0) & alike
+    shift = np.where(fit, (before - after) / np.where(fit, 2 * bend, 1.0), 0.0)  # in pulses, within a half
+    beside = best + np.where(fit, np.sign(shift), 0).astype(np.int64)
+    return np.asarray(legs[best] + np.abs(shift)[:, None, None] * (legs[beside] - legs[best]))
+
+
+def _spread(weight: Floats) -> NDArray[np.int64]:
+    """Return pulses (point, `SPREAD`) evenly spread over those that weigh half or more of the most, of all if none."""
+    size = np.abs(weight)
+    count = np.cumsum(size >= size.max(axis=0) / 2, axis=0)
+    wanted = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
+    return np.stack([(count >= number).argmax(axis=0) for number in wanted], axis=-1)

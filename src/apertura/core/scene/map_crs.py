@@ -1,0 +1,151 @@
+"""What a scene's CRS must be: known to PROJ, projected in metres, and usable where the scene lies."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
+
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic, projected_from_ecef
+
+MARGIN_DEG = 3.0
+"""How far beyond its area of use a projection may be used: half a UTM zone, where distances grow by half a per cent."""
+
+RETURN_M = 1e-3
+"""Places that do not come back to their coordinates this closely are beyond a projection."""
+
+_WHERE = "scene"
+
+
+def grid_mapping(crs_wkt: str) -> dict[str, str | float]:
+    """Return the attributes of a CF grid mapping: the CRS as it is written elsewhere, and its parameters by name.
+
+    Examples
+    --------
+    >>> grid_mapping(CRS("EPSG:32632").to_wkt())["grid_mapping_name"]
+    'transverse_mercator'
+    >>> grid_mapping('LOCAL_CS["local",UNIT["metre",1]]')
+    {'crs_wkt': 'LOCAL_CS["local",UNIT["metre",1]]'}
+    """
+    return {**CRS(crs_wkt).to_cf(), "crs_wkt": crs_wkt}
+
+
+def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
+    """Return the attributes of coordinate 'x' or 'y' of a raster, as CF names them.
+
+    Examples
+    --------
+    >>> axis_attributes("x", projected=False)
+    {'units': 'm', 'axis': 'X', 'long_name': 'easting'}
+    """
+    standard = {"standard_name": f"projection_{side}_coordinate"} if projected else {}
+    return {"units": "m", "axis": side.upper(), "long_name": {"x": "easting", "y": "northing"}[side], **standard}
+
+
+def horizontal_crs(crs: str) -> CRS:
+    """Return a CRS that PROJ knows and that has no heights of its own; raise CampaignError for any other.
+
+    Examples
+    --------
+    >>> horizontal_crs("EPSG:5555")
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: scene: crs EPSG:5555 (ETRS89 / UTM zone 32N + DHHN92 height) has ...
+    """
+    try:
+        system = CRS(crs)
+    except ProjError as error:
+        raise CampaignError(
+            f"crs {crs!r} is unknown to PROJ",
+            where=_WHERE,
+            expected="an EPSG code such as EPSG:32632, auto, or local",
+            remedy="Correct scene.crs.",
+        ) from error
+    if system.is_compound:
+        horizontal = system.sub_crs_list[0]
+        raise CampaignError(
+            f"crs {crs} ({system.name}) has heights of its own",
+            where=_WHERE,
+            expected="the horizontal part alone: heights count from what height_datum or dem_datum says",
+            remedy=f"Set scene.crs to {':'.join(horizontal.to_authority() or (horizontal.name,))}.",
+        )
+    return system
+
+
+def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
+    """Raise CampaignError unless `crs` is projected in metres and usable at the bounds: near its area of use.
+
+    Parameters
+    ----------
+    crs
+        What pyproj reads.
+    bounds_m
+        xmin, ymin, xmax, ymax, metres.
+
+    Examples
+    --------
+    >>> check_crs("EPSG:32632", (5e5, 5e6, 5e5 + 10, 5e6 + 10))
+    >>> check_crs("EPSG:4326", (0, 0, 1, 1))
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: scene: crs EPSG:4326 (WGS 84) is not projected in metres; ...
+    """
+    system = horizontal_crs(crs)
+    if not system.is_projected or any(axis.unit_name != "metre" for axis in system.axis_info):
+        raise CampaignError(
+            f"crs {crs} ({system.name}) is not projected in metres",
+            where=_WHERE,
+            expected="a projected CRS in metres, such as a UTM zone",
+            remedy="Choose another scene.crs.",
+        )
+    try:
+        _check_usable(system, bounds_m)
+        projected_from_ecef(crs, ecef_from_geodetic(*(np.array(angle) for angle in (0.0, 0.0, 0.0))))
+    except ProjError as error:  # such as a datum that only a grid of shifts leads to
+        raise CampaignError(
+            f"PROJ knows no exact way here from {crs} ({system.name}) to WGS 84",
+            where=_WHERE,
+            expected="a CRS that is defined by an ellipsoid and a shift, or whose grids PROJ finds",
+            remedy="Get its grid with `projsync`, or choose another scene.crs, such as the UTM zone of the place.",
+        ) from error
+
+
+def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
+    """Refuse corners from which the projection does not lead back, or that lie far from its area of use."""
+    area = system.area_of_use
+    inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
+    xmin, ymin, xmax, ymax = bounds_m
+    corners = np.array([[xmin, xmax, xmin, xmax], [ymin, ymin, ymax, ymax]])
+    longitudes, latitudes = inverse.transform(corners[0], corners[1])
+    returned = np.array(inverse.transform(longitudes, latitudes, direction=TransformDirection.INVERSE))
+    finite = np.where(np.isfinite(returned), returned, np.nan)
+    usable = (np.abs(finite - corners) < RETURN_M).all(axis=0)  # False of what is not finite
+    if area is not None:
+        usable &= _near(area.bounds, longitudes, latitudes)
+    if usable.all():
+        return
+    first = int(np.argmin(usable))
+    near = ""
+    if area is not None:
+        near = (
+            f"within {MARGIN_DEG:g} degrees of the area of use of {system.name}: "
+            f"longitude {area.west} to {area.east}, latitude {area.south} to {area.north}"
+        )
+    raise CampaignError(
+        f"bounds_m {list(bounds_m)} reach longitude {longitudes[first]:.4f}, latitude {latitudes[first]:.4f}",
+        where=_WHERE,
+        expected=near or f"places that {system.name} can show",
+        remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
+    )
+
+
+def _near(
+    area_deg: tuple[float, float, float, float], longitude: NDArray[np.float64], latitude: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which places lie within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
+    west, south, east, north = area_deg
+    width = (east - west) % 360 or 360.0
+    longitude = np.where(np.isfinite(longitude), longitude, np.nan)  # nowhere: near nothing
+    inside = (longitude - west + MARGIN_DEG) % 360 <= width + 2 * MARGIN_DEG
+    return np.asarray(inside & (latitude >= south - MARGIN_DEG) & (latitude <= north + MARGIN_DEG))

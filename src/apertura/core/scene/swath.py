@@ -1,0 +1,94 @@
+"""Total paths from each pulse to the scene, bounded by blocks of pixels."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import reached
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import Terrain
+
+_BLOCKS = 33
+_PULSES_AT_ONCE = 256
+_MOST_PULSES = 4096  # whose paths are taken each
+
+
+def swath(
+    grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, beams: Beams | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the shortest and longest total path from each pulse to the scene.
+
+    About 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
+    total path changes by at most twice the radius. Of a long flight some pulses stand for those about them: a path
+    changes by at most what both antennas move.
+
+    Parameters
+    ----------
+    grid, terrain
+        The scene and its ground.
+    aperture
+        In the grid's processing frame.
+    beams
+        What weighs pulses: blocks of pixels to which a pulse cannot add do not count.
+
+    Returns
+    -------
+    tuple of ndarray
+        (pulse,) float64 metres each; never longer, never shorter than any pixel's path. Infinite and minus infinite for
+        a pulse that adds to none.
+
+    Examples
+    --------
+    >>> from apertura.core.scene.terrain import FlatGround
+    >>> grid = SceneGrid("local", 0.0, 10.0, 1.0, (10, 10))
+    >>> near, far = swath(grid, FlatGround(0.0), Aperture(*2 * [np.array([[-20.0, 5.0, 0.0]])]))
+    >>> bool(near[0] <= 41.02), bool(far[0] >= 59.0)
+    (True, True)
+    """
+    side = (
+        -(-max(grid.shape) // _BLOCKS) if beams is None else math.isqrt(grid.shape[0] * grid.shape[1] // _BLOCKS**2) + 1
+    )
+    middle_m, radius_m = balls(grid, terrain, list(grid.tiles(side)))
+    every = 1 + (len(aperture) - 1) // _MOST_PULSES
+    nearest, farthest = np.empty((2, len(aperture)))
+    for first in range(0, len(aperture), every * _PULSES_AT_ONCE):
+        pulses = slice(first, first + every * _PULSES_AT_ONCE)
+        near, far = _spans(aperture[pulses], beams and beams[pulses], middle_m, radius_m, every)
+        nearest[pulses], farthest[pulses] = near, far
+    return nearest, farthest
+
+
+def _spans(
+    aperture: Aperture,
+    beams: Beams | None,
+    middle_m: NDArray[np.float64],
+    radius_m: NDArray[np.float64],
+    every: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the swath of some pulses, `every` so many of which one stands for those about it."""
+    block = np.arange(len(aperture)) // every
+    middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
+    moved = sum(
+        np.linalg.norm(leg - there[block], axis=1) for leg, there in zip(aperture.legs, middle.legs, strict=True)
+    )
+    path = middle.path(middle_m)
+    near, far = path - 2 * radius_m, path + 2 * radius_m
+    if beams is not None:
+        dark = ~reached(beams, aperture, middle_m, radius_m, pulses=every)
+        near[dark], far[dark] = np.inf, -np.inf
+    return near.min(axis=1)[block] - moved, far.max(axis=1)[block] + moved
+
+
+def balls(
+    grid: SceneGrid, terrain: Terrain, windows: Sequence[tuple[slice, slice]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return middles (window, 3) and radii (window,), metres, of balls that hold the pixels of windows of a scene."""
+    centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
+    half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
+    low, high = np.array([[(height := terrain.heights(grid[window])).min(), height.max()] for window in windows]).T
+    middle_m = grid.positions_at(centre[:, 0], centre[:, 1], (low + high) / 2)
+    return middle_m, np.sqrt((half_m**2).sum(axis=1) + ((high - low) / 2) ** 2)

@@ -1,0 +1,244 @@
+"""The ground under a scene, told in one way: at one height, a plane, or heights from a DEM.
+
+Whoever needs heights holds a `Terrain` and asks it for those of a grid, of a window of it, or of single pixels.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.core.scene.grid import SceneGrid
+
+Floats = NDArray[np.float64]
+
+_TILE_PX = 512  # heights at single pixels are read by such tiles
+
+
+class Terrain(Protocol):
+    """Heights of the ground; a subclass gives `heights`, the rest follows from it."""
+
+    def heights(self, grid: SceneGrid) -> Floats:
+        """Return the height of each pixel of a grid or of a window of it.
+
+        Parameters
+        ----------
+        grid
+            Pixels; each one has the same height, to the bit, in whatever window it is asked for.
+
+        Returns
+        -------
+        ndarray
+            (row, column) float64, metres above the ellipsoid of `grid.crs` (z in a local frame).
+        """
+
+    def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return (...,) float64 heights (m) at fractional pixel indices, bilinear between pixels; NaN off the grid."""
+        rows, columns = (np.asarray(axis, np.float64) for axis in np.broadcast_arrays(row, column))
+        heights = np.full(rows.shape, np.nan)
+        for tile in grid.tiles(_TILE_PX):
+            inside = np.logical_and(*(_within(part, at) for part, at in zip(tile, (rows, columns), strict=True)))
+            if inside.any():
+                at = [
+                    np.clip(axis[inside], 0, size - 1) for axis, size in zip((rows, columns), grid.shape, strict=True)
+                ]
+                first = [int(axis.min()) for axis in at]
+                window = slice(first[0], int(at[0].max()) + 2), slice(first[1], int(at[1].max()) + 2)
+                heights[inside] = bilinear(self.heights(grid[window])[None], at[0] - first[0], at[1] - first[1])[0]
+        return heights
+
+    def positions(self, grid: SceneGrid) -> Floats:
+        """Return (row, column, 3) float64 positions (m) of the pixels in the processing frame, on the ground."""
+        return grid.positions(self.heights(grid))
+
+    def positions_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return (..., 3) float64 positions (m) of fractional pixel indices, on the ground."""
+        return grid.positions_at(row, column, self.heights_at(grid, row, column))
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """Numbers that tell the ground, as JSON values for provenance; none where a file or stage tells it."""
+        return {}
+
+
+@dataclass(frozen=True)
+class FlatGround(Terrain):
+    """Ground at one height.
+
+    Attributes
+    ----------
+    height_m
+        Metres above the ellipsoid, or z of the local frame.
+
+    Examples
+    --------
+    >>> FlatGround(620.0).heights(SceneGrid("local", 0.0, 2.0, 1.0, (2, 3)))
+    array([[620., 620., 620.],
+           [620., 620., 620.]])
+    """
+
+    height_m: float
+
+    def heights(self, grid: SceneGrid) -> Floats:
+        """Return the one height at every pixel; no memory is spent on it."""
+        return np.broadcast_to(np.float64(self.height_m), grid.shape)
+
+    def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:  # noqa: ARG002
+        """Return the one height; flat ground goes on beside the grid."""
+        return np.full(np.broadcast_shapes(np.shape(row), np.shape(column)), self.height_m)
+
+    def positions(self, grid: SceneGrid) -> Floats:
+        """Return the pixels' positions: one height takes one polynomial."""
+        return grid.positions(self.height_m)
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The height."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Plane(Terrain):
+    """A tilted plane over the map.
+
+    Attributes
+    ----------
+    x_m, y_m, height_m
+        A point of it: easting and northing in the grid's CRS, height above the ellipsoid (z in a local frame).
+    east, north
+        Rise per metre eastward and northward.
+
+    Examples
+    --------
+    >>> Plane(0.5, 1.5, 10.0, east=0.1, north=-1.0).heights(SceneGrid("local", 0.0, 2.0, 1.0, (2, 3)))
+    array([[10. , 10.1, 10.2],
+           [11. , 11.1, 11.2]])
+    """
+
+    x_m: float
+    y_m: float
+    height_m: float
+    east: float
+    north: float
+
+    @classmethod
+    def through(cls, grid: SceneGrid, height_m: Floats) -> "Plane":
+        """Return the least-squares plane through heights (row, column) at the pixels of a grid, metres.
+
+        Examples
+        --------
+        >>> plane = Plane(0.0, 0.0, 620.0, east=0.2, north=0.1)
+        >>> grid = SceneGrid("local", 0.0, 30.0, 1.0, (30, 40))
+        >>> bool(np.allclose(Plane.through(grid, plane.heights(grid)).heights(grid), plane.heights(grid)))
+        True
+        """
+        x, y = np.meshgrid(grid.x_m - grid.x_m[0], grid.y_m - grid.y_m[0])
+        basis = np.stack([np.ones(x.size), x.ravel(), y.ravel()], -1)
+        height, east, north = np.linalg.lstsq(basis, height_m.ravel() - height_m.mean())[0]
+        return cls(float(grid.x_m[0]), float(grid.y_m[0]), float(height_m.mean() + height), float(east), float(north))
+
+    def heights(self, grid: SceneGrid) -> Floats:
+        """Return the plane's height at every pixel."""
+        return self._over(grid.x_m, grid.y_m[:, None])
+
+    def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
+        """Return the plane's heights; it goes on beside the grid."""
+        place = grid.map_at(*np.broadcast_arrays(row, column))
+        return self._over(place[..., 0], place[..., 1])
+
+    def _over(self, x_m: Floats, y_m: Floats) -> Floats:
+        return np.asarray(self.height_m + self.east * (x_m - self.x_m) + self.north * (y_m - self.y_m))
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """A point and the slope."""
+        return asdict(self)
+
+
+def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
+    """Return the ground that was given, flat where it is one height; in a local frame it may be left out, and is at 0.
+
+    Raises
+    ------
+    CampaignError
+        If it was left out of a grid on Earth.
+
+    Examples
+    --------
+    >>> ground_of(2.5, SceneGrid("local", 0.0, 0.0, 1.0, (4, 4)))
+    FlatGround(height_m=2.5)
+    """
+    if terrain is None and grid.frame == "ecef":
+        raise CampaignError(
+            "no terrain for a grid on Earth",
+            where="terrain",
+            expected=f"how high the ground of {grid.crs} is above its ellipsoid",
+            remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
+        )
+    return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
+
+
+class _Array(Protocol):
+    def __getitem__(self, window: tuple[slice, slice], /) -> Any: ...
+
+
+@dataclass(frozen=True, eq=False)
+class GridHeights(Terrain):
+    """Heights known at the pixels of one grid, such as the stage `terrain`.
+
+    Attributes
+    ----------
+    grid
+        The whole grid.
+    height_m
+        (row, column) float64 metres, read by windows: a numpy or a zarr array.
+
+    Examples
+    --------
+    >>> grid = SceneGrid("local", 0.0, 2.0, 1.0, (2, 3))
+    >>> GridHeights(grid, np.arange(6.0).reshape(2, 3)).heights_at(grid, 0.5, [0.0, 1.5])
+    array([1.5, 3. ])
+    """
+
+    grid: SceneGrid
+    height_m: _Array
+
+    def heights(self, grid: SceneGrid) -> Floats:
+        """Return the heights of a window of the grid; of other grids bilinear between its pixels."""
+        if (grid.crs, grid.west_m, grid.north_m, grid.spacing_m) != (
+            self.grid.crs, self.grid.west_m, self.grid.north_m, self.grid.spacing_m,
+        ):  # fmt: skip
+            return self.heights_at(self.grid, *self.grid.pixel_of(grid.x_m, grid.y_m[:, None]))
+        rows, columns = (slice(at, at + size) for at, size in zip(grid.first, grid.shape, strict=True))
+        return np.asarray(self.height_m[rows, columns], np.float64)
+
+
+def bilinear(values: Floats, row: Floats, column: Floats) -> Floats:
+    """Return (layer, ...) values between pixels; one that has no weight does not count, even if it is NaN.
+
+    Parameters
+    ----------
+    values
+        (layer, row, column) float64.
+    row, column
+        Fractional indices, broadcast against each other; beyond the edges the slope of the last two goes on.
+    """
+    first = [
+        np.clip(np.floor(axis), 0, max(0, size - 2)).astype(np.int64)
+        for axis, size in zip((row, column), values.shape[1:], strict=True)
+    ]
+    second = [np.minimum(at + 1, size - 1) for at, size in zip(first, values.shape[1:], strict=True)]
+    down, right = row - first[0], column - first[1]
+    corners = [values[:, r, c] for r in (first[0], second[0]) for c in (first[1], second[1])]
+    return _between(_between(corners[0], corners[1], right), _between(corners[2], corners[3], right), down)
+
+
+def _between(low: Floats, high: Floats, share: Floats) -> Floats:
+    mixed = (1 - share) * low + share * high
+    return np.where(np.abs(share) < 1e-9, low, np.where(np.abs(share - 1) < 1e-9, high, mixed))
+
+
+def _within(part: slice, at: Floats) -> NDArray[np.bool_]:
+    return np.asarray((at >= part.start - 0.5) & (at < part.stop - 0.5))

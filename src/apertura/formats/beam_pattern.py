@@ -1,0 +1,59 @@
+"""Antenna patterns as CSV: cut, angle_deg, gain_db."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, quoted
+from apertura.core.antenna.pattern import LIMITS_RAD
+from apertura.formats.tracks.tables import numbers, read_table
+
+Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""One sampled cut: angles from boresight (deg), growing, and gain (dB)."""
+
+_LARGEST_DB = 300.0
+_COLUMNS = ["cut", "angle_deg", "gain_db"]
+
+
+def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
+    """Return the azimuth and elevation cuts of a CSV file.
+
+    Its columns are cut (azimuth or elevation), angle_deg (growing within each cut, from boresight) and gain_db.
+
+    Raises
+    ------
+    CampaignError
+        If a column or a cut is missing, a cell is not a number, or angles do not grow or reach too far.
+    """
+    try:
+        table = read_table(path, _COLUMNS)
+        unknown = sorted(set(table["cut"].fillna("").astype(str)) - LIMITS_RAD.keys())
+        if unknown:
+            raise ValueError(f"a cut called {quoted(unknown[0])}")
+        azimuth, elevation = (_samples(table[table["cut"] == name], name) for name in LIMITS_RAD)
+    except (ValueError, ArithmeticError) as error:
+        raise CampaignError(
+            str(error).partition("\n")[0],
+            where=path,
+            expected="columns cut (azimuth, elevation), angle_deg and gain_db, with growing angles in both cuts",
+            remedy="Correct the table: one line per sample, first one cut, then the other.",
+        ) from error
+    return azimuth, elevation
+
+
+def _samples(cut: pd.DataFrame, name: str) -> Samples:
+    angle, gain = numbers(cut[["angle_deg", "gain_db"]]).T
+    limit = np.degrees(LIMITS_RAD[name])
+    if len(angle) < 3:
+        raise ValueError(f"{len(angle)} samples of the {name} cut, at least 3 are needed")
+    if not (np.isfinite(angle).all() and np.isfinite(gain).all()):
+        raise ValueError(f"the {name} cut holds a cell that is not a number")
+    if np.abs(gain).max() > _LARGEST_DB:
+        raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut")
+    if not (np.diff(angle) > 0).all():
+        raise ValueError(f"angles of the {name} cut do not grow")
+    if angle[0] < -limit or angle[-1] > limit:
+        raise ValueError(f"angles of the {name} cut go from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
+    return angle, gain

@@ -1,0 +1,152 @@
+"""The files of a campaign folder as they are written: config, flights, codes, SigMF recordings, flight logs."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from apertura.common.atomic import replacement
+from apertura.common.errors import CampaignError
+
+DATATYPES = {"int8": "ci8", "int16": "ci16_le", "int32": "ci32_le", "float32": "cf32_le"}
+"""dtype of I and Q → as SigMF names it."""
+
+
+@contextmanager
+def new_folder(directory: Path) -> Iterator[Path]:
+    """Yield where to write a campaign folder that is new or empty; it is renamed when complete.
+
+    Raises
+    ------
+    CampaignError
+        If the folder holds something already.
+    """
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise CampaignError(
+            "something is there already",
+            where=directory,
+            expected="a new or empty folder for the campaign",
+            remedy="Remove it or choose another name.",
+        )
+    with replacement(directory) as root:
+        (root / "config").mkdir(parents=True)
+        (root / "raw").mkdir()
+        yield root
+
+
+def write_config(
+    root: Path, document: Mapping[str, Any], flights: Iterable[tuple[str, str, str, Iterable[str]]]
+) -> None:
+    """Write config/config.yaml and config/flights.tsv.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    document
+        The config, plain values.
+    flights
+        Name, kind, transmitter and nodes of each.
+    """
+    text = yaml.safe_dump(dict(document), sort_keys=False)
+    (root / "config" / "config.yaml").write_text(text, encoding="utf-8")
+    rows = ["\t".join((name, kind, transmitter, ",".join(nodes))) for name, kind, transmitter, nodes in flights]
+    table = "\n".join(("flight\tkind\ttransmitter\tnodes", *rows)) + "\n"
+    (root / "config" / "flights.tsv").write_text(table, encoding="utf-8")
+
+
+def write_recording(
+    stem: Path,
+    blocks: Iterable[NDArray[Any]],
+    captures: Iterable[tuple[int, np.datetime64, int | None]],
+    *,
+    channels: Sequence[str],
+    sample_rate_hz: float,
+    frequency_hz: float,
+    extra: Mapping[str, Any],
+) -> None:
+    """Write `stem`.sigmf-data and `stem`.sigmf-meta.
+
+    Parameters
+    ----------
+    stem
+        raw/<flight>/<node>; the file name is the node's name.
+    blocks
+        (sample, channel, 2), I and Q of a dtype of `DATATYPES`, in order; never held all at once.
+    captures
+        Of each trigger the first sample, the node's own UTC tag (datetime64, written to its unit) and the frame
+        number sent, if any.
+    frequency_hz
+        RF frequency at baseband zero.
+    extra
+        More keys for the global object.
+
+    Notes
+    -----
+    Source: SigMF specification 1.2.
+    """
+    digest, datatype = hashlib.sha512(), "ci16_le"
+    with stem.with_name(f"{stem.name}.sigmf-data").open("wb") as stream:
+        for block in blocks:
+            datatype = DATATYPES[block.dtype.name]
+            data = np.ascontiguousarray(block, block.dtype.newbyteorder("<")).tobytes()
+            digest.update(data)
+            stream.write(data)
+    header = {
+        "core:datatype": datatype,
+        "core:sample_rate": sample_rate_hz,
+        "core:version": "1.2.5",
+        "core:num_channels": len(channels),
+        "core:sha512": digest.hexdigest(),
+        "core:description": f"{stem.parent.name} {stem.name}",
+        "core:extensions": [{"name": "apertura", "version": "0.1.0", "optional": True}],
+        "apertura:channels": list(channels),
+        "apertura:node": stem.name,
+        **extra,
+    }
+    segments = [
+        {
+            "core:sample_start": start,
+            "core:frequency": frequency_hz,
+            "core:datetime": f"{np.datetime_as_string(time_utc)}Z",
+            **({} if frame is None else {"apertura:frame": frame}),
+        }
+        for start, time_utc, frame in captures
+    ]
+    meta = {"global": header, "captures": segments, "annotations": []}
+    stem.with_name(f"{stem.name}.sigmf-meta").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+
+
+def write_csv_log(
+    path: Path,
+    time_utc: NDArray[np.datetime64],
+    geodetic: NDArray[np.float64],
+    attitude_rad: NDArray[np.float64] | None,
+) -> None:
+    """Write a flight controller's log as .csv.
+
+    Parameters
+    ----------
+    time_utc
+        (epoch,) datetime64, UTC, written to its unit.
+    geodetic
+        (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
+    attitude_rad
+        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged.
+    """
+    columns = ["time_utc", "latitude_deg", "longitude_deg", "height_m"]
+    cells = [[f"{text}Z" for text in np.datetime_as_string(time_utc)]]
+    cells += [[f"{one:.{digits}f}" for one in column] for column, digits in zip(geodetic.T, (11, 11, 5), strict=True)]
+    if attitude_rad is not None:
+        columns += ["roll_deg", "pitch_deg", "yaw_deg"]
+        turned = np.degrees(attitude_rad)
+        turned[:, 2] %= 360
+        cells += [[f"{one:.4f}" for one in column] for column in turned.T]
+    lines = [",".join(columns), *map(",".join, zip(*cells, strict=True))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,251 @@
+"""A whole run as an RO-Crate, profile Provenance Run Crate 0.5: what was run, by which code, on what, and what it made.
+
+The crate's root is the folder of results. What lies outside, recordings and config, stands in it by name and hash as
+contextual entities: a crate may not point above its root, and results are passed on without their recordings.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+from urllib.parse import quote, unquote
+
+from rocrate.model.entity import Entity
+from rocrate.rocrate import ROCrate
+
+from apertura.common.provenance import canonical_json, sha256_text
+from apertura.formats.catalog.assets import media_type
+from apertura.formats.catalog.run import Job, Listed, Run
+
+WORKFLOW = "workflow/Snakefile"
+"""The workflow as it lies beside the crate; its rules are in the folder below."""
+
+_CRATE_SPEC = "https://w3id.org/ro/crate/1.1"
+_WORKFLOW_CRATE = "https://w3id.org/workflowhub/workflow-ro-crate/1.0"
+_PROFILES = {
+    "https://w3id.org/ro/wfrun/process/0.5": "Process Run Crate",
+    "https://w3id.org/ro/wfrun/workflow/0.5": "Workflow Run Crate",
+    "https://w3id.org/ro/wfrun/provenance/0.5": "Provenance Run Crate",
+    _WORKFLOW_CRATE: "Workflow RO-Crate",
+}
+_TERMS = "https://w3id.org/ro/terms/workflow-run/context"
+_COMPLETED = "http://schema.org/CompletedActionStatus"
+_LICENCE = "#licence"
+_RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
+
+
+def crate_document(run: Run) -> dict[str, Any]:
+    """Return the metadata document of a run; the same run gives the same document.
+
+    Examples
+    --------
+    >>> image = Listed("f01/a-b/db.tif", "0" * 64, 10)
+    >>> job = Job("export", ["f01", "a-b"], "apertura step export f01 a-b", "1" * 64, {}, [], [image])
+    >>> rules = [Listed(WORKFLOW, "2" * 64, 10)]
+    >>> run = Run("tandem", "2025-05-14T09:30:00Z", {"apertura": "1", "snakemake": "9"}, "3" * 64, [job], [], rules)
+    >>> told = {entity["@id"]: entity for entity in crate_document(run)["@graph"]}
+    >>> told["#job/export/f01/a-b"]["result"], told["f01/a-b/db.tif"]["sha256"][:4]
+    ({'@id': 'f01/a-b/db.tif'}, '0000')
+    """
+    crate = ROCrate(version="1.1")
+    crate.metadata.extra_contexts.append(_TERMS)
+    crate.metadata["conformsTo"] = [{"@id": uri} for uri in (_CRATE_SPEC, _WORKFLOW_CRATE)]
+    tops, data = _data(run)
+    described = [*_software(run), *_steps(run), *_jobs(run), *data, *map(_input, run.inputs)]
+    actions = [entity for entity in described if str(entity["@type"]).endswith("Action")]
+    for name, value in _root(run, tops, actions).items():
+        crate.root_dataset[name] = value
+    crate.add(*(Entity(crate, entity.pop("@id"), properties=entity) for entity in _unique(described)))
+    document: dict[str, Any] = crate.metadata.generate()
+    return document
+
+
+def input_id(name: str) -> str:
+    """Return how an input is called in the crate.
+
+    Examples
+    --------
+    >>> input_id("raw/f 01/a.csv")
+    '#input/raw/f%2001/a.csv'
+    """
+    return f"#input/{quote(name)}"
+
+
+def _root(run: Run, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    about = (
+        f"Images of the campaign {run.campaign}, with every step from its recordings to them. Recordings and config "
+        "are named by hash and lie in the folder above. Actions have no times and datePublished is when the last pulse "
+        "was recorded: the same recordings, settings and code make the same crate, whenever they run. Versions are "
+        "those of the installation that wrote the crate."
+    )
+    return {
+        "name": run.campaign,
+        "description": about,
+        "datePublished": run.recorded_until,
+        "license": {"@id": _LICENCE},
+        "conformsTo": _refs(_PROFILES),
+        "hasPart": _refs(parts),
+        "mainEntity": {"@id": WORKFLOW},
+        "mentions": _refs(action["@id"] for action in actions),
+    }
+
+
+def _software(run: Run) -> Iterator[dict[str, Any]]:
+    for uri, name in _PROFILES.items():
+        yield {"@id": uri, "@type": "CreativeWork", "name": name, "version": uri.rpartition("/")[2]}
+    yield {
+        "@id": _LICENCE,
+        "@type": "CreativeWork",
+        "name": "not stated",
+        "description": "The campaign says nothing of a licence: ask whoever recorded it.",
+    }
+    for name, version in run.software.items():
+        yield {"@id": f"#software/{name}", "@type": "SoftwareApplication", "name": name, "version": version}
+    yield {
+        "@id": _LOCK,
+        "@type": "PropertyValue",
+        "name": "sha256 of requirements/all.txt",
+        "value": run.lock_sha256,
+        "description": "The lock that apertura ships: versions and hashes of all that it was tested with.",
+    }
+    yield {"@id": "#snakemake", "@type": "ComputerLanguage", "name": "Snakemake", "version": run.software["snakemake"]}
+
+
+def _steps(run: Run) -> Iterator[dict[str, Any]]:
+    """Yield the workflow, its steps, and the tools that they are: one for each rule and code that ran."""
+    tools: dict[str, dict[str, str]] = {}
+    for job in run.jobs:
+        tools.setdefault(job.rule, {})[_tool(job)] = job.code_sha256
+    needed = _refs(f"#software/{name}" for name in run.software)
+    yield {
+        "@id": WORKFLOW,
+        "@type": ["File", "SoftwareSourceCode", "ComputationalWorkflow", "HowTo"],
+        "name": "apertura",
+        "version": run.software["apertura"],
+        "programmingLanguage": {"@id": "#snakemake"},
+        "hasPart": _refs(tool for codes in tools.values() for tool in codes),
+        "step": _refs(f"#step/{rule}" for rule in tools),
+        "softwareRequirements": needed,
+        **_bytes(next(file for file in run.workflow if file.name == WORKFLOW)),
+    }
+    for position, (rule, codes) in enumerate(tools.items()):
+        step = {"@id": f"#step/{rule}", "@type": "HowToStep", "name": f"rule {rule}", "position": str(position)}
+        yield {**step, "workExample": _refs(codes)}
+        for tool, code in codes.items():
+            yield {
+                "@id": tool,
+                "@type": "SoftwareApplication",
+                "name": f"apertura step {rule}",
+                "version": run.software["apertura"],
+                "identifier": f"sha256:{code}",
+                "description": "The identifier is the hash of the code that this step can run.",
+                "softwareRequirements": needed,
+            }
+
+
+def _jobs(run: Run) -> Iterator[dict[str, Any]]:
+    """Yield every action, and the parameters that actions share."""
+    made = [_id(file) for job in run.jobs for file in job.files if file.name.endswith(".manifest.json")]
+    all_of_it = {
+        "name": f"apertura run on {run.campaign}",
+        "description": "Every rule of the workflow, from recordings to what describes the images.",
+        "instrument": {"@id": WORKFLOW},
+        "object": _refs(input_id(one.name) for one in run.inputs),
+        "result": _refs(made),
+        "environment": {"@id": _LOCK},
+        "actionStatus": _COMPLETED,
+    }
+    yield {"@id": _RUN, "@type": "CreateAction", **all_of_it}
+    yield {
+        "@id": _ORGANISED,
+        "@type": "OrganizeAction",
+        "name": "Snakemake",
+        "instrument": {"@id": "#software/snakemake"},
+        "object": _refs(f"#control/{job.path}" for job in run.jobs),
+        "result": {"@id": _RUN},
+    }
+    for job in run.jobs:
+        parameters = [_parameter(name, value) for name, value in sorted(job.settings.items())]
+        yield from parameters
+        sources = [_source(name) for name in job.sources]
+        yield {
+            "@id": f"#job/{job.path}",
+            "@type": "CreateAction",
+            "name": job.command,
+            "description": "; ".join(job.doubts) or "As the code and settings of today would make it.",
+            "instrument": {"@id": _tool(job)},
+            "object": _refs([*sources, *(each["@id"] for each in parameters)]),
+            "result": _refs(_stage(file) or _id(file) for file in job.files),
+            "environment": {"@id": _LOCK},
+            "actionStatus": _COMPLETED,
+        }
+        yield {
+            "@id": f"#control/{job.path}",
+            "@type": "ControlAction",
+            "name": f"rule {job.rule}",
+            "instrument": {"@id": f"#step/{job.rule}"},
+            "object": {"@id": f"#job/{job.path}"},
+        }
+
+
+def _data(run: Run) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return what lies directly in the root, and all files and stages of the results."""
+    stages: dict[str, list[str]] = {}
+    tops, entities = [], []
+    for listed in [*run.workflow, *(file for job in run.jobs for file in job.files)]:
+        stage = _stage(listed)
+        if stage:
+            stages.setdefault(stage, []).append(_id(listed))
+        else:
+            tops.append(_id(listed))
+        if listed.name != WORKFLOW:
+            entities.append({"@id": _id(listed), "@type": "File", "name": listed.name, **_bytes(listed)})
+    for stage, files in stages.items():
+        entities.append({"@id": stage, "@type": "Dataset", "name": unquote(stage), "hasPart": _refs(files)})
+    return [*tops, *stages], entities
+
+
+def _input(one: Listed) -> dict[str, Any]:
+    about = "An input, in the campaign folder above the results."
+    return {"@id": input_id(one.name), "@type": "CreativeWork", "name": one.name, "description": about, **_bytes(one)}
+
+
+def _bytes(file: Listed) -> dict[str, Any]:
+    size = {} if file.size is None else {"contentSize": str(file.size)}
+    return {"sha256": file.sha256, "encodingFormat": media_type(file.name).partition(";")[0], **size}
+
+
+def _parameter(name: str, value: object) -> dict[str, Any]:
+    told = value if isinstance(value, str) else canonical_json(value)
+    return {
+        "@id": f"#setting/{quote(name)}/{sha256_text(told)[:16]}",
+        "@type": "PropertyValue",
+        "name": name,
+        "value": told,
+    }
+
+
+def _tool(job: Job) -> str:
+    return f"#tool/{job.rule}/{job.code_sha256[:16]}"
+
+
+def _source(name: str) -> str:
+    return quote(name.removeprefix("results/")) if name.startswith("results/") else input_id(name)
+
+
+def _stage(file: Listed) -> str | None:
+    """Return the identifier of the stage that a file is a part of."""
+    name, inner, _ = file.name.partition(".zarr/")
+    return quote(f"{name}.zarr/") if inner else None
+
+
+def _id(file: Listed) -> str:
+    return quote(file.name)
+
+
+def _refs(ids: Iterable[str]) -> dict[str, str] | list[dict[str, str]]:
+    """Return references: a list, but of one a single value, as RO-Crate recommends."""
+    references = [{"@id": one} for one in dict.fromkeys(ids)]
+    return references[0] if len(references) == 1 else references
+
+
+def _unique(entities: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    yield from {entity["@id"]: entity for entity in entities}.values()

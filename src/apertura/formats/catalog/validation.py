@@ -1,0 +1,119 @@
+"""A static STAC catalog held against the schemas of pystac and of this package; nothing is fetched."""
+
+import json
+from collections.abc import Iterator
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
+
+import pystac
+
+from apertura.common.documents import read_json
+from apertura.common.errors import CampaignError, shown
+from apertura.common.paths import inside
+from apertura.formats.catalog import CATALOG
+
+if TYPE_CHECKING:
+    from pystac.validation.stac_validator import JsonSchemaSTACValidator
+
+_DOWN = frozenset({"child", "item"})
+
+
+def stac_problems(folder: Path) -> list[str]:
+    """Return what is wrong with a catalog: a line for each file that is not what its schemas say, or is not there.
+
+    Parameters
+    ----------
+    folder
+        Which holds catalog.json.
+
+    Examples
+    --------
+    >>> stac_problems(Path("nowhere"))
+    ['catalog.json: no such file']
+    """
+    return [shown(line, 500) for line in _problems(folder, CATALOG)]
+
+
+def document_problem(document: dict[str, Any]) -> str | None:
+    """Return what is wrong with one catalog, collection or item as JSON; None: nothing.
+
+    Examples
+    --------
+    >>> document_problem({"type": "Catalog", "stac_version": "1.1.0", "id": "a", "description": "b", "links": []})
+    >>> document_problem({"type": "Catalog", "stac_version": "1.1.0", "id": "a", "links": []})
+    "'description' is a required property"
+    """
+    from pystac.serialization import identify_stac_object, identify_stac_object_type
+
+    kind = identify_stac_object_type(document)
+    if kind is None:
+        return "neither a catalog nor a collection nor an item of STAC"
+    version = str(identify_stac_object(document).version_range.latest_valid_version())
+    extensions = document.get("stac_extensions", [])
+    unknown = [uri for uri in extensions if uri not in _schemas()]
+    if unknown:
+        return f"no schema of {unknown[0]} here"
+    try:
+        _validator().validate(document, kind, version, extensions)
+    except pystac.STACValidationError as error:
+        return _reason(error)
+    return None
+
+
+def _problems(folder: Path, start: str) -> Iterator[str]:
+    waiting, seen = [start], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        try:
+            document = read_json(inside(folder, name, where=folder), expected="a STAC catalog", remedy="Make it again.")
+        except CampaignError as error:
+            yield f"{name}: {error.found}"
+            continue
+        problem = document_problem(document)
+        if problem:
+            yield f"{name}: {problem}"
+        waiting += _below(name, document)
+
+
+def _below(name: str, document: dict[str, Any]) -> Iterator[str]:
+    """Yield the files that a file of the catalog leads down to, relative to its folder."""
+    links = document.get("links")
+    for link in links if isinstance(links, list) else ():
+        if isinstance(link, dict) and link.get("rel") in _DOWN and isinstance(link.get("href"), str):
+            way = urlsplit(link["href"]).path.removeprefix("./")
+            above = name.rpartition("/")[0]
+            yield unquote(f"{above}/{way}" if above else way)
+
+
+def _reason(error: pystac.STACValidationError) -> str:
+    from jsonschema import ValidationError
+
+    causes = error.source if isinstance(error.source, list) else [error.source]
+    first = causes[0] if causes else error
+    if isinstance(first, ValidationError):
+        deepest = min([first, *first.context], key=lambda one: -len(one.absolute_path)) if first.context else first
+        at = "/".join(map(str, deepest.absolute_path))
+        return f"{at}: {deepest.message}" if at else deepest.message
+    return str(error)
+
+
+@cache
+def _schemas() -> dict[str, dict[str, Any]]:
+    folder = files("apertura.formats.catalog") / "schemas"
+    read = [json.loads(path.read_text("utf-8")) for path in sorted(folder.iterdir(), key=lambda path: path.name)]
+    return {schema["$id"]: schema for schema in read}
+
+
+@cache
+def _validator() -> "JsonSchemaSTACValidator":
+    from pystac.validation.stac_validator import JsonSchemaSTACValidator
+
+    validator = JsonSchemaSTACValidator()
+    validator.schema_cache.update(_schemas())
+    return validator

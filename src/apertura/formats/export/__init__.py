@@ -1,0 +1,260 @@
+"""Files for other programs: one module per format, one row per file.
+
+A row says the file's name, which raster it is written from and what writes it. Rows drive the rules of the workflow,
+the steps and the tests; nothing else names a product. To add one, write a function such as
+`apertura.formats.export.cog.write_power` and add its row to `EXPORTS`; or, from another package, register an `Export`
+as entry point of group ``apertura.exports``. Importing this module imports no format.
+"""
+
+import pkgutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from apertura.common.provenance import canonical_json
+from apertura.formats.export.radiometry import TAG
+
+SOURCES: Mapping[str, str] = {
+    "image": "pair",
+    "coherent": "fused",
+    "noncoherent": "fused",
+    "magnitude": "fused",
+    "incidence": "layers",
+    "bistatic_angle": "layers",
+    "mask": "layers",
+    "looks": "layers",
+    "nesz": "layers",
+    "phase": "interferogram",
+    "coherence": "interferogram",
+    "unwrapped": "interferogram",
+    "height": "interferogram",
+    "height_std": "interferogram",
+    "panels": "interferogram",
+}
+"""Raster that a file may be written from → kind of folder the file lies in.
+
+``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
+complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
+lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
+"""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A product: one row of the table.
+
+    Attributes
+    ----------
+    file
+        Its name in the folder of the pair or of the fused images.
+    source
+        A key of `SOURCES`.
+    function
+        ``package.module:function``, imported when a file is written; called as
+        ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.formats.export.cog.write_slc`.
+    pictured
+        Whether the workflow's report shows it.
+    laid
+        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
+    """
+
+    file: str
+    source: str
+    function: str
+    pictured: bool = False
+    laid: bool = True
+
+    @property
+    def module(self) -> str:
+        """Dotted name of the module that writes the file."""
+        return self.function.partition(":")[0]
+
+    @property
+    def style(self) -> bool:
+        """Whether it says how QGIS shows the raster of its name."""
+        return self.module == "apertura.formats.export.style"
+
+    @property
+    def write(self) -> Callable[..., None]:
+        """The function that writes the file."""
+        function: Callable[..., None] = pkgutil.resolve_name(self.function)
+        return function
+
+
+EXPORTS: tuple[Export, ...] = (
+    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("power.tif", "image", "apertura.formats.export.cog:write_power"),
+    Export("power.qml", "image", "apertura.formats.export.style:write_linear_style"),
+    Export("db.tif", "image", "apertura.formats.export.db:write_db"),
+    Export("db.qml", "image", "apertura.formats.export.style:write_db_style"),
+    Export("quicklook.png", "image", "apertura.formats.export.quicklook:write_quicklook", pictured=True),
+    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("coherent_power.tif", "coherent", "apertura.formats.export.cog:write_power"),
+    Export("coherent_power.qml", "coherent", "apertura.formats.export.style:write_linear_style"),
+    Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db"),
+    Export("coherent_db.qml", "coherent", "apertura.formats.export.style:write_db_style"),
+    Export("quicklook.png", "coherent", "apertura.formats.export.quicklook:write_quicklook", pictured=True),
+    Export("noncoherent_power.tif", "noncoherent", "apertura.formats.export.cog:write_power"),
+    Export("noncoherent_power.qml", "noncoherent", "apertura.formats.export.style:write_linear_style"),
+    Export("noncoherent_db.tif", "noncoherent", "apertura.formats.export.db:write_db"),
+    Export("noncoherent_db.qml", "noncoherent", "apertura.formats.export.style:write_db_style"),
+    Export("noncoherent_magnitude.tif", "magnitude", "apertura.formats.export.cog:write_magnitude"),
+    Export("noncoherent_magnitude.qml", "magnitude", "apertura.formats.export.style:write_linear_style"),
+    Export("incidence.tif", "incidence", "apertura.formats.export.layers:write_incidence"),
+    Export("incidence.qml", "incidence", "apertura.formats.export.style:write_layer_style"),
+    Export("bistatic_angle.tif", "bistatic_angle", "apertura.formats.export.layers:write_bistatic_angle"),
+    Export("bistatic_angle.qml", "bistatic_angle", "apertura.formats.export.style:write_layer_style"),
+    Export("mask.tif", "mask", "apertura.formats.export.layers:write_mask"),
+    Export("mask.qml", "mask", "apertura.formats.export.style:write_mask_style"),
+    Export("looks.tif", "looks", "apertura.formats.export.layers:write_looks"),
+    Export("looks.qml", "looks", "apertura.formats.export.style:write_layer_style"),
+    Export("nesz.tif", "nesz", "apertura.formats.export.layers:write_nesz"),
+    Export("nesz.qml", "nesz", "apertura.formats.export.style:write_layer_style"),
+    Export("phase.tif", "phase", "apertura.formats.export.interferogram:write_phase"),
+    Export("phase.qml", "phase", "apertura.formats.export.style:write_layer_style"),
+    Export("coherence.tif", "coherence", "apertura.formats.export.interferogram:write_coherence"),
+    Export("coherence.qml", "coherence", "apertura.formats.export.style:write_layer_style"),
+    Export("unwrapped.tif", "unwrapped", "apertura.formats.export.interferogram:write_unwrapped"),
+    Export("unwrapped.qml", "unwrapped", "apertura.formats.export.style:write_layer_style"),
+    Export("height.tif", "height", "apertura.formats.export.interferogram:write_height"),
+    Export("height.qml", "height", "apertura.formats.export.style:write_layer_style"),
+    Export("height_std.tif", "height_std", "apertura.formats.export.interferogram:write_height_std"),
+    Export("height_std.qml", "height_std", "apertura.formats.export.style:write_layer_style"),
+    Export("quicklook.png", "panels", "apertura.formats.export.interferogram:write_panels", pictured=True),
+    *(point.load() for point in entry_points(group="apertura.exports")),
+)
+"""Every product of a pair or of a flight's sums, in the order in which they are written."""
+
+PHASE_HISTORY = "phase_history.cphd"
+"""Transfer functions of a pair; as large as its echo, and so written for those who ask for it."""
+
+COVERAGE = ("coverage.png", "coverage.geojson")
+"""What shows the whole campaign."""
+
+MOSAICS = "mosaic"
+"""Folder of the rasters of all flights."""
+
+MAP = "map/map.json"
+"""What `apertura map` shows of all of them in a browser."""
+
+
+def exports_in(folder: str) -> Iterator[Export]:
+    """Yield the rows of a kind: ``pair``, ``fused``, ``layers`` or ``interferogram``.
+
+    Examples
+    --------
+    >>> [export.file for export in exports_in("layers")][:4]
+    ['incidence.tif', 'incidence.qml', 'bistatic_angle.tif', 'bistatic_angle.qml']
+    """
+    return (export for export in EXPORTS if SOURCES[export.source] == folder)
+
+
+def export_modules(folder: str) -> list[str]:
+    """Return the modules that write the files of a kind of folder: code whose change makes them again.
+
+    Examples
+    --------
+    >>> export_modules("layers")
+    ['apertura.formats.export.layers', 'apertura.formats.export.style']
+    """
+    return sorted({export.module for export in exports_in(folder)})
+
+
+def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
+
+    Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs, the lowest first.
+
+    Examples
+    --------
+    >>> mosaics({"f01": ["a-b"], "f02": ["a-a", "a-b"]})["a-b/db.vrt"]
+    ['f01/a-b/db.tif', 'f02/a-b/db.tif']
+    """
+    found: dict[str, list[str]] = {}
+    for flight, names in pairs.items():
+        for folder, kinds in _folders(names):
+            for row in (row for kind in kinds for row in exports_in(kind)):
+                if row.laid and row.file.endswith(".tif"):
+                    name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
+                    found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
+    return found
+
+
+def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
+    styles = {row.file for row in EXPORTS if row.style}
+    for name in mosaics(pairs):
+        style = f"{name.removesuffix('.vrt')}.qml"
+        yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
+
+
+def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the folders of a flight, and the kinds of rows that lie in each."""
+    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield "fused", ("fused",)
+
+
+def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield every file that a finished campaign offers its user, relative to the results.
+
+    Parameters
+    ----------
+    pairs
+        Flight → its pairs.
+
+    Examples
+    --------
+    >>> list(product_files({"f01": ["a-b"]}))[2:5]
+    ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/power.qml']
+    """
+    yield from COVERAGE
+    for flight, names in pairs.items():
+        for folder, kinds in _folders(names):
+            files = [row.file for kind in kinds for row in exports_in(kind)]
+            yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
+    yield from mosaic_files(pairs)
+    yield MAP
+
+
+def write_exports(
+    kind: str,
+    folder: Path,
+    rasters: Mapping[str, Any],
+    *,
+    titles: Mapping[str, str],
+    tags: Mapping[str, str],
+    radiometry: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    **shared: Any,
+) -> list[Path]:
+    """Write every file of a kind of folder; return their paths.
+
+    Parameters
+    ----------
+    kind
+        ``pair``, ``fused``, ``layers`` or ``interferogram``.
+    folder
+        Where they go.
+    rasters, titles
+        Source → (y, x) raster on the campaign's grid, and what a person would call it.
+    tags
+        Of every file, name → text.
+    radiometry
+        Source → `apertura.formats.export.radiometry.Radiometry.report`, of images.
+    **shared
+        ``transform`` and ``crs``, as `apertura.formats.export.cog.write_slc` takes them.
+    """
+    written = []
+    for export in exports_in(kind):
+        path, source = folder / export.file, export.source
+        means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
+        export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
+        written.append(path)
+    return written

@@ -1,0 +1,227 @@
+"""What the flights of a campaign cover: a picture of looks, pairs, footprints and tracks, and the same for a GIS."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import BoundaryNorm
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from rasterio import Affine
+from rasterio.features import shapes
+from rasterio.transform import array_bounds
+
+from apertura.common.atomic import replacement
+from apertura.formats.export.map_layout import DPI, MapLayout
+
+MARGIN = 0.04
+"""Left free around tracks and scene, of the longer side."""
+
+_NAMED = 8  # flights in the legend
+_COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
+
+Ring = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Covered:
+    """What one pair of a flight covers.
+
+    Attributes
+    ----------
+    flight, pair
+        Which.
+    tracks_m
+        Antenna (transmitter, receiver) → (vertex, 3) float64, easting, northing and height on the map, metres.
+    looks
+        (row, column) float32, pulses that make each place of the scene, 0 where none does.
+    """
+
+    flight: str
+    pair: str
+    tracks_m: Mapping[str, NDArray[np.float64]]
+    looks: NDArray[np.float32]
+
+
+def footprint(looks: NDArray[np.float32], transform: Affine) -> list[list[Ring]]:
+    """Return polygons about the places that pulses make: rings (vertex, 2) of map metres, the outer one first.
+
+    Outer rings turn left, holes right, each ends where it begins, as GeoJSON asks.
+
+    Examples
+    --------
+    >>> rings = footprint(np.array([[0, 5.0], [0, 5.0]], np.float32), Affine(2, 0, 100, 0, -2, 50))
+    >>> rings[0][0].tolist()
+    [[102.0, 46.0], [104.0, 46.0], [104.0, 50.0], [102.0, 50.0], [102.0, 46.0]]
+    """
+    covered = looks > 0
+    found = shapes(covered.astype(np.uint8), mask=covered, transform=transform)
+    return [
+        [_turned(np.asarray(ring, np.float64), left=number == 0) for number, ring in enumerate(shape["coordinates"])]
+        for shape, _ in found
+    ]
+
+
+def _turned(ring: Ring, *, left: bool) -> Ring:
+    x, y = (ring - ring[0]).T
+    turns_left = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) > 0
+    ring = ring if turns_left == left else ring[::-1]
+    lowest = int(np.lexsort((ring[:-1, 0], ring[:-1, 1]))[0])  # the same vertex first, whoever traced it
+    return np.concatenate([ring[lowest:-1], ring[: lowest + 1]])
+
+
+def feature_collection(
+    covered: Sequence[Covered],
+    transform: Affine,
+    place: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None,
+    *,
+    height_m: float,
+) -> dict[str, Any]:
+    """Return tracks and footprints as GeoJSON (RFC 7946).
+
+    Parameters
+    ----------
+    covered
+        Of each pair.
+    transform
+        Of its looks, on the map.
+    place
+        Map (n, 3), metres → longitude and latitude (deg, WGS 84) and height (m), (n, 3); None where the map has no
+        place on Earth: geometries are then null.
+    height_m
+        Of the footprints, for `place`.
+    """
+    features = []
+    for one in covered:
+        named = {"flight": one.flight, "pair": one.pair}
+        for antenna, track_m in one.tracks_m.items():
+            line = None
+            if place is not None:
+                line = {"type": "LineString", "coordinates": _rounded(place(track_m), heights=True)}
+            features.append(_feature(line, {"kind": "track", "antenna": antenna, **named}))
+        area = None
+        if place is not None:
+            at = [
+                [_rounded(place(np.c_[ring, np.full(len(ring), height_m)])) for ring in rings]
+                for rings in footprint(one.looks, transform)
+            ]
+            area = {"type": "MultiPolygon", "coordinates": at}
+        features.append(_feature(area, {"kind": "footprint", **named, **_told(one.looks, transform)}))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _told(looks: NDArray[np.float32], transform: Affine) -> dict[str, Any]:
+    seen = looks[looks > 0]
+    pixel_m2 = abs(transform.a * transform.e)
+    if not seen.size:
+        return {"covered_share": 0.0, "area_m2": 0.0}
+    return {
+        "covered_share": round(seen.size / looks.size, 4),
+        "area_m2": float(f"{seen.size * pixel_m2:.4g}"),
+        "looks_median": round(float(np.median(seen)), 1),
+        "looks_most": round(float(seen.max()), 1),
+    }
+
+
+def _rounded(places: NDArray[np.float64], *, heights: bool = False) -> list[list[float]]:
+    """Return places as GeoJSON writes them: degrees to a millimetre, and metres."""
+    return [[round(x, 8), round(y, 8), *([round(z, 3)] if heights else [])] for x, y, z in places.tolist()]
+
+
+def write_coverage(
+    path: Path, covered: Sequence[Covered], transform: Affine, *, crs_name: str, title: str, tags: Mapping[str, str]
+) -> None:
+    """Draw two maps as a PNG: pulses of all pairs that make each place, and how many pairs see it.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    covered
+        Of each pair; their looks have one shape.
+    transform
+        Of the looks, on the map.
+    crs_name
+        Of the map.
+    title
+        What is drawn.
+    tags
+        Provenance, name → text; lies in the file.
+    """
+    total = np.sum([one.looks for one in covered], axis=0)
+    pairs = np.sum([one.looks > 0 for one in covered], axis=0)
+    flights = {name: number for number, name in enumerate(dict.fromkeys(one.flight for one in covered))}
+    with matplotlib.style.context("default"):
+        first = MapLayout.for_bounds(_bounds(covered, total.shape, transform), maps=2)
+        second = first.beside()
+        _draw(first, total, transform, "viridis", "pulses that make a pixel, all pairs")
+        _draw(second, pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
+        for layout in (first, second):
+            _draw_lines(layout, covered, transform, flights)
+        first.draw_frame(crs_name)
+        second.draw_frame("")
+        first.draw_scale_and_north()
+        second.axes.legend(*_legend(flights), loc="upper left", fontsize=7, framealpha=0.85)
+        seen = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {len(covered)} pairs of {len(flights)}"
+        subtitle = f"{seen} flight{'s' if len(flights) > 1 else ''}; lines: tracks (dashed: receiver) and footprints"
+        first.write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
+        with replacement(path) as temporary:
+            first.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+
+
+def _bounds(covered: Sequence[Covered], shape: tuple[int, ...], transform: Affine) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of the scene and all tracks, and a margin."""
+    west, south, east, north = array_bounds(*shape, transform)
+    corners = np.array([[west, south], [east, north]])
+    places = np.concatenate([corners, *(track[:, :2] for one in covered for track in one.tracks_m.values())])
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = MARGIN * float((high - low).max())
+    return (*(low - margin).tolist(), *(high + margin).tolist())
+
+
+def _draw(
+    layout: MapLayout, values: NDArray[Any], transform: Affine, colours: str, label: str, *, counts: bool = False
+) -> None:
+    west, south, east, north = array_bounds(*values.shape, transform)
+    most = float(values.max()) or 1.0
+    norm = BoundaryNorm(np.arange(0.5, most + 1), 256) if counts and most <= len(_COLOURS) else None
+    picture = layout.axes.imshow(
+        np.ma.masked_equal(values, 0),
+        extent=(west, east, south, north),
+        cmap=colours,
+        interpolation="nearest",
+        **({"norm": norm} if norm else {"vmin": 0, "vmax": most}),
+    )
+    bar = layout.draw_colour_bar(picture, label, beyond="neither")
+    if counts:
+        bar.locator = MaxNLocator(integer=True)
+        bar.update_ticks()
+
+
+def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine, flights: Mapping[str, int]) -> None:
+    """Draw tracks and footprints in the colours of their flights."""
+    for one in covered:
+        colour = _COLOURS[flights[one.flight] % len(_COLOURS)]
+        for style, track_m in zip(("-", "--"), one.tracks_m.values(), strict=False):
+            layout.axes.plot(*track_m.T[:2], style, color=colour, linewidth=1.4)
+        for rings in footprint(one.looks, transform):
+            for ring in rings:
+                layout.axes.plot(*ring.T, color=colour, alpha=0.8, linewidth=1.2)
+
+
+def _legend(flights: Mapping[str, int]) -> tuple[list[Any], list[str]]:
+    from matplotlib.lines import Line2D
+
+    names = list(flights)[:_NAMED]
+    lines = [Line2D([], [], color=_COLOURS[flights[name] % len(_COLOURS)]) for name in names]
+    if more := len(flights) - len(names):
+        return [*lines, Line2D([], [], color="none")], [*names, f"and {more} more"]
+    return lines, names

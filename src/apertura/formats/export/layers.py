@@ -1,0 +1,96 @@
+"""Layers that explain an image: angles of view, where it saw nothing or too much, and how many pulses made it."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from rasterio import Affine
+
+from apertura.common.errors import ContractError
+from apertura.formats.export.cog import Band, Pixels, Raster, write_cog
+
+SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
+"""Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
+
+CLASSES = {
+    0: ("valid", (255, 255, 255)),
+    SHADOW: ("shadow", (45, 55, 115)),
+    LAYOVER: ("layover", (225, 120, 20)),
+    SHADOW | LAYOVER: ("shadow and layover", (150, 20, 60)),
+    OUTSIDE: ("outside, no data", (0, 0, 0)),
+}
+"""Value of the mask → what it means, and its colour."""
+
+INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
+BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")
+MASK = Band(
+    "uint8",
+    OUTSIDE,
+    "bits",
+    "0 valid, 1 shadow, 2 layover, 3 both, 255 outside",
+    "MODE",
+    {value: colour for value, (_, colour) in CLASSES.items()},
+)
+LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
+NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
+
+
+def write_incidence(
+    path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the incidence angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
+    check = _only("float32")
+    write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_bistatic_angle(
+    path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
+    check = _only("float32")
+    write_cog(path, angle_deg, BISTATIC_ANGLE, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_mask(
+    path: Path, bits: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write where the image is in shadow or layover, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
+
+    Overviews take the commonest value, so that bits never mix. Else as `cog.write_slc`.
+
+    Examples
+    --------
+    >>> import rasterio
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "mask.tif"
+    ...     write_mask(path, np.ones((2, 3), "u1"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
+    ...     with rasterio.open(path) as raster:
+    ...         raster.descriptions[0], raster.read(1)[0, 0].item()
+    ('0 valid, 1 shadow, 2 layover, 3 both, 255 outside', 1)
+    """
+    check = _only("uint8")
+    write_cog(path, bits, MASK, transform=transform, crs=crs, tags=tags, title=title, value=check)
+
+
+def write_looks(
+    path: Path, looks: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `cog.write_slc`."""
+    write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
+
+
+def write_nesz(
+    path: Path, noise_db: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`."""
+    write_cog(path, noise_db, NESZ, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
+
+
+def _only(dtype: str) -> Callable[[Pixels], Pixels]:
+    def check(block: Pixels) -> Pixels:
+        if block.dtype != dtype:
+            raise ContractError(f"layer to export is {block.dtype}, not {dtype}")
+        return block
+
+    return check

@@ -1,0 +1,118 @@
+"""One raster of the same product of several flights: a VRT, which names their files and holds no pixels."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET  # only written, never parsed
+
+from rasterio.enums import ColorInterp
+
+from apertura.common.atomic import write_text
+from apertura.common.errors import ContractError
+from apertura.common.provenance import canonical_json
+from apertura.common.raster import opened_raster
+from apertura.formats.export.radiometry import TAG
+
+_TYPES = {"uint8": "Byte", "float32": "Float32"}
+
+
+def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> None:
+    """Write a VRT of rasters of one grid; where several hold data, the last of them is seen.
+
+    Parameters
+    ----------
+    path
+        ``….vrt``; complete or absent. It names the rasters relative to itself, so that a folder of all may be moved.
+    rasters
+        Files of one band, real, all on one grid, the lowest first.
+    title
+        What a person would call it.
+
+    Raises
+    ------
+    ContractError
+        If they are not of one grid and one kind.
+
+    Notes
+    -----
+    Source: GDAL's documentation of the VRT driver, ComplexSource with NODATA.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np, rasterio
+    >>> from rasterio import Affine
+    >>> from apertura.formats.export.cog import write_power
+    >>> grid = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {}}
+    >>> with TemporaryDirectory() as folder:
+    ...     below, above = files = [Path(folder) / "f01.tif", Path(folder) / "f02.tif"]
+    ...     write_power(below, np.array([[1, 1]], "c8"), **grid)
+    ...     write_power(above, np.array([[2, np.nan]], "c8"), **grid)
+    ...     write_mosaic(Path(folder) / "power.vrt", files)
+    ...     with rasterio.open(Path(folder) / "power.vrt") as mosaic:
+    ...         mosaic.read(1)
+    array([[4., 1.]], dtype=float32)
+    """
+    first, kind, tags = _opened(rasters)
+    root = ET.Element("VRTDataset", rasterXSize=str(first["width"]), rasterYSize=str(first["height"]))
+    ET.SubElement(root, "SRS").text = first["crs"]
+    ET.SubElement(root, "GeoTransform").text = ", ".join(map(repr, first["transform"]))
+    said = {"TIFFTAG_IMAGEDESCRIPTION": title, TAG: canonical_json(_common([json.loads(one) for one in tags]))}
+    metadata = ET.SubElement(root, "Metadata")
+    for name, value in said.items():
+        ET.SubElement(metadata, "MDI", key=name).text = value
+    band = ET.SubElement(root, "VRTRasterBand", dataType=kind["type"], band="1")
+    for name in ("Description", "UnitType", "NoDataValue"):
+        ET.SubElement(band, name).text = kind[name]
+    if kind["colours"]:
+        table = ET.SubElement(band, "ColorTable")
+        for colour in kind["colours"]:
+            ET.SubElement(table, "Entry", dict(zip(("c1", "c2", "c3", "c4"), map(str, colour), strict=True)))
+    for raster in rasters:
+        band.append(_source(os.path.relpath(raster, path.parent), first, kind))
+    ET.indent(root)
+    write_text(path, ET.tostring(root, encoding="unicode") + "\n")
+
+
+def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
+    """Return the grid and the kind that all rasters share, and what each says of its radiometry."""
+    seen: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
+    tags = []
+    for path in rasters:
+        with opened_raster(path, expected="what the workflow wrote", remedy="Run it again.") as raster:
+            grid = {"width": raster.width, "height": raster.height, "transform": raster.transform.to_gdal()}
+            kind: dict[str, Any] = {"type": _TYPES.get(raster.dtypes[0]), "NoDataValue": f"{raster.nodata:g}"}
+            # Which images were added up stands in the words of a sum: those of the last.
+            words = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
+            coloured = raster.colorinterp[0] == ColorInterp.palette
+            colours = [colour for _, colour in sorted(raster.colormap(1).items())] if coloured else []
+            seen.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, words))
+            tags.append(raster.tags().get(TAG, "{}"))
+    grid, kind, _ = seen[0]
+    for path, (other, its, _) in zip(rasters, seen, strict=True):
+        if other != grid or its != kind or kind["type"] is None:
+            raise ContractError(f"{path}: no real raster on the grid of {rasters[0]}")
+    return grid, kind | seen[-1][2], tags
+
+
+def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.Element:
+    source, width, height = ET.Element("ComplexSource"), str(grid["width"]), str(grid["height"])
+    ET.SubElement(source, "SourceFilename", relativeToVRT="1").text = Path(name).as_posix()
+    ET.SubElement(source, "SourceBand").text = "1"
+    ET.SubElement(source, "SourceProperties", RasterXSize=width, RasterYSize=height, DataType=kind["type"])
+    for rectangle in ("SrcRect", "DstRect"):
+        ET.SubElement(source, rectangle, xOff="0", yOff="0", xSize=width, ySize=height)
+    ET.SubElement(source, "NODATA").text = kind["NoDataValue"]
+    return source
+
+
+def _common(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what the rasters agree on of what their values mean, and levels that span them all."""
+    common = {name: value for name, value in told[-1].items() if all(one.get(name) == value for one in told)}
+    if all({"peak_db", "noise_floor_re_peak_db"} <= one.keys() for one in told):
+        top = max(one["peak_db"] for one in told)
+        floor = min(one["peak_db"] + one["noise_floor_re_peak_db"] for one in told)
+        common |= {"peak_db": top, "noise_floor_re_peak_db": round(floor - top, 2)}
+    return common

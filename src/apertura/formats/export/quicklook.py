@@ -1,0 +1,214 @@
+"""One picture of an image for people: power in dB on metric axes, north up, its origin in the footer."""
+
+import json
+from collections.abc import Iterable, Mapping
+from math import ceil
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+from rasterio import Affine
+from rasterio.transform import array_bounds
+
+from apertura.common.atomic import replacement
+from apertura.formats.export.cog import Raster, placed, power
+from apertura.formats.export.db import decibels
+from apertura.formats.export.map_layout import DPI, PICTURE_DOTS, MapLayout, Marker
+from apertura.formats.export.writing import READ
+
+
+def write_quicklook(
+    path: Path,
+    image: Raster,
+    *,
+    transform: Affine,
+    crs: str,
+    tags: Mapping[str, str],
+    title: str = "",
+    subtitle: str = "",
+    markers: Iterable[Marker] = (),
+    dynamic_range_db: float = 40.0,
+) -> None:
+    """Draw power in dB relative to the peak as a PNG that a person can read without a GIS.
+
+    An image of more pixels than the picture has dots is shrunk by averaging power, so that no target
+    falls between the samples. The colours span `dynamic_range_db` downwards from the peak, or, where
+    no more than three dots lie within 20 dB of the peak, from the fourth rounded up to 5 dB, so that
+    a glitch does not blacken the scene.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    image
+        (y, x) complex64, north-up, NaN (left white) where nothing was formed; read block by block.
+    transform, crs
+        As `apertura.formats.export.cog.write_slc`.
+    tags
+        Provenance: flags by name, version, numerical error and code hash are drawn, all of them lie in the file.
+    title, subtitle
+        Flight and pair; whatever else a reader should know at a glance.
+    markers
+        (x, y, label) in metres of `crs`, drawn as rings.
+    dynamic_range_db
+        dB between the ends of the colour bar.
+
+    Raises
+    ------
+    ContractError, CampaignError
+        As `apertura.formats.export.cog.write_slc`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "quicklook.png"
+    ...     write_quicklook(path, np.eye(9, dtype="c8"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
+    ...     path.read_bytes()[1:4]
+    b'PNG'
+    """
+    placed(image, transform, crs)
+    mean, factor = shrink(image, PICTURE_DOTS)
+    decibel, top_db = below_peak(mean)
+    rows, columns = (factor * size for size in mean.shape)  # the last groups may reach beyond the image
+    north, west = transform.f, transform.c
+    with matplotlib.style.context("default"):
+        layout = MapLayout.for_bounds(array_bounds(*image.shape, transform))
+        picture = layout.axes.imshow(
+            np.ma.masked_invalid(decibel),
+            extent=(west, west + columns * transform.a, north + rows * transform.e, north),
+            cmap="inferno",
+            vmin=top_db - dynamic_range_db,
+            vmax=top_db,
+            interpolation="nearest",
+        )
+        layout.draw_frame(crs_name(crs))
+        averaged = f"\nmean of {factor} × {factor} pixels" if factor > 1 else ""
+        beyond = "both" if top_db else "min"  # 0 dB is the peak: nothing lies above it
+        layout.draw_colour_bar(picture, f"power re peak, dB{averaged}", beyond=beyond)
+        layout.draw_scale_and_north()
+        layout.draw_markers(markers)
+        if not np.isfinite(decibel).any():
+            layout.axes.text(
+                0.5, 0.5, "no power in any pixel", transform=layout.axes.transAxes, ha="center", va="center"
+            )
+        layout.write_words(title, subtitle, footer(tags))
+        if "APERTURA_FLAGS" in tags:
+            layout.write_flags(list(json.loads(tags["APERTURA_FLAGS"])))
+        with replacement(path) as temporary:
+            layout.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+
+
+def crs_name(crs: str) -> str:
+    """Return what people call a coordinate reference system.
+
+    Examples
+    --------
+    >>> crs_name("EPSG:32632")
+    'WGS 84 / UTM zone 32N'
+    """
+    known = CRS.from_user_input(crs)
+    return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")
+
+
+def footer(tags: Mapping[str, str]) -> str:
+    """Return the line below a picture: version, focus, numerical error and code, as far as its tags say them.
+
+    Examples
+    --------
+    >>> footer({"APERTURA_VERSION": "1.0", "APERTURA_CODE_SHA256": "0123456789abcdef"})
+    'apertura 1.0 · code 0123456789ab'
+    """
+    known = (
+        ("APERTURA_VERSION", "apertura {}"),
+        ("APERTURA_ERROR_DB", "numerical error below {} dB"),
+        ("APERTURA_CODE_SHA256", "code {:.12}"),
+    )
+    told = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]
+    return " · ".join([*told[:1], *_focus_words(tags), *told[1:]])
+
+
+def _focus_words(tags: Mapping[str, str]) -> list[str]:
+    """Return the verdict on the focus, and the loss measured."""
+    if "APERTURA_FOCUS" not in tags:
+        return []
+    focus = json.loads(tags["APERTURA_FOCUS"])
+    loss = f" ({abs(focus['loss_db']):.1f} dB lost)" if "loss_db" in focus else ""
+    return [f"focus: {focus['verdict']}{loss}"]
+
+
+def shrink(image: Raster, most: int) -> tuple[NDArray[np.float64], int]:
+    """Return the mean power of square groups of pixels, so few that neither side exceeds `most`.
+
+    Parameters
+    ----------
+    image
+        (y, x) complex64; NaN pixels do not count.
+    most
+        Groups along the longer side.
+
+    Returns
+    -------
+    mean
+        (rows, columns) float64 power, NaN where a group holds no valid pixel.
+    factor
+        Pixels along a side of a group.
+
+    Examples
+    --------
+    >>> shrink(np.array([[2, 0, 1], [0, 0, np.nan]], "c8"), 2)
+    (array([[1., 1.]]), 2)
+    """
+    height, width = image.shape
+    factor = ceil(max(height, width) / most)
+    mean = np.full((ceil(height / factor), ceil(width / factor)), np.nan)
+    step = max(1, READ // factor)  # groups along a side of what is held in memory
+    for row in range(0, mean.shape[0], step):
+        for column in range(0, mean.shape[1], step):
+            groups = slice(row, row + step), slice(column, column + step)
+            rows, columns = (slice(part.start * factor, part.stop * factor) for part in groups)
+            mean[groups] = _mean_of_groups(power(np.asarray(image[rows, columns])), factor)
+    return mean, factor
+
+
+def _mean_of_groups(linear: NDArray[np.float32], factor: int) -> NDArray[np.float64]:
+    missing = [(0, -size % factor) for size in linear.shape]
+    padded = np.pad(linear.astype(np.float64), missing, constant_values=np.nan)
+    groups = padded.reshape(padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
+    valid = np.isfinite(groups).sum(axis=(1, 3))
+    return np.where(valid, np.nansum(groups, axis=(1, 3)) / np.maximum(valid, 1), np.nan)
+
+
+def below_peak(mean: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return power relative to its peak, and the level at which the colours end.
+
+    Parameters
+    ----------
+    mean
+        (rows, columns) float64 power, NaN where nothing was formed.
+
+    Returns
+    -------
+    decibel
+        (rows, columns) float64 dB, NaN without power.
+    top_db
+        0, or less where only a glitch is brighter.
+
+    Notes
+    -----
+    Source: docs/theory/export.md, "Where the colours of a quicklook end".
+
+    Examples
+    --------
+    >>> below_peak(np.array([[1.0, 0.5], [0.25, 0.125]]))[1]
+    0.0
+    """
+    decibel = decibels(mean)
+    brightest = np.sort(decibel[np.isfinite(decibel)])[-4:]
+    if not brightest.size:
+        return decibel, 0.0
+    decibel -= brightest[-1]
+    fourth = float(brightest[0] - brightest[-1])  # a target is no single dot; a glitch may be
+    return decibel, 0.0 if fourth > -20 else 5.0 * ceil(fourth / 5)

@@ -1,0 +1,112 @@
+"""What a pixel's value means, in words for the band and as values for the tag."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from math import log10
+from typing import TYPE_CHECKING, Any
+
+from apertura.common.provenance import canonical_json
+
+if TYPE_CHECKING:
+    from apertura.formats.export.cog import Band
+
+TAG = "APERTURA_RADIOMETRY"
+
+
+@dataclass(frozen=True)
+class Radiometry:
+    """What the values of a raster mean, whichever file shows them.
+
+    Attributes
+    ----------
+    amplitude, power
+        What its amplitude is called, and its square.
+    one_is
+        What has the value 1, or 0 dB.
+    divided_by
+        Pair → largest amplitude of its image, by which it was divided before it was added.
+    phases_taken_off_rad
+        Pair → constant phase taken off before it was added; pairs that a coherent sum leaves out are missing.
+    peak_db, noise_floor_re_peak_db
+        Power of the brightest target, dB re 1; median power against the peak, dB; None where nobody measured.
+    """
+
+    amplitude: str
+    power: str
+    one_is: str
+    divided_by: Mapping[str, float] = field(default_factory=dict)
+    phases_taken_off_rad: Mapping[str, float] = field(default_factory=dict)
+    peak_db: float | None = None
+    noise_floor_re_peak_db: float | None = None
+
+    def measured(self, amplitude: float, noise_floor_re_peak_db: float) -> "Radiometry":
+        """Return it with the largest amplitude of one raster, and its median power against that.
+
+        Examples
+        --------
+        >>> ECHO.measured(10.0, -49.0).peak_db
+        20.0
+        """
+        return replace(
+            self, peak_db=round(20 * log10(amplitude), 2) + 0.0, noise_floor_re_peak_db=noise_floor_re_peak_db
+        )
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values, for image.json and for `TAG`."""
+        return asdict(self)
+
+
+ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target that every pulse counted sees")
+"""Of the image of a pair (docs/theory.md, eq. 6)."""
+
+
+def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict[str, Radiometry]:
+    """Return what the sums of a flight's pairs mean, by their source in `apertura.formats.export.SOURCES`.
+
+    Parameters
+    ----------
+    peaks
+        Pair → largest amplitude of its image.
+    phases_rad
+        Pair of the coherent sum → phase taken off.
+
+    Examples
+    --------
+    >>> of_sums({"a-a": 4.0, "a-b": 2.0}, {"a-a": 0.0})["noncoherent"].power
+    'mean power of 2 peak-normalised images'
+    """
+    all_of, added = f"{len(peaks)} peak-normalised images", f"{len(phases_rad)} peak-normalised images"
+    in_phase = f"mean of {added}, added with phase"
+    shown = {pair: peaks[pair] for pair in phases_rad}
+    best = "a place where every image added has its peak"
+    return {
+        "coherent": Radiometry(in_phase, f"power of the {in_phase}", f"{best}, in phase", shown, phases_rad),
+        "noncoherent": Radiometry(f"root mean power of {all_of}", f"mean power of {all_of}", best, peaks),
+        "magnitude": Radiometry(f"mean magnitude of {all_of}", f"squared mean magnitude of {all_of}", best, peaks),
+    }
+
+
+def told(band: "Band", tags: Mapping[str, str]) -> tuple["Band", dict[str, str]]:
+    """Return a band and tags that say what its values mean, from what `TAG` says of the raster it is made from.
+
+    Parameters
+    ----------
+    band
+        Its meaning may name ``{amplitude}`` or ``{power}``.
+    tags
+        Of the file; without `TAG` the raster is any focused scene.
+
+    Examples
+    --------
+    >>> from apertura.formats.export.cog import POWER
+    >>> told(POWER, {TAG: canonical_json(ECHO.report)})[0].meaning
+    'echo power, linear'
+    """
+    raster = {"amplitude": "amplitude of the focused scene", "power": "power of the focused scene"}
+    raster |= json.loads(tags.get(TAG, "{}"))
+    meaning = band.meaning.format(**raster)
+    said = {name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None}
+    words = canonical_json({**said, "quantity": meaning, "unit": band.unit})
+    return replace(band, meaning=meaning), {**tags, TAG: words}

@@ -1,0 +1,142 @@
+"""Readers that may crash run in a process of their own: it may die, run out of memory or of time, and is then reported.
+
+The process gets paths and gives arrays as .npy files; nothing that it writes is executed or unpickled here.
+"""
+
+import json
+import os
+import pkgutil
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.errors import shown
+
+SPARE_BYTES = 1 << 30
+"""Address space that a reader may have besides `BYTES_PER_BYTE` of its largest file."""
+
+BYTES_PER_BYTE = 16
+
+SECONDS, SECONDS_PER_BYTE = 30.0, 1e-6
+"""Time that a reader may take, and more of it for each byte of its files."""
+
+_REFUSED = 3
+_THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
+
+
+class UnreadableError(ValueError):
+    """A file could not be read: which one, and what became of its reader.
+
+    Attributes
+    ----------
+    path
+        The file that was being read.
+    """
+
+    def __init__(self, path: Path, found: str) -> None:
+        self.path = path
+        super().__init__(found)
+
+
+def read_isolated(
+    function: str, paths: Sequence[Path], *, seconds: float | None = None, memory_bytes: int | None = None
+) -> list[dict[str, NDArray[Any]]]:
+    """Return what a reader makes of each file, in one process for all.
+
+    Parameters
+    ----------
+    function
+        ``module:function`` of path → name → array; a ValueError of it is the reason why a file is refused.
+    paths
+        The files.
+    seconds, memory_bytes
+        Limits; by default they grow with the files.
+
+    Returns
+    -------
+    list
+        Per file name → array, memory-mapped and read-only.
+
+    Raises
+    ------
+    UnreadableError
+        If the function refuses a file, or the process dies, takes too long or asks for too much memory.
+    """
+    sizes = [path.stat().st_size for path in paths]
+    seconds = SECONDS + SECONDS_PER_BYTE * sum(sizes) if seconds is None else seconds
+    memory_bytes = SPARE_BYTES + BYTES_PER_BYTE * max(sizes, default=0) if memory_bytes is None else memory_bytes
+    with TemporaryDirectory(prefix="apertura-") as name:
+        folder = Path(name)
+        # -P: a module that lies in the campaign folder is not what is imported
+        command = [sys.executable, "-P", "-m", __name__, function, str(memory_bytes), str(int(seconds) + 1), name]
+        files = [str(path.absolute()) for path in paths]
+        try:
+            done = subprocess.run(
+                [*command, *files],
+                check=False,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=seconds,
+                env={**os.environ, **_THREADS},
+            )
+            found = _ended(done.returncode, done.stderr)
+        except subprocess.TimeoutExpired:
+            found = f"its reader took more than {seconds:.0f} s"
+        finished = sum((folder / f"{number}.json").is_file() for number in range(len(paths)))
+        if found or finished < len(paths):
+            raise UnreadableError(paths[min(finished, len(paths) - 1)], found or "its reader wrote nothing")
+        return [_read(folder, number) for number in range(len(paths))]
+
+
+def _ended(status: int, said: bytes) -> str:
+    """Return what became of the process; empty if all is well."""
+    if status < 0:
+        return f"its reader died of {signal.Signals(-status).name}"
+    lines = said.decode("utf-8", errors="replace").strip().splitlines()
+    return "" if status == 0 else shown(lines[-1] if lines else f"its reader ended with status {status}", 300)
+
+
+def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
+    names = json.loads((folder / f"{number}.json").read_text())
+    return {
+        name: np.load(folder / f"{number}.{index}.npy", mmap_mode="r", allow_pickle=False)
+        for index, name in enumerate(names)
+    }
+
+
+def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: str) -> int:
+    """Read files in this process, which has limits of its own; write arrays, and their names when all are there."""
+    limits = {
+        resource.RLIMIT_AS: int(memory_bytes),
+        resource.RLIMIT_FSIZE: int(memory_bytes),
+        resource.RLIMIT_CPU: int(seconds),
+        resource.RLIMIT_CORE: 0,
+    }
+    for kind, limit in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        bound = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(kind, (bound, bound))
+    try:
+        reader = pkgutil.resolve_name(function)
+        for number, path in enumerate(paths):
+            arrays = reader(Path(path))
+            for index, array in enumerate(arrays.values()):
+                np.save(Path(folder) / f"{number}.{index}.npy", array, allow_pickle=False)
+            (Path(folder) / f"{number}.json").write_text(json.dumps(list(arrays)))
+    except Exception as error:  # whatever a parser raises is why the file is not readable
+        text = "its reader ran out of memory" if isinstance(error, MemoryError) else " ".join(str(error).split())
+        sys.stderr.write((text or type(error).__name__).encode("ascii", "backslashreplace").decode() + "\n")
+        return _REFUSED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main(*sys.argv[1:]))

@@ -1,0 +1,155 @@
+"""Names of recorders, flight logs and phase histories: which file is of which format, and which function reads it.
+
+Rows name their readers and import none: who asks what a file is called pays for no format, and the code hash of a
+result (`apertura.pipeline.lineage.code`) holds the readers of its own campaign alone. To add a format: one file with
+its reader, one row here.
+"""
+
+import pkgutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from apertura.common.atomic import naming
+from apertura.common.errors import CampaignError, quoted
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+
+RECORDERS: Mapping[tuple[str, ...], str] = {
+    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:open_sigmf"
+}
+"""Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
+
+FINDERS: Mapping[tuple[str, ...], str] = {
+    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf_collection:find_sigmf",
+}
+"""Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
+
+
+class LogFormat(NamedTuple):
+    """How a flight log is recognised, and read."""
+
+    suffixes: tuple[str, ...]
+    """Of <node>.track.*"""
+    reader: str
+    """reader(path, node=, options=) → `track`."""
+    heading: str = ""
+    """What its first 8 KiB hold, where others have the same suffix; none: any."""
+
+
+TRACKS: Mapping[str, LogFormat] = {
+    "airdata": LogFormat((".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)"),
+    "optitrack": LogFormat((".csv",), "apertura.formats.tracks.optitrack:read_optitrack", "Format Version,1."),
+    "csv": LogFormat((".csv",), "apertura.formats.tracks.csv_track:read_csv_track"),
+    "nmea": LogFormat((".nmea", ".txt"), "apertura.formats.tracks.nmea:read_nmea", "$"),
+    "px4": LogFormat((".ulg",), "apertura.formats.tracks.px4_ulog:read_px4_ulog"),
+    "ardupilot": LogFormat((".bin", ".log"), "apertura.formats.tracks.ardupilot:read_ardupilot", heading="FMT"),
+    "rtklib": LogFormat((".pos",), "apertura.formats.tracks.rtklib:read_rtklib_pos"),
+}
+"""Name of a format → how it is recognised and read; of those that fit a file the first is taken."""
+
+_HEADING_BYTES = 8192
+
+
+class HistoryFormat(NamedTuple):
+    """How phase history is read."""
+
+    suffix: str
+    """Of <node>.*, or of <node> itself."""
+    reader: str
+    """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs.
+
+    Of a folder paths are all its files.
+    """
+    described: bool = False
+    """Whether the reader also takes described=, the section `waveform` of the config."""
+    frame: str = ""
+    """Of its positions, local or ecef; empty: the files say, or a flight log."""
+    waveform: str = "phase_history"
+    """waveform.kind that it belongs to."""
+    beside: str = ""
+    """What ends the name of a second file of <stem><suffix>, <stem><beside>; empty: there is none."""
+
+    def files_of(self, path: Path) -> list[Path]:
+        """Return the files of what one file or folder belongs to, the one that all others are named after first."""
+        if path.is_dir():
+            return sorted(one for one in path.rglob("*") if one.is_file())
+        if not self.beside:
+            return [path]
+        stem = path.name.removesuffix(self.beside if path.name.endswith(self.beside) else self.suffix)
+        return [one for one in (path.with_name(stem + end) for end in (self.suffix, self.beside)) if one.is_file()]
+
+
+PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
+    "afrl_mat": HistoryFormat(".mat", "apertura.formats.phase_histories.afrl:read_afrl_mat", frame="local"),
+    "pulson": HistoryFormat(".out", "apertura.formats.phase_histories.pulson:read_pulson"),
+    "cphd": HistoryFormat(".cphd", "apertura.formats.phase_histories.cphd:read_cphd", described=True),
+    "hdf5": HistoryFormat(".h5", "apertura.formats.phase_histories.hdf5_history:read_hdf5_history"),
+    "zarr": HistoryFormat(".zarr", "apertura.formats.phase_histories.zarr_history:read_zarr_history"),
+    "beat_npy": HistoryFormat(
+        ".npy",
+        "apertura.formats.phase_histories.fmcw:read_beat_npy",
+        described=True,
+        waveform="fmcw",
+        beside=".time.npy",
+    ),
+    "beat_mat": HistoryFormat(
+        ".mat", "apertura.formats.phase_histories.fmcw:read_beat_mat", described=True, waveform="fmcw"
+    ),
+    "beat_wav": HistoryFormat(
+        ".wav", "apertura.formats.phase_histories.fmcw_wav:read_beat_wav", described=True, waveform="fmcw"
+    ),
+}
+"""waveform.format → how it is read."""
+
+
+def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
+    """Return the files of a node's recording in the format that is begun in a folder, else in the first known one.
+
+    Raises
+    ------
+    CampaignError
+        If metadata that name files cannot be read.
+    """
+    begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
+    row = next(begun, next(iter(RECORDERS)))
+    if row in FINDERS:
+        found: tuple[Path, ...] = pkgutil.resolve_name(FINDERS[row])(folder, node)
+        return found
+    return tuple(folder / f"{node}{suffix}" for suffix in row)
+
+
+def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
+    """Return which row of `TRACKS` reads a log: the one asked for, else by suffix and heading.
+
+    Raises
+    ------
+    CampaignError
+        If none does.
+    """
+    if options.format in TRACKS:
+        return str(options.format)
+    suffix = path.suffix.lower()
+    known = {name: row for name, row in TRACKS.items() if suffix in row.suffixes}
+    if any(row.heading for row in known.values()):
+        with naming(path), path.open("rb") as stream:
+            begins = stream.read(_HEADING_BYTES).decode("utf-8", errors="replace")
+        known = {name: row for name, row in known.items() if row.heading in begins}
+    if options.format is None and known:
+        return next(iter(known))
+    raise CampaignError(
+        f"a flight log of kind {path.suffix!r}" if options.format is None else f"format {quoted(options.format)}",
+        where=path,
+        expected=f"<node>.track.<{'|'.join(log_suffixes())}>; formats {', '.join(TRACKS)}",
+        remedy="Convert the log, or write a reader for it.",
+    )
+
+
+def log_suffixes() -> list[str]:
+    """Return what <node>.track.* may end in, without the dot.
+
+    Examples
+    --------
+    >>> "csv" in log_suffixes()
+    True
+    """
+    return sorted({suffix[1:] for row in TRACKS.values() for suffix in row.suffixes})

@@ -1,0 +1,235 @@
+"""Beat signals of FMCW radars as arrays (.npy, .mat): they enter at `echo`, placed by flight logs.
+
+What was swept is what the config says of it: section `waveform` of kind fmcw.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.npy import read_npy
+from apertura.formats.times import utc_times
+
+_TIMES = ".time.npy"
+_MOST_VALUES = 1 << 34
+_LARGEST = 1e15
+"""What a sample may be: its square is a float32."""
+
+_FARTHEST_S = 2.0**33
+"""Since 1970, what nanoseconds can count."""
+
+_LEAST_STEP = 0.9
+"""Of a sweep, what at least is between the beginnings of two; float64 seconds since 1970 are good to 0.2 us."""
+
+_EXPECTED = "beat signals (sweep, sample), real or complex as waveform.iq says, all finite"
+_REMEDY = "Correct the file, or waveform in the config."
+
+Times = NDArray[np.datetime64]
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """What one file holds.
+
+    Attributes
+    ----------
+    path
+        The file.
+    beat
+        (sweep, sample) from the beginning of each sweep.
+    time
+        (sweep,) datetime64[ns], when each began; None: the file does not say.
+    late_s
+        (sweep,) seconds by which the first sample is later than that; None: by nothing.
+    dropped
+        Reason → sweeps that are left out.
+    """
+
+    path: Path
+    beat: NDArray[Any]
+    time: Times | None
+    late_s: NDArray[np.float64] | None = None
+    dropped: Mapping[str, int] | None = None
+
+
+def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
+    """Return the `echo` stage of <node>.npy or <node>.<part>.npy, (sweep, sample), without positions.
+
+    Beside <stem>.npy, <stem>.time.npy may say when each sweep began: datetime64, or float64 seconds since 1970.
+
+    Raises
+    ------
+    CampaignError
+        If arrays do not fit each other or the waveform.
+    """
+    by_name = {path.name: path for path in paths}
+    files = [path for path in paths if not path.name.endswith(_TIMES)]
+    alone = [path for path in paths if path.name.endswith(_TIMES) and path.name[: -len(_TIMES)] + ".npy" not in by_name]
+    if alone or not files:
+        raise _error("times without beat signals", (alone or list(paths))[0])
+    asked: dict[str, Any] = {"most": _MOST_VALUES, "expected": _EXPECTED, "remedy": _REMEDY}
+    read = []
+    for path in files:
+        beside = by_name.get(path.name.removesuffix(".npy") + _TIMES)
+        time = None if beside is None else _times(read_npy(beside, kinds="Mf", **asked), beside)
+        read.append(Sweeps(path, read_npy(path, kinds="fiuc", **asked), time))
+    return joined_sweeps(read, pair=pair, described=described)
+
+
+def read_beat_mat(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
+    """Return the `echo` stage of MATLAB files with beat (sweep, sample) and, or not, time (sweep,) in s since 1970.
+
+    Raises
+    ------
+    CampaignError
+        As `read_beat_npy`.
+    """
+    read = read_fields("apertura.formats.phase_histories.fmcw_fields:read_beat_fields", paths)
+    return joined_sweeps([sweeps_of(path, one) for path, one in read], pair=pair, described=described)
+
+
+def read_fields(function: str, paths: Sequence[Path]) -> Iterable[tuple[Path, dict[str, NDArray[Any]]]]:
+    """Return each file, in the order of names, and what a function in a process of its own makes of it.
+
+    Raises
+    ------
+    CampaignError
+        If it refuses one, or dies of it.
+    """
+    paths = sorted(paths)
+    try:
+        return list(zip(paths, read_isolated(function, paths), strict=True))
+    except UnreadableError as error:
+        raise _error(f"not readable ({error})", error.path) from error
+
+
+def sweeps_of(path: Path, found: Mapping[str, NDArray[Any]]) -> Sweeps:
+    """Return the variables beat and time of a MATLAB file as sweeps; raise CampaignError if time is none."""
+    return Sweeps(path, found["beat"], _times(found["time"], path) if "time" in found else None)
+
+
+def sweep_of(described: Mapping[str, Any]) -> Sweep:
+    """Return what section `waveform` says of the sweep."""
+    return Sweep(**{field.name: described[field.name] for field in fields(Sweep)})
+
+
+def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
+    """Return the `echo` stage of sweeps, without positions; `dropped` counts those left out by reason.
+
+    Parameters
+    ----------
+    read
+        What files hold, in the order of time.
+    pair
+        Transmitter-receiver.
+    described
+        Section `waveform`.
+
+    Raises
+    ------
+    CampaignError
+        If sweeps are too short, are not what waveform.iq says, are no finite numbers, or have no times that ascend.
+    """
+    sweep, dropped = sweep_of(described), dict[str, int]()
+    times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    for one in read:
+        _check(one, sweep)
+        began = _regular(one, described, alone=len(read) == 1) if one.time is None else one.time
+        if len(began) != len(one.beat):
+            raise _error(f"{len(began)} times for {len(one.beat)} sweeps", one.path)
+        sound = one.beat[:, sweep.first : sweep.whole].any(axis=1)
+        left_out = {**(one.dropped or {}), "silent": int((~sound).sum())}
+        dropped = {why: dropped.get(why, 0) + left_out.get(why, 0) for why in {**dropped, **left_out}}
+        late_s = None if one.late_s is None else one.late_s[sound]
+        times.append(began[sound])
+        transfers.append(transfer_of(one.beat[sound], sweep, late_s=late_s))
+    time = np.concatenate(times) + np.timedelta64(round(sweep.middle_s * 1e9), "ns")
+    if not len(time):
+        raise _error("no sweep with a signal", read[0].path)
+    steps_s = np.diff(time) / np.timedelta64(1, "s")
+    early = np.flatnonzero(steps_s < _LEAST_STEP * sweep.whole / sweep.sample_rate_hz)
+    if early.size:
+        found = (
+            f"sweep {int(early[0]) + 1} begins {steps_s[early[0]]:.6g} s after another that lasts {sweep.sweep_s:g} s"
+        )
+        raise _error(f"{found} ({early.size} such in all files)", read[0].path)
+    return xr.Dataset(
+        {
+            "time": ("pulse", time),
+            "transfer": (("pulse", "subcarrier"), np.concatenate(transfers)),
+            "frequency": ("subcarrier", sweep.frequency_hz),
+            "reference_delay": ("pulse", np.full(len(time), sweep.reference_delay_s)),
+            "path_limit": ("pulse", np.full(len(time), sweep.path_limit_m)),
+        },
+        attrs={
+            "pair": pair,
+            "flags": {},
+            "dropped": {why: count for why, count in dropped.items() if count},
+            "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
+        },
+    )
+
+
+def _check(one: Sweeps, sweep: Sweep) -> None:
+    beat = one.beat
+    if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.whole or not len(beat):
+        raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.whole} samples", one.path)
+    if (beat.dtype.kind == "c") != (sweep.iq != "real"):
+        raise _error(f"{beat.dtype} samples where waveform.iq is {sweep.iq}", one.path)
+    with np.errstate(invalid="ignore"):
+        bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
+    if bad.size:
+        raise _error(
+            f"sweep {int(bad[0])} holds what is no number, or beyond {_LARGEST:g} ({bad.size} in all)", one.path
+        )
+
+
+def _regular(one: Sweeps, described: Mapping[str, Any], *, alone: bool) -> Times:
+    """Return when sweeps began that come at waveform.prf_hz from waveform.start_utc on."""
+    if described["prf_hz"] is None or not alone:
+        found = "no times of sweeps" if alone else "several files without times of their sweeps"
+        raise _error(found, one.path, "the file's own times, or one file and waveform.prf_hz")
+    steps_ns = np.round(np.arange(len(one.beat)) * (1e9 / described["prf_hz"]))
+    times: Times = beginning(described, one.path) + steps_ns.astype("timedelta64[ns]")
+    return times
+
+
+def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
+    """Return waveform.start_utc; without one 1970, from where a clock of the config leads to the log's times."""
+    stated = described["start_utc"]
+    try:
+        first: np.datetime64 = np.datetime64("1970-01-01", "ns") if stated is None else utc_times([stated])[0]
+    except ValueError as error:
+        raise _error(f"waveform.start_utc: {error}", path, "ISO 8601 in UTC") from error
+    return first
+
+
+def _times(stored: NDArray[Any], path: Path) -> Times:
+    known = stored.dtype.kind in "fiu" or (stored.dtype.kind == "M" and stored.dtype != np.dtype("M8"))
+    if not known or stored.ndim != 1 or not stored.size:
+        raise _error(f"times as {stored.dtype} of shape {stored.shape}", path)
+    if stored.dtype.kind != "M":
+        with np.errstate(invalid="ignore", over="ignore"):  # what is no number becomes no time, and is refused as such
+            seconds = stored.astype(np.float64)
+            seconds = np.where(np.abs(seconds) < _FARTHEST_S, seconds, np.nan)
+            whole = np.floor(seconds)
+            # apart, because float64 holds nanoseconds of one second but not of all since 1970
+            rest = np.round((seconds - whole) * 1e9).astype("timedelta64[ns]")
+            stored = whole.astype("datetime64[s]").astype("datetime64[ns]") + rest
+    years = stored.astype("datetime64[Y]").astype(np.int64) + 1970
+    wrong = np.flatnonzero(np.isnat(stored) | (years < 1970) | (years > 2199))
+    if wrong.size:
+        raise _error(f"time {int(wrong[0])} is none between 1970 and 2199", path)
+    return stored.astype("datetime64[ns]")
+
+
+def _error(found: str, path: Path, expected: str = _EXPECTED) -> CampaignError:
+    return CampaignError(found, where=path, expected=expected, remedy=_REMEDY)

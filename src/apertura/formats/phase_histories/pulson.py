@@ -1,0 +1,152 @@
+"""Scans of Time Domain PulsON P4xx radars (.out): real samples of what came back, as messages MRM_SCAN_INFO.
+
+They enter at `echo`: the radar correlates by itself, and counts milliseconds since it was switched on.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.atomic import naming
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.formats.tracks.tables import LARGEST_LOG
+
+SAMPLE_RATE_HZ = 16.384e9
+"""Of a scan: 32 of the radar's bins of 1.907 ps."""
+
+BAND_HZ = 3.1e9, 5.3e9
+"""What the radar occupies by its data sheet."""
+
+_CONFIG_BYTES = 32  # of the radar's configuration, which a file begins with
+_SAMPLES = 350  # of each message
+MESSAGE = np.dtype(
+    [("type", ">u2"), ("id", ">u2"), ("source", ">u4"), ("time_ms", ">u4"), ("reserved", "V16")]
+    + [("start_ps", ">i4"), ("stop_ps", ">i4"), ("step_bins", ">i2")]
+    + [("kind", "u1"), ("filter", "u1"), ("antenna", "u1"), ("mode", "u1")]
+    + [("held", ">u2"), ("total", ">u4"), ("index", ">u2"), ("messages", ">u2"), ("scan", ">i4", (_SAMPLES,))]
+)
+_SCAN_INFO, _STEP_BINS, _RAW_SCAN = 0xF201, 32, 1
+_MOST_SAMPLES = 1 << 16
+_EPOCH = np.datetime64("1970-01-01", "ns")
+_SHARED = ("source", "start_ps", "stop_ps", "step_bins", "kind", "antenna", "total", "messages")
+
+
+def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
+    """Return scans as transfer functions over the band, without positions: a flight log has those.
+
+    `time` counts from 1970 as the radar does from when it was switched on. Scans with a message missing or damaged, and
+    those that a file ends in, are left out and counted in flag `scans_incomplete`.
+
+    Parameters
+    ----------
+    paths
+        Files of one radar, in the order of their scans.
+    pair
+        Transmitter-receiver.
+
+    Raises
+    ------
+    CampaignError
+        If a file holds no messages of that kind, or scans that differ in what they cover.
+
+    Notes
+    -----
+    Source: Time Domain, "Monostatic Radar Module Application Programming Interface (API) Specification", messages
+    MRM_SCAN_INFO and MRM_SET_CONFIG_REQUEST; docs/formats.md. A scan is the real echo at `SAMPLE_RATE_HZ`: bins of its
+    Fourier transform inside `BAND_HZ` are the transfer function, referred to where the scan begins.
+    """
+    found = [_scans(path) for path in sorted(paths)]
+    messages = np.concatenate([first for first, _, _ in found])
+    samples = np.concatenate([scan for _, scan, _ in found])
+    incomplete = sum(count for _, _, count in found)
+    start_ps, total = int(messages["start_ps"][0]), int(messages["total"][0])
+    time_ms = messages["time_ms"].astype(np.int64)
+    backwards = np.flatnonzero(np.diff(time_ms) <= 0)
+    if backwards.size:
+        at = int(backwards[0]) + 1
+        raise _error(f"scan {at} at {time_ms[at]} ms is not after the one before, {time_ms[at - 1]} ms", paths[0])
+    frequency = np.arange(total // 2 + 1) * (SAMPLE_RATE_HZ / total)
+    band = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
+    transfer = np.fft.rfft(samples, axis=1, norm="forward")[:, band].astype(np.complex64)
+    lasts_s = total / SAMPLE_RATE_HZ
+    flags = {"scans_incomplete": f"{incomplete} of {incomplete + len(samples)} scans"} if incomplete else {}
+    return xr.Dataset(
+        {
+            "time": ("pulse", _EPOCH + time_ms.astype("timedelta64[ms]").astype("timedelta64[ns]")),
+            "transfer": (("pulse", "subcarrier"), transfer),
+            "frequency": ("subcarrier", frequency[band]),
+            "reference_delay": ("pulse", np.full(len(samples), start_ps * 1e-12)),
+            "path_limit": ("pulse", np.full(len(samples), (start_ps * 1e-12 + lasts_s) * SPEED_OF_LIGHT_M_S)),
+        },
+        attrs={"pair": pair, "flags": flags},
+    )
+
+
+def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
+    """Return the first message of each whole scan, their samples (scan, sample), and how many scans are not whole."""
+    if path.stat().st_size > LARGEST_LOG:
+        raise _error(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read", path)
+    with naming(path):
+        content = path.read_bytes()
+    messages, cut = _messages(content)
+    if not messages.size:
+        raise _error(f"{len(content)} bytes without a message MRM_SCAN_INFO", path)
+    total = int(np.median(messages["total"]))
+    count = -(-total // _SAMPLES)
+    if not 0 < total <= _MOST_SAMPLES or count != int(np.median(messages["messages"])):
+        raise _error(f"scans of {total} samples in {int(np.median(messages['messages']))} messages", path)
+    kept = messages[(messages["total"] == total) & (messages["index"] < count)]
+    first = np.flatnonzero(kept["index"] == 0)
+    following = first[:, None] + np.arange(count)
+    inside = following[:, -1] < len(kept)
+    rows = kept[following[inside]]
+    same = np.all([rows[name] == rows[name][:, :1] for name in ("id", "time_ms", *_SHARED)], axis=(0, 2))
+    whole = rows[same & (rows["index"] == np.arange(count)).all(axis=1)]
+    if not len(whole):
+        raise _error("no whole scan", path)
+    numbers = np.unique(messages["id"].astype(np.int64) << 32 | messages["time_ms"])
+    _check(whole[:, 0], path)
+    samples = whole["scan"].reshape(len(whole), -1)[:, :total].astype(np.float64)
+    begun = cut and messages["index"][-1] == count - 1  # else the message cut off is of a scan that is counted already
+    return whole[:, 0], samples, len(numbers) - len(whole) + int(begun)
+
+
+def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:
+    """Return the messages of a file, found again behind bytes that are none, and whether it ends within one."""
+    size, sign = MESSAGE.itemsize, _SCAN_INFO.to_bytes(2, "big")
+    at, found = min(_CONFIG_BYTES, len(content)), []
+    last = at
+    while (at := content.find(sign, at)) >= 0 and at + size <= len(content):
+        last = at
+        while content[last : last + 2] == sign and last + size <= len(content):
+            last += size
+        found.append(np.frombuffer(content[at:last], MESSAGE))
+        at = last
+    messages = np.concatenate(found) if found else np.empty(0, MESSAGE)
+    scans = messages[(messages["step_bins"] == _STEP_BINS) & (messages["kind"] == _RAW_SCAN)]
+    return np.asarray(scans), len(content) > last and sign.startswith(content[last : last + 2])
+
+
+def _check(scans: NDArray[np.void], path: Path) -> None:
+    """Raise CampaignError unless all scans look at the same window by the same antennas."""
+    for name in _SHARED:
+        other = np.flatnonzero(scans[name] != scans[name][0])
+        if other.size:
+            raise _error(f"scan {int(other[0])} has {name} {scans[name][other[0]]}, others {scans[name][0]}", path)
+    lasts_ps = int(scans["stop_ps"][0]) - int(scans["start_ps"][0])
+    if abs(lasts_ps * 1e-12 * SAMPLE_RATE_HZ - int(scans["total"][0])) > 2:
+        raise _error(f"{scans['total'][0]} samples for {lasts_ps} ps", path)
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(
+        found,
+        where=path,
+        expected=f"{_CONFIG_BYTES} bytes of configuration, then messages MRM_SCAN_INFO of {MESSAGE.itemsize} bytes, "
+        "raw scans in steps of 32 bins",
+        remedy="Copy the file again, or log it by the radar's own software with these settings.",
+    )

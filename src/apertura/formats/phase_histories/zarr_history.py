@@ -1,0 +1,106 @@
+"""Phase history in a zarr folder (version 3) of a documented layout, through zarr in a process of its own."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.documents import CODECS, other_codec
+from apertura.common.errors import quoted
+from apertura.formats.isolated import BYTES_PER_BYTE, UnreadableError, read_isolated
+from apertura.formats.phase_histories.history_layout import EXPECTED, LAYOUT, check_array, check_attributes, history
+from apertura.formats.phase_histories.phase_history import joined, refused
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SUFFIX = ".zarr"
+
+_EXPECTED = f"a zarr folder, version 3, of {EXPECTED}"
+_SPARE_BYTES = 4 << 30
+"""Address space for zarr, whose threads and event loop reserve much more than they use."""
+
+
+def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
+    """Return the `echo` stage of zarr folders, joined in the order of their names; `paths` are the files in them.
+
+    Raises
+    ------
+    CampaignError
+        If a folder is not of the layout of docs/formats/phase_history.md.
+    """
+    folders = folders_of(paths)
+    if not folders:
+        raise refused("a file, not a folder", paths[0], _EXPECTED)
+    for folder in folders:
+        for path in (folder, *folder.rglob("*")):
+            if path.is_symlink():
+                raise refused("a symbolic link: what it leads to is not read", path, _EXPECTED)
+    sizes = [path.stat().st_size for path in paths]
+    limits: dict[str, Any] = {"memory_bytes": _SPARE_BYTES + BYTES_PER_BYTE * sum(sizes)}
+    try:
+        read = read_isolated(f"{__name__}:read_fields", folders, **limits)
+    except UnreadableError as error:
+        raise refused(f"not readable ({error})", error.path, _EXPECTED) from error
+    return joined([history(*one) for one in zip(folders, read, strict=True)], pair=pair, expected=_EXPECTED)
+
+
+def folders_of(paths: Iterable[Path]) -> list[Path]:
+    """Return the zarr folders that files lie in, sorted: of folders in each other the outermost.
+
+    Examples
+    --------
+    >>> [path.as_posix() for path in folders_of([Path("f/b.x.zarr/time/c/0"), Path("f/a.x.zarr/zarr.json")])]
+    ['f/a.x.zarr', 'f/b.x.zarr']
+    """
+    above = ([folder for folder in path.parents if folder.suffix == SUFFIX] for path in paths)
+    return sorted({folders[-1] for folders in above if folders})
+
+
+def read_fields(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a zarr folder that the layout names; run by `read_isolated`.
+
+    Raises
+    ------
+    ValueError
+        If one is missing, is not of the layout, or is kept in a way that may run code.
+    """
+    group = _metadata(path)
+    fields = {
+        name: _array(path / name, name)
+        for name, field in LAYOUT.items()
+        if (path / name).is_dir() or not field.optional
+    }
+    frame = _mapping(group, "attributes").get("frame")
+    units = _mapping(_metadata(path / "time"), "attributes").get("units")
+    check_attributes(frame, units, placed="tx_position" in fields)
+    return fields | {"frame": np.array(frame or "")}
+
+
+def _array(folder: Path, name: str) -> NDArray[Any]:
+    import zarr
+
+    other = other_codec(_metadata(folder))
+    if other is not None:
+        raise ValueError(f"{name} is kept by codec {quoted(other)}, and not by {', '.join(sorted(CODECS))}")
+    # by itself: what a group repeats of its arrays' metadata has not been looked at
+    array = zarr.open_array(folder, mode="r", zarr_format=3)
+    check_array(name, array.shape, np.dtype(array.dtype))
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        return np.asarray(array[...], np.complex64) if name == "transfer" else np.asarray(array[...])
+
+
+def _metadata(folder: Path) -> Mapping[str, Any]:
+    from apertura.common.documents import read_json
+
+    path = folder / "zarr.json"
+    if not path.is_file():
+        raise ValueError(f"no {path.name} in {folder.name}")
+    return read_json(path, expected="metadata of zarr, version 3", remedy="Copy the folder again.")
+
+
+def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = document.get(key)
+    return value if isinstance(value, Mapping) else {}

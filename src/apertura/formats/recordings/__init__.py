@@ -1,0 +1,1 @@
+"""Samples as recorders write them; rows in `apertura.formats.names.RECORDERS`."""

@@ -1,0 +1,125 @@
+"""Flight logs of DJI drones as AirData exports them (CSV): whole seconds of UTC beside a clock of milliseconds."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.formats.times import utc_times
+from apertura.formats.tracks.left_open import contradicted, unsaid
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.tables import cut_off, numbers, read_table
+from apertura.formats.tracks.track import make_track, remarked
+
+_CLOCK, _UTC = "time(millisecond)", "datetime(utc)"
+_PLACE = ["latitude", "longitude"]
+_ATTITUDE = ["roll(degrees)", "pitch(degrees)", "compass_heading(degrees)"]
+_HEIGHTS = {"altitude_above_seaLevel(meters)": 1.0, "altitude_above_seaLevel(feet)": 0.3048}
+_SATELLITES = "satellites"
+_FEWEST = 4  # without them a position is dead reckoning
+
+_APART_S = 1.5
+"""By what seconds and clock step apart where the clock stood still: a whole second is late by 1 s at most."""
+
+_SURE_S = 0.1
+"""How well the seconds of a part must tell its clock's zero, and how far an epoch may lie outside its second: AirData's
+interval."""
+
+_ROUNDING_S = 1e-6
+
+_EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
+
+
+class _Clock(NamedTuple):
+    """UTC of epochs, and what is known of it."""
+
+    time: NDArray[np.datetime64]
+    sure: NDArray[np.bool_]
+    misfit_s: float
+    parts: int
+
+
+def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of a DJI flight as AirData exports it, at 10 Hz.
+
+    datetime(utc) holds whole seconds, which are taken as cut off: UTC is the clock time(millisecond) plus the offset
+    with which no epoch leaves its second. The clock stands still while motors are off, so every part between has an
+    offset of its own; parts too short to tell it are left out. What does not fit is told (remarks). Heights are above
+    mean sea level: options.height_offset_m is needed. The log does not say how a position was solved (RTK or not).
+
+    Raises
+    ------
+    CampaignError
+        If a column is missing, a cell is no number, nobody says what heights are above, or the two clocks do not agree.
+
+    Notes
+    -----
+    Source: equations in docs/theory/logs.md, "Two clocks".
+    """
+    if options.time_system == "gpst":
+        raise contradicted("time_system", f"{_UTC} is UTC", node=node, where=path)
+    if options.height_offset_m is None:
+        raise unsaid("height_offset_m", "heights above mean sea level", node=node, where=path)
+    try:
+        table = read_table(path, (_CLOCK, _UTC, *_PLACE), optional=(*_ATTITUDE, *_HEIGHTS, _SATELLITES), texts=(_UTC,))
+        height = next((name for name in _HEIGHTS if name in table), None)
+        if height is None:
+            raise ValueError("no column altitude_above_seaLevel, in metres or feet")
+        cut = cut_off(path)
+        table, dropped = _measured(table.iloc[: len(table) - cut])
+        clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, utc_times(table[_UTC].fillna("").str.strip().tolist()))
+        logged = numbers(table[[*_PLACE, height]])
+        attitude = numbers(table[_ATTITUDE])[clock.sure] if set(_ATTITUDE) <= set(table) else None
+    except (ValueError, ArithmeticError) as error:
+        found = str(error).partition("\n")[0]
+        raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
+    position = logged * [1.0, 1.0, _HEIGHTS[height]] + [0.0, 0.0, options.height_offset_m]
+    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~clock.sure).sum())}
+    track = make_track(
+        clock.time[clock.sure],
+        position[clock.sure],
+        attitude_deg=attitude,
+        dropped={why: count for why, count in dropped.items() if count},
+        node=node,
+        where=path,
+    )
+    remark = f"{_UTC} holds whole seconds, {clock.misfit_s:.2f} s off the clock of milliseconds in {clock.parts} parts"
+    return remarked(track, remark, path)
+
+
+def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
+    """Return the rows that hold an epoch of their own, and why others do not."""
+    doubled = table.duplicated([_CLOCK, _UTC, *_PLACE]).to_numpy()
+    blind = np.zeros(len(table), bool)
+    if _SATELLITES in table:
+        blind = numbers(table[[_SATELLITES]])[:, 0] < _FEWEST
+    counts = {"said twice": doubled, f"fewer than {_FEWEST} satellites": blind & ~doubled}
+    return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items()}
+
+
+def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64]) -> _Clock:
+    """Return UTC of epochs from a clock and from seconds of UTC that are cut off; ValueError if they do not agree."""
+    if not np.isfinite(clock_s).all() or not (np.diff(clock_s) > 0).all():
+        raise ValueError(f"column {_CLOCK} does not increase")
+    if not len(clock_s):
+        raise ValueError("no epochs")
+    zero = second[0]
+    told = (second - zero) / np.timedelta64(1, "s")
+    apart = np.abs(np.diff(told) - np.diff(clock_s)) > _APART_S
+    part = np.concatenate([[0], np.cumsum(apart)])
+    offset, sure, misfit = np.zeros(len(told)), np.zeros(len(told), bool), 0.0
+    for number in range(part[-1] + 1):
+        rows = part == number
+        low, high = (told - clock_s)[rows].max(), (told - clock_s)[rows].min() + 1
+        offset[rows] = (low + high) / 2
+        sure[rows] = high - low <= 2 * _SURE_S + _ROUNDING_S
+        misfit = max(misfit, (low - high) / 2 if sure[rows].any() else 0.0)
+    if misfit > _SURE_S or not sure.any():
+        found = f"{misfit:.2f} s apart" if misfit > _SURE_S else "one a second, so that no second is seen to change"
+        raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
+    elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")
+    return _Clock(zero + elapsed, sure, misfit, int(part[-1]) + 1)

@@ -1,0 +1,187 @@
+"""ArduPilot flight logs (DataFlash .bin, or .log as text): the receiver's epochs by GPS week, and attitude."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, quoted
+from apertura.common.leap_seconds import gps_from_weeks, utc_from_gps
+from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
+from apertura.formats.tracks.dataflash_fields import COLUMNS, NEEDED
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.track import FIXES
+
+Fields = Mapping[str, NDArray[Any]]
+Floats = NDArray[np.float64]
+
+_KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
+"""GPS.Status; below 3 there is no height."""
+
+_DELAYS = (("GPS_DELAY_MS", "GPS1_DELAY_MS"), ("GPS_DELAY_MS2", "GPS2_DELAY_MS"))
+_TYPES = (("GPS_TYPE", "GPS1_TYPE"), ("GPS_TYPE2", "GPS2_TYPE"))
+_DELAY_S = 0.12
+_NOVATEL = 15  # its driver has the geoid's sign reversed, and with it that of AEl
+_LAST_WEEK, _WEEK_MS = 11_000, 604_800_000
+_LOWEST_M = -1e6  # AEl is the lowest integer where it is not known
+_EXPECTED = f"an ArduPilot DataFlash log whose GPS messages hold {', '.join(NEEDED)}"
+
+
+def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of a DataFlash log; its attribute `source` says which receiver was taken of how many.
+
+    Taken is receiver 0, or the one whose number ``options.body`` is. GPS week and milliseconds become UTC by the table
+    of leap seconds. Heights are GPA.AEl, above the ellipsoid; logs without it have GPS.Alt only, above sea level, and
+    need ``options.height_offset_m``. GPA.Und of some versions is not used: drivers differ in its sign.
+
+    Parameters
+    ----------
+    path
+        The log.
+    node
+        Its node.
+    options
+        start_utc: UTC at the autopilot's start, where its receiver told no week.
+
+    Raises
+    ------
+    CampaignError
+        If the file is no DataFlash log, or holds no positions, no ellipsoidal heights or no GPS time.
+
+    Notes
+    -----
+    Source: ArduPilot, AP_GPS/LogStructure.h and AP_AHRS/LogStructure.h (messages GPS, GPA, ATT), and parameters
+    GPS1_DELAY_MS, GPS1_TYPE.
+    """
+    try:
+        fields = read_isolated("apertura.formats.tracks.dataflash_fields:read_fields", [path])[0]
+    except UnreadableError as error:
+        raise _error(f"not readable ({error})", path) from error
+    return track_of(fields, node=node, options=options, where=path)
+
+
+def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> xr.Dataset:
+    """Return the `track` stage of what `apertura.formats.tracks.dataflash_fields` read.
+
+    Parameters
+    ----------
+    fields
+        Its answer.
+    node, options, where
+        As `read_ardupilot`.
+
+    Raises
+    ------
+    CampaignError
+        As `read_ardupilot`.
+    """
+    chosen, known = _receiver(fields, options, node, where)
+    rows = {name: fields[f"GPS/{name}"][fields["GPS/I"] == chosen] for name in COLUMNS["GPS"]}
+    stated = _accuracy(fields, chosen, rows["TimeUS"])
+    height = _height(fields, rows["Alt"], stated["AEl"], chosen, options)
+    if height is None:
+        raise CampaignError(
+            "heights are above sea level (GPS.Alt), and none above the ellipsoid is logged that can be trusted",
+            where,
+            "GPA.AEl of a receiver other than a NovAtel",
+            f"Set nodes.{node}.log.height_offset_m: what makes GPS.Alt ellipsoidal (the geoid's height there).",
+        )
+    try:
+        time_utc = _utc(rows["GWk"], rows["GMS"])
+    except ValueError as error:
+        raise _error(str(error), where) from error
+    fix = np.array([_KINDS.get(int(kind) if np.isfinite(kind) else 0, 0) for kind in rows["Status"]], np.int8)
+    epochs = Epochs(
+        boot_s=rows["TimeUS"] * 1e-6,
+        time_utc=time_utc,
+        geodetic=np.stack([rows["Lat"], rows["Lng"], height], -1),
+        fixed=fix > 0,
+        fix=fix,
+        std_m=np.stack([stated["HAcc"], stated["HAcc"], stated["VAcc"]], -1),
+        velocity=_velocity(rows, stated["VV"]),
+    )
+    delay_s = _parameter(fields, _DELAYS, chosen, 0.0) / 1e3
+    delay_s = delay_s if 0 < delay_s < 1 else _DELAY_S
+    track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
+    track.attrs["source"] = f"GPS {chosen} of {', '.join(map(str, known))}"
+    return track
+
+
+def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tuple[int, list[int]]:
+    """Return the number of the receiver to take, and of all."""
+    numbers = fields["GPS/I"]
+    known = sorted({int(number) for number in numbers[np.isfinite(numbers)]})
+    if not known:
+        raise _error("no GPS message", where)
+    asked = options.body is None or options.body in map(str, known)
+    if not asked:
+        raise CampaignError(
+            f"no receiver {quoted(options.body)}",
+            where,
+            f"one of {', '.join(map(str, known))}",
+            f"Correct nodes.{node}.log.body, or leave it out.",
+        )
+    return known[0] if options.body is None else int(options.body), known
+
+
+def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Floats]:
+    """Return HAcc, VAcc, AEl (m), VV (VZ is known) of the GPA message written with each epoch; NaN where none was."""
+    own = fields["GPA/I"] == receiver
+    times, order = np.unique(fields["GPA/TimeUS"][own], return_index=True)
+    place = np.searchsorted(times, time_us)
+    there = place < times.size
+    there[there] = times[place[there]] == time_us[there]
+    stated = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "VV", "AEl")}
+    for name, values in stated.items():
+        values[there] = fields[f"GPA/{name}"][own][order][place[there]]
+    return stated
+
+
+def _height(
+    fields: Fields, sea_level: Floats, ellipsoidal: Floats, receiver: int, options: LogOptions
+) -> Floats | None:
+    """Return heights above the ellipsoid, NaN where unknown; None if the log does not tell them."""
+    known = ellipsoidal > _LOWEST_M
+    if known.any() and _parameter(fields, _TYPES, receiver, 0) != _NOVATEL:
+        return np.where(known, ellipsoidal, np.nan)
+    return None if options.height_offset_m is None else sea_level + options.height_offset_m
+
+
+def _parameter(fields: Fields, names: tuple[tuple[str, ...], ...], receiver: int, default: float) -> float:
+    """Return a receiver's parameter, which versions name differently."""
+    of = names[min(receiver, len(names) - 1)]
+    return next((float(fields[f"PARM/{name}"][0]) for name in of if f"PARM/{name}" in fields), default)
+
+
+def _utc(week: Floats, milliseconds: Floats) -> NDArray[np.datetime64]:
+    """Return UTC of GPS weeks and milliseconds; NaT where a receiver did not know them yet."""
+    known = (week > 0) & (week <= _LAST_WEEK) & (milliseconds >= 0) & (milliseconds < _WEEK_MS)
+    utc = np.full(week.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
+    utc[known] = utc_from_gps(gps_from_weeks(week[known].astype(np.int64), milliseconds[known].astype(np.int64)))
+    return utc
+
+
+def _velocity(rows: Fields, vertical: Floats) -> Floats:
+    """Return velocities to north, east and down."""
+    course = np.radians(rows["GCrs"])
+    down = np.where(vertical == 1, rows["VZ"], np.nan)
+    return np.stack([rows["Spd"] * np.cos(course), rows["Spd"] * np.sin(course), down], -1)
+
+
+def _attitude(fields: Fields) -> Attitude | None:
+    from scipy.spatial.transform import Rotation
+
+    angles = np.stack([fields[f"ATT/{name}"] for name in ("Yaw", "Pitch", "Roll")], -1)
+    good = np.isfinite(angles).all(axis=1) & (np.abs(angles) <= 360).all(axis=1)
+    if not good.any():
+        return None
+    turns = Rotation.from_euler("ZYX", angles[good], degrees=True)
+    return Attitude(fields["ATT/TimeUS"][good] * 1e-6, turns.as_quat())
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(found, path, _EXPECTED, "Copy the log again, or log GPS messages.")

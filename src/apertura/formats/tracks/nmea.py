@@ -1,0 +1,251 @@
+"""NMEA 0183 logs: GGA for positions, RMC or ZDA for the date, GST for standard deviations; checksums are verified."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from pynmea2 import NMEASentence, ParseError
+
+from apertura.common.errors import CampaignError, quoted
+from apertura.formats.times import utc_times
+from apertura.formats.tracks.left_open import contradicted, start_time, unsaid
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.tables import LARGEST_LOG, number
+from apertura.formats.tracks.track import FIXES, make_track, remarked
+
+_BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")
+_STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
+_DATED = {"RMC", "ZDA"}
+_WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
+_TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
+_DAY_NS, _SECOND_NS = 86_400_000_000_000, 1_000_000_000
+_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float", "9": "sbas"}
+_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "typed in", "8": "simulated"}
+_REMEDY = "Log GGA with RMC or ZDA, as the receiver sends them."
+
+
+class _Fix(NamedTuple):
+    """One GGA with a position."""
+
+    talker: str
+    geodetic: tuple[float, float, float]
+    separation: float
+    kind: int
+
+
+@dataclass
+class _Log:
+    """What the sentences of a log say, on its way to a track."""
+
+    path: Path
+    node: str
+    options: LogOptions
+    now_ns: int | None = None
+    fixes: dict[int, _Fix] = field(default_factory=dict)
+    order: list[int] = field(default_factory=list)
+    std: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    dropped: Counter[str] = field(default_factory=Counter)
+    stamped: int = 0
+
+
+def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of an NMEA 0183 log of any talkers.
+
+    Positions, their kind and the geoid separation are those of GGA: ellipsoidal height is altitude plus separation. GGA
+    has a time of day; its date is that of the RMC (valid) or ZDA before it, or options.start_utc's where there is none,
+    and goes on over midnight; where both are, they must be of one day. GST states standard deviations. Of one epoch by
+    several talkers GN's is taken.
+
+    Raises
+    ------
+    CampaignError
+        If no sentence has a date, none a geoid separation and the config does not say what they leave open, or the
+        config says another day than they do, or times do not increase.
+
+    Notes
+    -----
+    Source: NMEA 0183 4.10, GGA, GST, RMC, ZDA; quality 9 as NovAtel's GPGGA. What a host wrote before ``$`` is cut off.
+    """
+    if options.time_system == "gpst":
+        raise contradicted("time_system", "times of NMEA are UTC", node=node, where=path)
+    if path.stat().st_size > LARGEST_LOG // 2:
+        raise CampaignError(f"{path.stat().st_size} bytes", path, f"at most {LARGEST_LOG // 2}", "Shorten the log.")
+    log = _Log(path, node, options)
+    looked_through = _sentences(_Log(path, node, options))  # as far as the first date: epochs before it have it, too
+    dates = (_dated(sentence) for sentence in looked_through if sentence.sentence_type in _DATED)
+    log.now_ns = next((date for date in dates if date is not None), None)
+    first_ns = log.now_ns
+    for sentence in _sentences(log):
+        _take(sentence, log)
+    if first_ns is not None and options.start_utc is not None:
+        _check_day(first_ns, log)
+    return _track(log)
+
+
+def _check_day(first_ns: int, log: _Log) -> None:
+    """Raise CampaignError where the config's day is neither that of the first date nor that of the first epoch."""
+    stated = start_time(log.options, "", node=log.node, where=log.path).astype("datetime64[D]")
+    days = [np.datetime64(time_ns, "ns").astype("datetime64[D]") for time_ns in (first_ns, *log.order[:1])]
+    if stated not in days:
+        raise contradicted("start_utc", f"RMC or ZDA date its first epoch {days[-1]}", node=log.node, where=log.path)
+
+
+def _sentences(log: _Log) -> Iterator[Any]:
+    """Yield the sentences that are wanted and whole; those that are broken are counted."""
+    for line in log.path.read_bytes().splitlines():
+        stamp, *pieces = line.split(b"$")
+        for place, piece in enumerate(pieces):
+            match = _BODY.match(piece)
+            if match:
+                log.stamped += place == 0 and bool(_STAMP.fullmatch(stamp))
+                yield from _whole(match[1].decode("latin-1"), match[2], log)
+
+
+def _whole(text: str, checksum: bytes | None, log: _Log) -> Iterator[Any]:
+    """Yield a sentence that is wanted and whole."""
+    if not checksum or int(checksum, 16) != NMEASentence.checksum(text):
+        log.dropped["sentences broken off or with a wrong checksum"] += 1
+    elif _WANTED.match(text):
+        try:
+            yield NMEASentence.parse(f"${text}*{checksum.decode()}", check=True)
+        except ParseError as error:
+            raise _error(f"sentence {quoted(text, 100)}", log.path) from error
+
+
+def _time_of_day(text: str) -> int | None:
+    """Return nanoseconds since midnight, None where the time is empty; ValueError if it is none."""
+    if not text:
+        return None
+    match = _TIME.fullmatch(text)
+    if not match:
+        raise ValueError(f"time {quoted(text, 40)}")
+    hour, minute, second = (int(match[part]) for part in (1, 2, 3))
+    return (hour * 3600 + minute * 60 + second) * _SECOND_NS + int((match[4] or "").ljust(9, "0"))
+
+
+def _dated(sentence: Any) -> int | None:
+    """Return nanoseconds since 1970 that a sentence with a date says, None where it says none or is not sure."""
+    data = [*sentence.data, *[""] * 9]
+    if sentence.sentence_type == "RMC":
+        day, month, year = (data[8][place : place + 2] for place in (0, 2, 4))
+        year = f"20{year}"
+    else:
+        day, month, year = data[1:4]
+    try:
+        of_day = _time_of_day(data[0])
+        if of_day is None or (sentence.sentence_type == "RMC" and data[1] != "A"):
+            return None
+        return int(utc_times([f"{year}-{month.zfill(2)}-{day.zfill(2)}"])[0].astype(np.int64)) + of_day
+    except ValueError:
+        return None
+
+
+def _take(sentence: Any, log: _Log) -> None:
+    """Add what a sentence says to the log."""
+    kind = sentence.sentence_type
+    if kind in _DATED:
+        log.now_ns = _dated(sentence) or log.now_ns
+        return
+    try:
+        of_day = _time_of_day(sentence.data[0])
+        fix = _fix(sentence, log) if kind == "GGA" else None
+        if of_day is None or (kind == "GGA" and fix is None):
+            return
+        if of_day >= _DAY_NS or sentence.data[0][4:6] == "60":
+            log.dropped["within a leap second"] += kind == "GGA"
+            return
+        log.now_ns = now = _nearest(of_day, log)
+        if fix is not None:
+            _keep(now, fix, log)
+        elif all(sentence.data[5:8]):
+            north, east, up = (number(cell) for cell in sentence.data[5:8])
+            log.std[now] = north, east, up
+    except (ValueError, IndexError) as error:
+        if isinstance(error, CampaignError):
+            raise
+        raise _error(f"sentence {quoted(str(sentence), 100)} ({error})", log.path) from error
+
+
+def _nearest(of_day: int, log: _Log) -> int:
+    """Return the time of that time of day that is nearest to the last one; the config has the day of the first."""
+    if log.now_ns is None:
+        found = "times of day only, no RMC or ZDA with a date"
+        start = start_time(log.options, found, node=log.node, where=log.path)
+        return int(start.astype("datetime64[D]").astype("datetime64[ns]").astype(np.int64)) + of_day
+    return round((log.now_ns - of_day) / _DAY_NS) * _DAY_NS + of_day
+
+
+def _fix(sentence: Any, log: _Log) -> _Fix | None:
+    """Return what a GGA says, or None and count it where it is no measured position."""
+    data = sentence.data
+    quality = data[5]
+    reason = _NOT_MEASURED.get(quality)
+    if reason is None and not all((data[1], data[2], data[3], data[4], data[8])):
+        reason = "without a position"
+    if reason is not None:
+        log.dropped[reason] += 1
+        return None
+    if quality not in _KINDS or data[9] != "M" or data[2] not in "NS" or data[4] not in "EW":
+        raise ValueError("a quality, unit or hemisphere that NMEA has not")
+    separation = number(data[10]) if data[10] and data[11] == "M" else np.nan
+    geodetic = sentence.latitude, sentence.longitude, number(data[8])
+    return _Fix(sentence.talker, geodetic, separation, FIXES[_KINDS[quality]])
+
+
+def _keep(now: int, fix: _Fix, log: _Log) -> None:
+    """Add an epoch; of several that talkers have at one time GN's, of the same said twice one."""
+    other = log.fixes.get(now)
+    if other is None:
+        log.fixes[now] = fix
+        log.order.append(now)
+    elif other.talker != fix.talker:
+        log.dropped["of another talker"] += 1
+        log.fixes[now] = fix if fix.talker == "GN" else other
+    elif other == fix:
+        log.dropped["said twice"] += 1
+    else:
+        raise CampaignError(
+            f"two positions of talker {fix.talker} at {np.datetime64(now, 'ns')}",
+            log.path,
+            "one receiver's sentences",
+            "Separate the receivers.",
+        )
+
+
+def _track(log: _Log) -> xr.Dataset:
+    fixes = [log.fixes[now] for now in log.order]
+    geodetic = np.array([fix.geodetic for fix in fixes]).reshape(-1, 3)
+    separation = np.array([fix.separation for fix in fixes])
+    stated = np.isfinite(separation)
+    if not separation[stated].any():  # a receiver without a model of the geoid writes 0 throughout
+        if fixes and log.options.height_offset_m is None:
+            found = "altitudes above mean sea level, without geoid separation"
+            raise unsaid("height_offset_m", found, node=log.node, where=log.path)
+        stated, separation = np.ones(len(fixes), bool), np.full(len(fixes), log.options.height_offset_m or 0.0)
+    elif log.options.height_offset_m is not None:
+        raise contradicted("height_offset_m", "GGA states the geoid separation", node=log.node, where=log.path)
+    if not stated.all():
+        log.dropped["without geoid separation"] += int((~stated).sum())
+    geodetic[:, 2] += separation
+    std = np.array([log.std.get(now, (np.nan,) * 3) for now in log.order]).reshape(-1, 3)
+    track = make_track(
+        np.array(log.order, "datetime64[ns]")[stated],
+        geodetic[stated],
+        position_std_m=std[stated] if log.std else None,
+        fix=np.array([fix.kind for fix in fixes], np.int8)[stated],
+        dropped=dict(log.dropped),
+        node=log.node,
+        where=log.path,
+    )
+    if not log.stamped:
+        return track
+    return remarked(track, f"{log.stamped} lines begin with a host's stamp, which is not used", log.path)
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(found, path, "an NMEA 0183 log with GGA", _REMEDY)

@@ -1,0 +1,185 @@
+"""Motion captures as OptiTrack's Motive exports them (CSV): rigid bodies in a room, which is the campaign's frame."""
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.documents import read_text
+from apertura.common.errors import CampaignError, quoted
+from apertura.formats.tracks.left_open import start_time, unsaid
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.tables import LARGEST_LOG, number
+from apertura.formats.tracks.track import make_track
+
+_METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
+_NEEDED = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis in "XYZ"]
+_HEADING_LINES = 12
+_UNIT = 0.01
+_EXPECTED = "Motive's CSV: rigid bodies with rotation (quaternion) and position, global coordinates"
+_REMEDY = "Export the take with these settings."
+
+_ENU_FROM_MOTIVE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rows are east, north and up in Motive's x, y (up) and z."""
+
+_NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rows are north, east and down; of a body forward, right and down: one as it was defined flies level to north."""
+
+
+class _Take(NamedTuple):
+    """One rigid body of a take."""
+
+    time_s: NDArray[np.float64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+    lost: int
+    cut: int
+
+
+def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of a rigid body in a motion capture, options.body where there are several.
+
+    Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were
+    −z, x and −y when the body was defined. Times are options.start_utc plus the take's seconds: its own Capture Start
+    Time is a wall clock without zone. Frames in which the body was not seen are left out and counted.
+
+    Raises
+    ------
+    CampaignError
+        If it is no such table, the body is not in it or not chosen, a line is not whole, or start_utc is not given.
+
+    Notes
+    -----
+    Source: equations in docs/theory/logs.md, "Motion capture". Motive's documentation, "Data Export: CSV".
+    """
+    take = _read(path, options.body, node=node)
+    found = "seconds since the capture's start, which is a wall clock without zone"
+    start = start_time(options, found, node=node, where=path)
+    counts = {"body not seen": take.lost, "line cut off": take.cut}
+    return make_track(
+        start + np.round(take.time_s * 1e9).astype("timedelta64[ns]"),
+        take.position,
+        frame="local",
+        attitude_deg=_attitude_deg(take.quaternion),
+        dropped={why: count for why, count in counts.items() if count},
+        node=node,
+        where=path,
+    )
+
+
+def body_position(path: Path, body: str) -> NDArray[np.float64]:
+    """Return where a body that stands still was, such as a reflector: (3,) float64, m, local east, north and up.
+
+    Parameters
+    ----------
+    path
+        A motion capture.
+    body
+        Name of a rigid body in it. The median over the take is taken.
+
+    Raises
+    ------
+    CampaignError
+        As `read_optitrack`, or if no frame shows the body.
+    """
+    take = _read(path, body, node="")
+    if not len(take.position):
+        raise _error(f"rigid body {quoted(body)} in no frame", path)
+    return np.asarray(np.median(take.position, axis=0))
+
+
+def _read(path: Path, body: str | None, *, node: str) -> _Take:
+    text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
+    lines = text.splitlines()
+    try:
+        heading = list(csv.reader(lines[:_HEADING_LINES]))
+    except csv.Error as error:
+        raise _error(f"heading: {error}", path) from error
+    first = next((row for row, cells in enumerate(heading) if cells[:1] == ["Frame"]), None)
+    if first is None:
+        raise _error("no line that begins with Frame", path)
+    scale = _metres(heading[0], path)
+    columns = _columns(heading[: first + 1], body, node=node, where=path)
+    cut = text[-1] not in "\r\n" and len(lines) > first + 1
+    time_s, values = _numbers(lines[first + 1 : len(lines) - cut], len(heading[first]), columns, first + 2, path)
+    seen = np.isfinite(values).all(axis=1)
+    if (np.isfinite(values).any(axis=1) & ~seen).any():
+        row = int(np.flatnonzero(np.isfinite(values).any(axis=1) & ~seen)[0])
+        raise _error(f"half a pose at {time_s[row]:g} s", path)
+    quaternion, position = values[seen, :4], values[seen, 4:] * scale
+    if (np.abs(np.linalg.norm(quaternion, axis=1) - 1) > _UNIT).any():
+        raise _error("a rotation that is no quaternion of length 1", path)
+    return _Take(time_s[seen], position @ _ENU_FROM_MOTIVE.T, quaternion, int((~seen).sum()), int(cut))
+
+
+def _metres(cells: list[str], path: Path) -> float:
+    """Return metres of the take's unit, after a look at what else its first line says."""
+    said = dict(zip(cells[::2], cells[1::2], strict=False))
+    for key, wanted in (("Rotation Type", ["quaternion"]), ("Coordinate Space", ["global"]), ("Length Units", _METRES)):
+        if said.get(key, "").lower() not in wanted:
+            raise _error(f"{key} {quoted(said.get(key, ''))}, not {' or '.join(wanted)}", path)
+    return _METRES[said["Length Units"].lower()]
+
+
+def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Path) -> list[int]:
+    """Return the columns of time, quaternion (x, y, z, w) and position of a rigid body."""
+    width = len(heading[-1])
+    rows = [row for row in heading[1:] if len(row) == width]
+    titled = {row[1]: row for row in rows if row[0] == ""}
+    kinds, names, quantities, axes = titled.get("Type"), titled.get("Name"), titled.get(""), heading[-1]
+    if kinds is None or names is None or quantities is None or axes[1] != "Time (Seconds)":
+        raise _error("no lines Type, Name, Rotation and Position, Time (Seconds)", where)
+    place = {
+        (name, quantity, axis): column
+        for column, (kind, name, quantity, axis) in enumerate(zip(kinds, names, quantities, axes, strict=True))
+        if kind == "Rigid Body"
+    }
+    bodies = list(dict.fromkeys(name for name, _, _ in place))
+    listed = ", ".join(quoted(name, 40) for name in bodies)
+    if body is None and len(bodies) != 1:
+        raise unsaid("body", f"rigid bodies {listed}" if bodies else "no rigid body", node=node, where=where)
+    chosen = body if body is not None else bodies[0]
+    if chosen not in bodies:
+        raise _error(f"no rigid body {quoted(chosen, 40)} among {listed}", where)
+    lacking = [f"{quantity} {axis}" for quantity, axis in _NEEDED if (chosen, quantity, axis) not in place]
+    doubled = names.count(chosen) != len([key for key in place if key[0] == chosen])
+    if lacking or doubled:
+        raise _error(f"{lacking[0] if lacking else 'columns'} of body {quoted(chosen, 40)} missing or doubled", where)
+    return [1, *(place[chosen, quantity, axis] for quantity, axis in _NEEDED)]
+
+
+def _numbers(
+    lines: list[str], width: int, columns: list[int], first: int, path: Path
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return seconds (frame,) and a pose (frame, 7), NaN where a cell is empty; `first` numbers the first line."""
+    rows = []
+    for line, text in enumerate(lines, first):
+        if not text.strip():
+            continue
+        cells = text.split(",")
+        if len(cells) != width:
+            raise _error(f"line {line} has {len(cells)} cells, the heading {width}", path)
+        try:
+            rows.append([number(cells[column].strip()) if cells[column].strip() else np.nan for column in columns])
+        except ValueError as error:
+            raise _error(f"line {line}: {error}", path) from error
+    values = np.array(rows).reshape(-1, len(columns))
+    wild = np.flatnonzero(~(np.abs(values[:, 0]) < 1e6))
+    if wild.size:
+        raise _error(f"a time of {values[wild[0], 0]:g} s", path)
+    return values[:, 0], values[:, 1:]
+
+
+def _attitude_deg(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return roll, pitch and yaw of (frame, 4) x, y, z, w: Rz(yaw)·Ry(pitch)·Rx(roll) = N·Q·Nᵀ."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    turned = _NED_FROM_MOTIVE @ Rotation.from_quat(quaternion).as_matrix() @ _NED_FROM_MOTIVE.T
+    return np.asarray(Rotation.from_matrix(turned).as_euler("ZYX", degrees=True)[:, ::-1])
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(found, path, _EXPECTED, _REMEDY)

@@ -1,0 +1,228 @@
+"""PX4 flight logs (.ulg): the receiver's own epochs, or positions fused with inertial ones, and attitude."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, quoted
+from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
+from apertura.formats.tracks.boot_clock import clock_of
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.track import FIXES
+from apertura.formats.tracks.ulog_fields import ATTITUDE, DELAY, FUSED, RECEIVERS
+
+Fields = Mapping[str, NDArray[Any]]
+
+_KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
+"""fix_type; below 3 there is no height, 8 is extrapolated."""
+
+_STATES = {"dead_reckoning": 0, "lat_lon_valid": 1, "alt_valid": 1}
+"""What flags of fused positions are where a receiver holds them; versions of PX4 log some of them."""
+
+_ALWAYS = ("fix_type", "vel_n_m_s", "vel_e_m_s", "vel_d_m_s")
+"""Fields of receivers in every version of PX4; one that is not there was damaged."""
+
+_DELAY_MS = 110.0
+_FIRST_US, _LAST_US = 3.2e14, 7.2e15  # of UTC, 1980 to 2198; 0 is: not known
+_LATITUDE, _LONGITUDE = ("latitude_deg", "lat"), ("longitude_deg", "lon")
+_ELLIPSOIDAL, _SEA_LEVEL = ("altitude_ellipsoid_m", "alt_ellipsoid"), ("altitude_msl_m", "alt")
+_SCALES = {"lat": 1e-7, "lon": 1e-7, "alt": 1e-3, "alt_ellipsoid": 1e-3}
+"""Of fields that are integers; otherwise they are degrees and metres."""
+
+_EXPECTED = f"a PX4 ULog with positions in {', '.join((*RECEIVERS, FUSED))}"
+
+
+def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of a PX4 ULog; its attribute `source` says which topic and instance was taken.
+
+    Taken is the first there is of vehicle_gps_position, sensor_gps: what the receiver says, at its own time in UTC and
+    of its own antenna; else vehicle_global_position, whose height follows a barometer and whose time is found through
+    the receiver's. ``options.body`` chooses: a topic, or one of several receivers as ``sensor_gps:1``. Attitude comes
+    from vehicle_attitude. Heights are ellipsoidal; where the driver copies those above sea level, or has none,
+    ``options.height_offset_m`` makes them so.
+
+    Parameters
+    ----------
+    path
+        The log.
+    node
+        Its node.
+    options
+        start_utc: UTC at the autopilot's start, where its receiver told none.
+
+    Raises
+    ------
+    CampaignError
+        If the file is no ULog, or holds no positions, no ellipsoidal heights or no UTC.
+
+    Notes
+    -----
+    Source: PX4 user guide, "ULog file format"; messages SensorGps, VehicleGlobalPosition and VehicleAttitude of PX4.
+    """
+    try:
+        fields = read_isolated("apertura.formats.tracks.ulog_fields:read_fields", [path])[0]
+    except UnreadableError as error:
+        raise _error(f"not readable ({error})", path) from error
+    return track_of(fields, node=node, options=options, where=path)
+
+
+def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> xr.Dataset:
+    """Return the `track` stage of what `apertura.formats.tracks.ulog_fields` read.
+
+    Parameters
+    ----------
+    fields
+        Its answer.
+    node, options, where
+        As `read_px4_ulog`.
+
+    Raises
+    ------
+    CampaignError
+        As `read_px4_ulog`.
+    """
+    source = _source(fields, options, node, where)
+    delay_s = float(fields.get(DELAY, [_DELAY_MS])[0]) / 1e3
+    delay_s = delay_s if 0 <= delay_s < 1 else _DELAY_MS / 1e3
+    epochs = _epochs(fields, source, options, node, where)
+    if source.startswith(FUSED):
+        receiver = next((name for name in _sources(fields) if not name.startswith(FUSED)), None)
+        told = None if receiver is None else _of_receiver(fields, receiver)
+        if told is not None and told[0].size:
+            clock = clock_of(*told, delay_s=delay_s, where=where)[0]
+            epochs = replace(epochs, time_utc=clock.utc(epochs.boot_s))
+        delay_s = 0.0  # the estimator's positions are of the moment that it writes
+    track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
+    track.attrs["source"] = source
+    return track
+
+
+def _sources(fields: Fields) -> list[str]:
+    """Return topic:instance of positions, best first."""
+    there = {name.partition("/")[0] for name in fields}
+    return [name for topic in (*RECEIVERS, FUSED) for name in sorted(there) if name.startswith(f"{topic}:")]
+
+
+def _source(fields: Fields, options: LogOptions, node: str, where: Path) -> str:
+    known = _sources(fields)
+    asked = [name for name in known if options.body in (None, name, name.partition(":")[0])]
+    if not known:
+        raise _error("no message of any of them", where)
+    if not asked:
+        raise CampaignError(
+            f"no positions of {quoted(options.body)}",
+            where,
+            f"one of {', '.join(known)}",
+            f"Correct nodes.{node}.log.body, or leave it out.",
+        )
+    return asked[0]
+
+
+def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: Path) -> Epochs:
+    """Return epochs of a topic; those of the fused one have no time yet."""
+    latitude, longitude = (_first(fields, source, names) for names in (_LATITUDE, _LONGITUDE))
+    if latitude is None or longitude is None:
+        raise _error(f"no latitude and longitude in {source}", where)
+    of = {name: fields.get(f"{source}/{name}") for name in ("fix_type", "eph", "epv")}
+    fix = None if of["fix_type"] is None else np.array([_KINDS.get(int(kind), 0) for kind in of["fix_type"]], np.int8)
+    lacking = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
+    if lacking:
+        raise _error(f"no {', '.join(lacking)} in {source}", where)
+    fixed = np.ones(latitude.size, bool) if fix is None else fix > 0
+    for name, good in _STATES.items():
+        fixed &= np.asarray(fields.get(f"{source}/{name}", good)) == good
+    boot_s = fields[f"{source}/timestamp"] * 1e-6
+    utc = np.full(boot_s.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
+    if not source.startswith(FUSED):
+        boot_s, utc = _arrived(fields, source), _utc(fields, source)
+    unknown = np.full(latitude.size, np.nan)
+    across, up = (unknown if one is None else one.astype(np.float64) for one in (of["eph"], of["epv"]))
+    height = _height(fields, source, fixed, options.height_offset_m)
+    if height is None:
+        raise CampaignError(
+            f"{source} holds no heights above the ellipsoid",
+            where,
+            "altitude_ellipsoid_m or alt_ellipsoid other than the height above sea level",
+            f"Set nodes.{node}.log.height_offset_m: what makes heights above sea level ellipsoidal (the geoid's).",
+        )
+    return Epochs(
+        boot_s,
+        utc,
+        np.stack([latitude, longitude, height], -1),
+        fixed,
+        fix,
+        np.stack([across, across, up], -1),
+        _velocity(fields, source),
+    )
+
+
+def _height(
+    fields: Fields, source: str, fixed: NDArray[np.bool_], offset_m: float | None
+) -> NDArray[np.float64] | None:
+    ellipsoidal, sea_level = (_first(fields, source, names) for names in (_ELLIPSOIDAL, _SEA_LEVEL))
+    copied = ellipsoidal is None or not fixed.any()
+    if ellipsoidal is not None and fixed.any():
+        # a driver without the geoid's height writes 0, or one height twice; nowhere is the geoid flat to a millimetre
+        copied = not ellipsoidal[fixed].any()
+        copied |= sea_level is not None and bool(np.abs((ellipsoidal - sea_level)[fixed]).max() < 1e-3)
+    if not copied:
+        return ellipsoidal
+    return sea_level + offset_m if sea_level is not None and offset_m is not None else None
+
+
+def _velocity(fields: Fields, source: str) -> NDArray[np.float64]:
+    unknown = np.full(fields[f"{source}/timestamp"].size, np.nan)
+    axes = [_first(fields, source, (f"vel_{axis}_m_s", f"vel_{axis}")) for axis in "ned"]
+    valid = np.asarray(fields.get(f"{source}/vel_ned_valid", 1)) == 1
+    velocity = np.stack([unknown if axis is None else axis for axis in axes], -1)
+    return np.where(valid[..., None], velocity, np.nan)
+
+
+def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    """Return the first field that there is, in degrees or metres."""
+    for name in names:
+        values = fields.get(f"{source}/{name}")
+        if values is not None:
+            return np.asarray(values * _SCALES[name] if values.dtype.kind in "iu" else values, np.float64)
+    return None
+
+
+def _arrived(fields: Fields, source: str) -> NDArray[np.float64]:
+    """Return the autopilot's clock at which it had the time that a message tells."""
+    later = fields.get(f"{source}/timestamp_time_relative", np.zeros(1))
+    return np.asarray((fields[f"{source}/timestamp"].astype(np.float64) + later) * 1e-6)
+
+
+def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
+    told = fields.get(f"{source}/time_utc_usec")
+    size = fields[f"{source}/timestamp"].size
+    told = np.zeros(size, np.uint64) if told is None else told
+    known = (told > _FIRST_US) & (told < _LAST_US)
+    utc = np.full(size, np.datetime64("NaT", "ns"), "datetime64[ns]")
+    utc[known] = told[known].astype("datetime64[us]")
+    return utc
+
+
+def _of_receiver(fields: Fields, source: str) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
+    """Return where a receiver places the autopilot's clock in UTC."""
+    utc = _utc(fields, source)
+    known = ~np.isnat(utc)
+    return _arrived(fields, source)[known], utc[known]
+
+
+def _attitude(fields: Fields) -> Attitude | None:
+    topic = f"{ATTITUDE}:0"
+    parts = [fields.get(f"{topic}/q[{n}]") for n in (1, 2, 3, 0)]  # logged as w, x, y, z
+    if any(part is None for part in parts):
+        return None
+    return Attitude(fields[f"{topic}/timestamp"] * 1e-6, np.stack([np.asarray(p, np.float64) for p in parts], -1))
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(found, path, _EXPECTED, "Copy the log again, or log these topics.")

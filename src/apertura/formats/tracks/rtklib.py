@@ -1,0 +1,260 @@
+"""RTKLIB solutions (.pos): positions of any of its formats against GPS time, UTC or Japan's time."""
+
+import re
+from itertools import accumulate
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.documents import read_text
+from apertura.common.errors import CampaignError, quoted
+from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
+from apertura.formats.times import utc_times
+from apertura.formats.tracks.left_open import contradicted, unsaid
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.tables import LARGEST_LOG, number
+from apertura.formats.tracks.track import make_track
+
+_POSITIONS = {
+    "geodetic": ("latitude(deg)", "longitude(deg)", "height(m)"),
+    "sexagesimal": ("latitude(d'\")", "longitude(d'\")", "height(m)"),
+    "ecef": ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)"),
+    "baseline": ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)"),
+}
+"""Formats of positions → their columns; an angle in degrees, minutes and seconds is three cells."""
+
+_STD = ("sdn(m)", "sde(m)", "sdu(m)")
+_STD_ECEF = ("sdx(m)", "sdy(m)", "sdz(m)", "sdxy(m)", "sdyz(m)", "sdzx(m)")
+_CELLS = re.compile(r"\s*[,;]\s*|\s+")
+_LAST_WEEK, _WEEK_S = 11_000, 604_800
+_JST_AHEAD = np.timedelta64(9, "h")
+_SAME_BASE_M, _WORST_M = 0.01, 1e9
+_EXPECTED = "an RTKLIB solution whose header names its columns and says GPST, UTC or JST"
+_REMEDY = "Export the solution with these output settings."
+
+
+class _Header(NamedTuple):
+    """What the lines before the first solution say."""
+
+    system: str
+    position: str
+    cell_of: dict[str, int]
+    cells: int
+    geodetic_height: str
+    base: list[str]
+
+
+def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+    """Return the `track` stage of an RTKLIB solution.
+
+    Its header says whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
+    are latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east,
+    north and up of ``ref pos`` or options.base. Columns Q and standard deviations, where named, are kept; those of ECEF
+    are turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted.
+
+    Raises
+    ------
+    CampaignError
+        If the header does not say what the columns are, heights are above a geoid and options.height_offset_m is not
+        given, a baseline has no base, or a line cannot be read.
+
+    Notes
+    -----
+    Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
+    """
+    text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
+    lines = text.splitlines()
+    header = _header([line for line in lines if line.startswith("%")], path)
+    _check_said(header, options, node=node, where=path)
+    cut = bool(lines) and text[-1] not in "\r\n" and lines[-1][:1] not in {"", "%"}
+    times, values, stated = _rows(lines[: len(lines) - cut], header, path)
+    quality = stated[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
+    solved = quality != 0
+    unsolved = int((~solved).sum())
+    time = _utc(_times(times, path)[solved], header.system, path)
+    position, ecef = _position(values[solved], header, options, node=node, where=path)
+    return make_track(
+        time,
+        position,
+        frame="ecef" if ecef else "geodetic",
+        fix=_fix(quality[solved], path) if "Q" in header.cell_of else None,
+        position_std_m=_std(stated[solved, 1:], position),
+        dropped={why: count for why, count in (("Q = 0", unsolved), ("line cut off", int(cut))) if count},
+        node=node,
+        where=path,
+    )
+
+
+def _header(lines: list[str], path: Path) -> _Header:
+    split = ((line, _CELLS.split(line.strip("% \t"))) for line in lines)
+    found = (
+        (line, names, kind)
+        for line, names in split
+        for kind, columns in _POSITIONS.items()
+        if set(columns) <= set(names)
+    )
+    _, names, kind = next(found, ("", [""], ""))
+    if not kind:
+        raise _error(f"no header line with {', '.join(_POSITIONS['geodetic'])}, x-ecef(m) … or e-baseline(m) …", path)
+    if names[0] not in {"GPST", "UTC", "JST"}:
+        raise _error(f"time system {quoted(names[0])}", path)
+    doubled = [name for name in names if names.count(name) > 1]
+    if doubled:
+        raise _error(f"column {quoted(doubled[0], 40)} a second time", path)
+    widths = [2, *(3 if name.endswith("(d'\")") else 1 for name in names[1:])]
+    ends = list(accumulate(widths))
+    heights = next((word for line in lines for word in ("geodetic", "ellipsoidal") if f"/{word}" in line), "")
+    base = next((line.partition(":")[2] for line in lines if re.match(r"%\s*ref pos\s*:", line)), "")
+    cell_of = {name: end - width for name, end, width in zip(names, ends, widths, strict=True)}
+    return _Header(names[0], kind, cell_of, ends[-1], heights, _CELLS.split(base.strip()) if base.strip() else [])
+
+
+def _check_said(header: _Header, options: LogOptions, *, node: str, where: Path) -> None:
+    """Raise CampaignError where log and config say different things, or neither says what heights are above."""
+    if options.time_system is not None and options.time_system.upper() != header.system:
+        raise contradicted("time_system", f"times are {header.system}", node=node, where=where)
+    if header.position not in {"geodetic", "sexagesimal"}:
+        return
+    if header.geodetic_height == "geodetic" and options.height_offset_m is None:
+        raise unsaid(
+            "height_offset_m",
+            "heights are geodetic (above a geoid)",
+            node=node,
+            where=where,
+            remedy=", or export ellipsoidal heights",
+        )
+    if header.geodetic_height == "ellipsoidal" and options.height_offset_m:
+        raise contradicted("height_offset_m", "heights are ellipsoidal", node=node, where=where)
+
+
+def _rows(
+    lines: list[str], header: _Header, path: Path
+) -> tuple[list[str | np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return of each solution its time, a date as text; its position as logged; Q and standard deviations, or NaN."""
+    sexagesimal = header.position == "sexagesimal"
+    angles = [header.cell_of[name] for name in _POSITIONS[header.position]]
+    named = _STD_ECEF if header.position == "ecef" else _STD
+    whole = [header.cell_of[name] for name in named] if set(named) <= set(header.cell_of) else []
+    wanted = [header.cell_of.get("Q"), *whole]
+    times, positions, stated = [], [], []
+    for line, text in enumerate(lines, 1):
+        if not text.strip() or text[0] == "%":
+            continue
+        cells = _CELLS.split(text.strip())
+        if len(cells) != header.cells:
+            raise _error(f"line {line} has {len(cells)} columns, the header names {header.cells}", path)
+        try:
+            times.append(_time(cells[0], cells[1]))
+            positions.append(
+                [
+                    _angle(cells[at : at + 3]) if sexagesimal and axis < 2 else number(cells[at])
+                    for axis, at in enumerate(angles)
+                ]
+            )
+            stated.append([np.nan if at is None else number(cells[at]) for at in wanted])
+        except ValueError as error:
+            raise _error(f"line {line} is {quoted(' '.join(cells), 60)} ({error})", path) from error
+    return times, np.array(positions).reshape(-1, 3), np.array(stated).reshape(-1, len(wanted))
+
+
+def _angle(cells: list[str]) -> float:
+    """Return degrees of an angle whose sign stands before its degrees, even where they are 0."""
+    degrees, minutes, seconds = (number(cell) for cell in cells)
+    if not (0 <= minutes < 60 and 0 <= seconds < 60 + 1e-9):
+        raise ValueError(f"no degrees, minutes and seconds: {quoted(' '.join(cells), 40)}")
+    return (-1 if cells[0].startswith("-") else 1) * (abs(degrees) + minutes / 60 + seconds / 3600)
+
+
+def _time(first: str, second: str) -> str | np.datetime64:
+    """Return a calendar date as text, which costs less to read all at once, or what week and seconds say."""
+    if "/" in first:
+        return f"{first.replace('/', '-')}T{second}"
+    week, seconds = number(first), number(second)
+    if not (0 <= week <= _LAST_WEEK and 0 <= seconds < _WEEK_S and week.is_integer()):
+        raise ValueError(f"week {first} and second {second}")
+    return GPS_EPOCH + np.timedelta64(7 * int(week), "D") + np.timedelta64(round(seconds * 1e9), "ns")
+
+
+def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime64]:
+    dates = [place for place, time in enumerate(stated) if isinstance(time, str)]
+    times = np.array(
+        [np.datetime64("NaT", "ns") if isinstance(time, str) else time for time in stated], "datetime64[ns]"
+    )
+    try:
+        times[dates] = utc_times([time for time in stated if isinstance(time, str)])
+    except ValueError as error:
+        raise _error(str(error), path) from error
+    return times
+
+
+def _utc(time: NDArray[np.datetime64], system: str, path: Path) -> NDArray[np.datetime64]:
+    if system != "GPST":
+        return time - _JST_AHEAD if system == "JST" else time
+    try:
+        return utc_from_gps(time)
+    except ValueError as error:
+        raise _error(str(error), path) from error
+
+
+def _position(
+    values: NDArray[np.float64], header: _Header, options: LogOptions, *, node: str, where: Path
+) -> tuple[NDArray[np.float64], bool]:
+    """Return positions, and whether they are ECEF; else latitude, longitude and ellipsoidal height."""
+    if header.position == "ecef":
+        return values, True
+    if header.position == "baseline":
+        base = _base(header, options, node=node, where=where)
+        axes = ned_axes(base)
+        return base + values @ np.stack([axes[:, 1], axes[:, 0], -axes[:, 2]]), True
+    values[:, 2] += options.height_offset_m or 0.0
+    return values, False
+
+
+def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> NDArray[np.float64]:
+    """Return ECEF of the point that baselines begin at."""
+    cells = header.base
+    try:
+        whole = [number(cell) for cell in cells]
+        angles = whole if len(cells) == 3 else [_angle(cells[:3]), _angle(cells[3:6]), *whole[6:]] if whole else []
+    except ValueError as error:
+        raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where) from error
+    said = angles or options.base
+    if not said:
+        found = "baselines without the point that they begin at (ref pos)"
+        raise unsaid("base", found, node=node, where=where)
+    if len(said) != 3 or not (abs(said[0]) <= 90 and abs(said[1]) <= 360 and abs(said[2]) < 1e5):
+        raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where)
+    base = ecef_from_geodetic(*np.array(said, np.float64))
+    if options.base and np.linalg.norm(base - ecef_from_geodetic(*np.array(options.base))) > _SAME_BASE_M:
+        raise contradicted("base", f"ref pos {' '.join(cells)}", node=node, where=where)
+    return base
+
+
+def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return standard deviations to north, east and up; ECEF's come with signed roots of their covariances."""
+    if not stated.shape[1]:
+        return None
+    if stated.shape[1] == len(_STD):
+        return stated
+    held = stated.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
+    xx, yy, zz, xy, yz, zx = (np.sign(held) * held**2).T
+    covariance = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], -1).reshape(-1, 3, 3)
+    axes = ned_axes(ecef)
+    return np.asarray(np.sqrt(np.einsum("nia,nij,nja->na", axes, covariance, axes).clip(0)))
+
+
+def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
+    """Return kinds of solution, 0 where the log says none."""
+    stated = np.nan_to_num(quality, nan=0.0)
+    wrong = np.flatnonzero(~np.isin(stated, range(10)))
+    if wrong.size:
+        raise _error(f"Q {stated[wrong[0]]:g} in solution {int(wrong[0])}", path)
+    return np.asarray(stated, np.int8)
+
+
+def _error(found: str, path: Path) -> CampaignError:
+    return CampaignError(found, where=path, expected=_EXPECTED, remedy=_REMEDY)

@@ -1,0 +1,185 @@
+"""What every flight log becomes: times in UTC, positions in ECEF, attitude in radians."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, shown
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.times import outside
+
+FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
+"""Kinds of solution by RTKLIB's numbers, Q."""
+
+LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
+"""Heights above the ellipsoid that an aircraft or a balloon logs."""
+
+FARTHEST_M = 1e5
+"""From the origin of a local frame."""
+
+_LOG = logging.getLogger(__name__)
+_EARTH_M = 6.37e6
+_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; within a centimetre of there nobody flies
+_WIDEST_DEG = 1080.0
+_WORST_STD_M = 1e7
+
+
+def make_track(
+    time_utc: NDArray[np.datetime64],
+    position: NDArray[np.float64],
+    *,
+    frame: Literal["geodetic", "ecef", "local"] = "geodetic",
+    attitude_deg: NDArray[np.float64] | None = None,
+    position_std_m: NDArray[np.float64] | None = None,
+    fix: NDArray[np.int8] | None = None,
+    dropped: Mapping[str, int] | None = None,
+    node: str,
+    where: Path,
+) -> xr.Dataset:
+    """Return the `track` stage of epochs that `node` logged in the file `where`.
+
+    Parameters
+    ----------
+    time_utc
+        (epoch,) datetime64[ns], UTC, strictly increasing.
+    position
+        (epoch, 3) float64 in `frame`.
+    frame
+        geodetic: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m); epochs at latitude 0, longitude 0 have
+        no fix, and are dropped. ecef: metres. local: metres to east, north and up in axes of the campaign's own.
+    attitude_deg
+        (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None where not logged.
+    position_std_m
+        (epoch, 3) float64: standard deviations to north, east and up, metres, NaN where not logged; None: nowhere.
+    fix
+        (epoch,) int8: kind of solution, a value of `FIXES`, 0 where not logged; None: nowhere.
+    dropped
+        Reason → how many epochs of the log the reader left out.
+
+    Raises
+    ------
+    CampaignError
+        If times do not increase, or a value is not finite or is none that a flight on Earth has.
+
+    Examples
+    --------
+    >>> times = np.array(["2025-05-14T09:30", "2025-05-14T09:31"], "datetime64[ns]")
+    >>> track = make_track(times, np.array([[0, 90, 0], [0, 90, 1.0]]), node="uav1", where=Path("x.csv"))
+    >>> track.position.values[1].round(6)
+    array([      0., 6378138.,       0.])
+    """
+    fixed = (np.abs(position[:, :2]) >= _NOWHERE_DEG).any(axis=1) | (frame != "geodetic")
+    left_out = {**(dropped or {}), **({"no fix": int((~fixed).sum())} if not fixed.all() else {})}
+    time_utc, position = time_utc[fixed], position[fixed]
+    attitude_deg, position_std_m = (None if one is None else one[fixed] for one in (attitude_deg, position_std_m))
+    fix = None if fix is None else fix[fixed]
+    if len(time_utc) < 2:
+        without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
+        raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
+    _check_times(time_utc, where)
+    _check_positions(position, frame, where)
+    _check_stated(attitude_deg, position_std_m, fix, where)
+    attitude = np.full_like(position, np.nan) if attitude_deg is None else np.radians(attitude_deg)
+    quality = {
+        name: (dims, values)
+        for name, dims, values in (("position_std", ("epoch", "axis"), position_std_m), ("fix", ("epoch",), fix))
+        if values is not None
+    }
+    variables = {
+        **quality,
+        "time": (("epoch",), time_utc.astype("datetime64[ns]")),
+        "position": (("epoch", "axis"), ecef_from_geodetic(*position.T) if frame == "geodetic" else position),
+        "attitude": (("epoch", "axis"), attitude),
+    }
+    # Arrays that need no look into: xarray would import dask and scipy to see whether they are theirs.
+    return xr.Dataset(
+        {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
+        attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
+    )
+
+
+def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
+    """Return a track with what a person should know of how its log was read, in its `remarks`; it is told, too.
+
+    Parameters
+    ----------
+    track
+        Of `make_track`.
+    remark
+        One line.
+    where
+        The log.
+    """
+    _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
+    return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
+
+
+def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> None:
+    """Raise CampaignError where an epoch is nowhere that a node flies."""
+    if frame == "geodetic":
+        latitude, longitude, height = position.T
+        good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (height >= LOWEST_M) & (height <= HIGHEST_M)
+        expected = "finite latitude, longitude and ellipsoidal height, the height between "
+        expected += f"{LOWEST_M:g} and {HIGHEST_M:g} m"
+    elif frame == "ecef":
+        above_m = np.linalg.norm(position, axis=1) - _EARTH_M
+        good, expected = np.abs(above_m) <= HIGHEST_M, "finite ECEF coordinates in metres, near the Earth's surface"
+    else:
+        good = (np.abs(position) <= FARTHEST_M).all(axis=1)
+        expected = f"finite local coordinates within {FARTHEST_M:g} m"
+    if not good.all():
+        first = int(np.flatnonzero(~good)[0])
+        raise CampaignError(
+            f"{int((~good).sum())} epochs without a position, first epoch {first}: {position[first].tolist()}",
+            where,
+            expected,
+            "Drop those lines or export again.",
+        )
+
+
+def _check_stated(
+    attitude_deg: NDArray[np.float64] | None,
+    position_std_m: NDArray[np.float64] | None,
+    fix: NDArray[np.int8] | None,
+    where: Path,
+) -> None:
+    """Raise CampaignError where a stated value is none that the log of a flight has; NaN says nothing."""
+    std, kinds = "a standard deviation", sorted(FIXES.values())
+    for name, values, low, high in (
+        ("an angle of attitude", attitude_deg, -_WIDEST_DEG, _WIDEST_DEG),
+        (std, position_std_m, 0.0, _WORST_STD_M),
+        ("a kind of solution", fix, 0, kinds[-1]),
+    ):
+        wrong = None if values is None else np.argwhere((values < low) | (values > high))
+        if values is not None and wrong is not None and wrong.size:
+            raise CampaignError(
+                f"{name} of {values[tuple(wrong[0])]:g} in epoch {int(wrong[0][0])}",
+                where,
+                f"{low:g} to {high:g}",
+                "Drop those lines or export again.",
+            )
+
+
+def _check_times(time_utc: NDArray[np.datetime64], where: Path) -> None:
+    beyond = outside(time_utc)
+    if beyond.size:
+        epoch = int(beyond[0])
+        raise CampaignError(
+            f"epoch {epoch} is at {time_utc[epoch]}", where, "times between 1980 and 2199", "Correct the log."
+        )
+    steps = np.diff(time_utc)
+    wrong = np.flatnonzero(steps <= np.timedelta64(0, "ns"))
+    if wrong.size:
+        epoch = int(wrong[0]) + 1
+        kind = "the same time as the epoch before" if steps[wrong[0]] == np.timedelta64(0, "ns") else "an earlier time"
+        raise CampaignError(
+            f"epoch {epoch} ({time_utc[epoch]}) has {kind} ({time_utc[epoch - 1]})",
+            where,
+            "strictly increasing times",
+            "Remove doubled or unsorted lines from the log.",
+        )

@@ -1,0 +1,5 @@
+"""What improves or compares images beyond forming them: autofocus, synchronisation, interferometry.
+
+Offers estimators that take arrays, apertures and formed patches and give corrections with their uncertainty. Imports
+`apertura.common` and `apertura.core`; never opens a campaign.
+"""

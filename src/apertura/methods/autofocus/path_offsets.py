@@ -1,0 +1,225 @@
+"""One path offset per pulse of each pair, as bright patches ask for it, and whether it is to be believed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.quality.budget import NodePositions, position_lines
+from apertura.core.quality.path_errors import Effect, PointPaths
+from apertura.methods.autofocus.candidates import Candidates
+from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, gains_db
+from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.objective import Seen
+from apertura.methods.autofocus.one_phase import METHODS, Patches
+from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.patches import LEAST_PATCHES, Patch, affordable, bandwidth_hz
+from apertura.methods.autofocus.uncertainty import MOST_RATIO
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_FOLDS = 4  # each of so many parts of the patches is held out once
+_APART_CELLS = 2.0  # of range, c/B of total path
+_BLOCKS_A_LASTING = 10  # at least, to an error's correlation time
+_BETWEEN_BLOCKS_RAD2 = 0.1  # by which an error grows from block to block: linear between them, an eighth is left
+_LINEAR = 1 / 8  # of that growth is left by offsets that are linear between blocks
+_PULSES = 4096  # read at a time
+_SHIFTS = 0.5  # of the largest variation of the path's slope: a move in such a direction is a phase alone
+
+
+def refine_one_phase(
+    sightings: Sequence[Sighting], found: Candidates, errors: Mapping[str, TrackErrors], *, method: str
+) -> Refinement:
+    """Return path offsets of pairs that make patches sharp, and whether patches that were not fitted believe them.
+
+    Parameters
+    ----------
+    sightings
+        What every pair saw.
+    found
+        What the scene has to refine by.
+    errors
+        Node → what is known of its log's errors.
+    method
+        A row of `METHODS`.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is judged by offsets fitted to
+    those of the others that share no range with it. Of these offsets and those fitted to all the sharpest are returned.
+    No node is moved: what is known of its place is what its log knows.
+    """
+    if len(found.patches) < LEAST_PATCHES:
+        return found.refused(errors)
+    fits = [_Pair.of(sighting, found.patches, errors).fitted(method) for sighting in sightings]
+    gain_db = np.concatenate([fit.gain_db for fit in fits])
+    better = float((gain_db > 0).mean())
+    accepted = bool(gain_db.mean() >= LEAST_GAIN_DB and better >= LEAST_BETTER)
+    why = (
+        f"{gain_db.size} images of patches, each while it was not fitted, gained {gain_db.mean():.2f} dB of contrast, "
+        f"{better:.0%} of them gained"
+    )
+    knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # each pair's own: nothing is smoothed
+    correction = TrackCorrection(
+        knots_s,
+        {node: np.zeros((len(knots_s), 3)) for node in errors},
+        {fit.pair: np.interp(knots_s, fit.time_s, fit.further_m) for fit in fits},
+    )
+    std_m = {node: np.tile(one.along(found.axes), (len(knots_s), 1)) for node, one in errors.items()}
+    report = {
+        "method": method,
+        "patches": len(found.patches),
+        "gain_held_out_db": round(float(gain_db.mean()), 3),
+        "held_out_better": round(better, 3),
+        **_left(fits, [_of_logs(sighting, found, errors) for sighting in sightings]),
+    }
+    return Refinement(correction, std_m, accepted, why, report, {} if accepted else {"refinement_rejected": why})
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """By how much the echoes of a pair lie further, in total path, than its logs say.
+
+    Attributes
+    ----------
+    pair
+        Its name.
+    time_s, further_m
+        (block,) float64, seconds of the flight's clock and metres; between blocks offsets are linear.
+    gain_db
+        (patch,) float64, of contrast, while the patch was not fitted.
+    left_rad2
+        Variance of the phase that is expected to be left.
+    """
+
+    pair: str
+    time_s: Floats
+    further_m: Floats
+    gain_db: Floats
+    left_rad2: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """What blocks of a pair add to the patches."""
+
+    name: str
+    time_s: Floats
+    grows_rad2: float
+    cached: Patches
+    path_m: Floats
+    cell_m: float
+    slope: Floats
+    wavenumber: float
+
+    @classmethod
+    def of(cls, sighting: Sighting, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
+        profiles = sighting.profiles
+        wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        of_nodes = [errors[node] for node in sighting.nodes]
+        lasting_s = min(error.correlation_s for error in of_nodes)
+        turned = 2 * wavenumber * max(max(error.std_m) for error in of_nodes)
+        lasts = min(1 / _BLOCKS_A_LASTING, _BETWEEN_BLOCKS_RAD2 / max(2 * turned**2, 1e-12))
+        edges = _edges(sighting.time_s, lasting_s * lasts)
+        middle = (edges[:-1] + edges[1:] - 1) // 2
+        time_s = np.add.reduceat(sighting.time_s, edges[:-1]) / np.diff(edges)
+        patches = patches[: affordable([len(patch.pixels_m) * len(time_s) for patch in patches])]
+        cached = _contributions(sighting, patches, edges)
+        places = np.array([patch.place_m for patch in patches])
+        path_m = profiles.aperture[middle].path(places).mean(axis=0)
+        slope = profiles.aperture[middle].path_gradient(places.mean(axis=0))
+        cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
+        return cls(sighting.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, wavenumber)
+
+    def fitted(self, method: str) -> _Fit:
+        """Return the offsets found, and what each patch gains by those that it has no part in.
+
+        Of offsets fitted to all patches and to parts of them those are taken that all patches gain most by.
+        """
+        folds, before = np.arange(len(self.cached)) % _FOLDS, self.seen()
+        parts = [self.apart(folds == fold) for fold in range(_FOLDS)]
+        phases = [self.phases(method, fitted) for fitted in (*parts, np.ones_like(parts[0]))]
+        gain_db = np.array([gains_db([before], [self.seen(phase)])[0] for phase in phases])
+        phase = phases[int(gain_db.mean(axis=1).argmax())]
+        told = 2 * sum(min(seen.ratio, MOST_RATIO) for seen in self.seen(phase)) / len(phase)
+        left_rad2 = _LINEAR * self.grows_rad2 + 1 / told
+        # An echo over ∆ turns by -k∆.
+        return _Fit(self.name, self.time_s, -phase / self.wavenumber, gain_db[folds, np.arange(len(folds))], left_rad2)
+
+    def apart(self, held_out: Bools) -> Bools:
+        """Return (patch,) bool, those that share no range with others: echoes of one range share their noise."""
+        near = np.abs(self.path_m[:, None] - self.path_m[held_out]) < _APART_CELLS * self.cell_m
+        return np.asarray(~near.any(axis=1))
+
+    def phases(self, method: str, used: Bools) -> Floats:
+        """Return (block,) float64 radians that make the patches used sharp and move nothing; 0 if none is used."""
+        if not used.any():
+            return np.zeros(len(self.time_s))
+        phase = METHODS[method]([self.cached[int(number)] for number in np.flatnonzero(used)])
+        left, size, _ = np.linalg.svd(self.slope - self.slope.mean(axis=0), full_matrices=False)
+        moves = left[:, size >= _SHIFTS * size[0]]
+        centred = phase - phase.mean()
+        return np.asarray(centred - moves @ (moves.T @ centred))
+
+    def seen(self, phase: Floats | None = None) -> list[Seen]:
+        """Return what the patches show with blocks turned; as the logs have them by default."""
+        turn = np.exp(1j * (np.zeros(len(self.time_s)) if phase is None else phase)).astype(np.complex64)
+        return [Seen.of(patch @ turn) for patch in self.cached]
+
+
+def _edges(time_s: Floats, block_s: float) -> NDArray[np.int64]:
+    """Return (block + 1,) int64 first pulses of blocks of equal time; blocks without pulses are left out."""
+    count = max(2, min(len(time_s), int(np.ceil((time_s[-1] - time_s[0]) / block_s))))
+    ends = np.linspace(time_s[0], time_s[-1], count + 1)[:-1]
+    return np.append(np.unique(np.searchsorted(time_s, ends)), len(time_s))
+
+
+def _contributions(
+    sighting: Sighting, patches: Sequence[Patch], edges: NDArray[np.int64]
+) -> list[NDArray[np.complex64]]:
+    """Return (pixel, block), what blocks add to each patch; every pulse is read once."""
+    blocks = len(edges) - 1
+    cached = [np.empty((len(patch.pixels_m), blocks), np.complex64) for patch in patches]
+    at_once = max(1, _PULSES * blocks // int(edges[-1]))
+    for first in range(0, blocks, at_once):
+        some = slice(first, min(first + at_once, blocks))
+        pulses = slice(int(edges[some.start]), int(edges[some.stop]))
+        inside = edges[some.start : some.stop + 1] - pulses.start
+        part = sighting.profiles[pulses]
+        part = replace(part, samples=np.asarray(part.samples))
+        beams = None if sighting.beams is None else sighting.beams[pulses]
+        for patch, target in zip(patches, cached, strict=True):
+            weights = None if beams is None else beams.weight(part.aperture, patch.place_m[None])[:, 0]
+            target[:, some] = block_contributions(part, patch.pixels_m, edges=inside, weights=weights)
+    return cached
+
+
+def _of_logs(sighting: Sighting, found: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
+    """Return what errors of the logs do to a pair's image."""
+    profiles = sighting.profiles
+    paths = PointPaths.of(
+        profiles.aperture,
+        sighting.time_s,
+        point_m=np.mean([patch.place_m for patch in found.patches], axis=0),
+        axes=found.axes,
+        wavelength_m=SPEED_OF_LIGHT_M_S / profiles.centre_frequency_hz,
+    )
+    nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(sighting.nodes)]
+    (line,) = position_lines(paths, nodes, sidelink=sighting.sidelink_m is not None)
+    return line.effect
+
+
+def _left(fits: Sequence[_Fit], of_logs: Sequence[Effect]) -> dict[str, float]:
+    """Return what is left at the scene's middle: shifts and mean phases are the logs', as offsets hold neither."""
+    left_rad2 = float(np.mean([fit.left_rad2 for fit in fits]))
+    mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in of_logs]))
+    return {
+        "left_rad": round(float(np.sqrt(left_rad2 + mean_rad2)), 4),
+        "left_db": round(10 * float(np.log10(np.exp(-left_rad2))), 3),
+        "gauge_shift_m": round(max(effect.shift_m for effect in of_logs), 4),
+    }

@@ -1,0 +1,182 @@
+"""Two images of one scene, compared: coherence and phase, which of it tells heights, and these at their own places."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.methods.interferometry.coherence import chance, unbiased
+from apertura.methods.interferometry.flags import Measured
+from apertura.methods.interferometry.forming import formed
+from apertura.methods.interferometry.heights import Placed, fits, least_coherence, phase_std, placed, sensible
+from apertura.methods.interferometry.level import Known, Level, level, levelled
+from apertura.methods.interferometry.sensitivity import Sensitivity
+from apertura.methods.interferometry.unwrapping import Unwrapped, unwrap
+
+LEAST_SPREAD = 4.0
+"""Looks that a window's energy must be spread over: else a point beside its middle is all that it tells."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What both images assume of each pixel.
+
+    Attributes
+    ----------
+    height_m
+        (y, x) float64, metres.
+    plain
+        (y, x) bool, seen by both images, without shadow or layover.
+    sensed
+        What a height does to the phase there.
+    shift_px
+        (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of height.
+    known
+        Points of known height.
+    """
+
+    height_m: Floats
+    plain: NDArray[np.bool_]
+    sensed: Sensitivity
+    shift_px: Floats
+    known: Sequence[Known] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What two images tell.
+
+    Attributes
+    ----------
+    panels
+        ``phase``, ``coherence`` and ``unwrapped`` where the images show it, ``height`` and ``height_std`` where the
+        ground lies: (y, x) float32, NaN where nothing is told.
+    looks
+        Independent samples of a window; NaN where there is none.
+    measured
+        What flags follow from.
+    level
+        What heights count from, and the constant taken off the phase; None where nothing is told.
+    """
+
+    panels: Mapping[str, NDArray[np.float32]]
+    looks: float
+    measured: Measured
+    level: Level | None
+
+
+def compared(
+    first: NDArray[np.complex64], second: NDArray[np.complex64], ground: Ground, tiles: Iterable[Window], *, window: int
+) -> Compared:
+    """Return what two images on one grid tell.
+
+    Parameters
+    ----------
+    first, second, tiles, window
+        As of `apertura.methods.interferometry.forming.formed`.
+    ground
+        What both assume.
+
+    Notes
+    -----
+    Source: docs/theory/interferometry.md.
+
+    Examples
+    --------
+    An image against itself: coherent everywhere, and its phase tells no height.
+
+    >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
+    >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
+    >>> same = Sensitivity(0 * one, 0 * one, np.zeros((32, 32, 2)), one, 30 * one)
+    >>> flat = Ground(0 * one, one > 0, same, np.zeros((32, 32, 2)))
+    >>> told = compared(image, image, flat, [(slice(0, 32), slice(0, 32))], window=5)
+    >>> told.measured.coherent, told.measured.sensitive, bool(np.isnan(told.panels["height"]).all())
+    (1024, 0, True)
+    """
+    both = formed(first, second, tiles, window=window)
+    magnitude, phase, looks = both.magnitude, both.phase, both.looks
+    common = ground.plain & np.isfinite(magnitude)
+    enough = looks > 1  # coherence of a single look is 1 whatever the images hold
+    energy = looks * both.shared.astype(np.float64)  # looks that the window's energy is spread over
+    told_by_one = energy < LEAST_SPREAD
+    valid = common & ~told_by_one & fits(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
+    centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
+    centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
+    unwrapped = unwrap(centred, magnitude, looks=looks)
+    known = [
+        replace(one, measured_rad=float(phase[one.row, one.column]) - centre)
+        for one in ground.known
+        if common[one.row, one.column]
+    ]
+    told = level(unwrapped, known)
+    alone = levelled(unwrapped, told) if told else np.full(common.shape, np.nan, np.float32)
+    at_place = _placed(ground, alone, magnitude, np.minimum(looks, 2 * energy), looks)
+    panels = {
+        "phase": np.where(common, phase, np.nan).astype(np.float32),
+        "coherence": np.where(common, magnitude, np.nan).astype(np.float32),
+        "unwrapped": alone,
+        "height": at_place.height.astype(np.float32),
+        "height_std": at_place.std.astype(np.float32),
+    }
+    coherent = magnitude > least_coherence(looks) if enough else np.zeros(common.shape, bool)
+    counted = _measured(ground.sensed, common, coherent, magnitude, chance(looks) if enough else 1.0)
+    return Compared(panels, looks, _unwrapping(counted, unwrapped, alone, told, at_place), told)
+
+
+def _placed(
+    ground: Ground, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
+) -> Placed:
+    """Return heights at their own places from the phase that height alone has."""
+    rise = ground.sensed.height(alone.astype(np.float64))
+    std = np.full(rise.shape, np.nan)
+    there = np.isfinite(rise)
+    if there.any():
+        steep = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[there]
+        std[there] = phase_std(unbiased(magnitude[there], looks), own[there]) / steep
+    return placed(ground.height_m, rise, std, ground.shift_px)
+
+
+def _measured(
+    sensed: Sensitivity,
+    common: NDArray[np.bool_],
+    coherent: NDArray[np.bool_],
+    magnitude: NDArray[np.float32],
+    by_chance: float,
+) -> Measured:
+    """Return what the pixels are that both images see plainly."""
+    count = int(common.sum())
+
+    def middle(values: NDArray[np.floating]) -> float:
+        return float(np.median(values[common])) if count else 0.0
+
+    return Measured(
+        common=count,
+        coherent=int((common & coherent).sum()),
+        sensitive=int((common & sensible(sensed)).sum()),
+        coherence=middle(magnitude),
+        chance=by_chance,
+        overlap=middle(sensed.overlap),
+        ambiguity_m=min(middle(sensed.ambiguity_m), 1e9),  # a height that JSON can say
+    )
+
+
+def _unwrapping(
+    counted: Measured, phase: Unwrapped, alone: NDArray[np.float32], told: Level | None, at_place: Placed
+) -> Measured:
+    """Return the same with what became of the phase."""
+    unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(alone).sum())
+    return replace(
+        counted,
+        told=unwrapped,
+        apart=unwrapped - kept,
+        residues=phase.residues,
+        loops=phase.loops,
+        jumps=phase.jumps,
+        by=phase.by,
+        folded=at_place.folded,
+        points=len(told.points) if told else 0,
+    )

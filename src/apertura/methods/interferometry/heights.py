@@ -1,0 +1,157 @@
+"""From phase to height: which pixels tell it, how well, from which level it counts, and where that ground lies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.methods.interferometry.sensitivity import Sensitivity
+
+BY_CHANCE = 1e-3
+"""Share of pixels that have nothing in common and still count as coherent."""
+
+MARGIN = 1.4
+"""How much more the phase of simulated ground scatters than its bound, at most."""
+
+Floats = NDArray[np.float64]
+
+_STEPS = 30  # of the search for the pixel that shows a place
+_MOST_COVERED = 1.5  # twice is folded over
+_FOUND_PX = 0.05  # a pixel that shows the place so nearly is the one
+
+
+def least_coherence(looks: float) -> float:
+    """Return the coherence that `BY_CHANCE` of pixels reach where there is none, docs/theory/interferometry.md, eq. 7.
+
+    Examples
+    --------
+    >>> [round(least_coherence(looks), 3) for looks in (4.0, 25.0)]
+    [0.949, 0.5]
+    """
+    return float(np.sqrt(1 - BY_CHANCE ** (1 / max(looks - 1, 1e-6))))
+
+
+def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the standard deviation of the phase, rad, docs/theory/interferometry.md, eq. 8.
+
+    Parameters
+    ----------
+    coherence
+        (...) float32, without what chance adds to it.
+    looks
+        Independent samples that the phase is the mean of, of all or of each.
+
+    Examples
+    --------
+    >>> phase_std(np.array([0.9, 0.0], np.float32), 25.0).round(3)
+    array([0.096, 1.814], dtype=float32)
+    """
+    square = np.square(coherence.astype(np.float64))
+    with np.errstate(divide="ignore"):
+        bound = MARGIN * np.sqrt((1 - square) / (2 * looks * square))
+    return np.asarray(np.minimum(bound, np.pi / np.sqrt(3)), np.float32)  # that of any phase at all
+
+
+def fits(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
+    """Return which pixels tell a height: coherent beyond chance, and no height of the range's size in one turn.
+
+    Parameters
+    ----------
+    sensed
+        At the pixels.
+    coherence
+        (...) float32, as measured.
+    looks
+        As of `phase_std`.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(sensible(sensed) & (sensed.overlap > 0) & (coherence > least_coherence(looks)))
+
+
+def sensible(sensed: Sensitivity) -> NDArray[np.bool_]:
+    """Return where one turn of the phase is less height than the range: docs/theory/interferometry.md, section 5."""
+    return np.asarray(sensed.ambiguity_m < sensed.range_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Heights at their own places.
+
+    Attributes
+    ----------
+    height
+        (y, x) float64, metres, of the ground at the middle of each pixel; NaN where no pixel shows it, or several do.
+    std
+        (y, x) float64, metres, by the phase's scatter alone.
+    folded
+        Places that more than one pixel shows by the heights found: laid over, or unwrapped by whole turns too far.
+    """
+
+    height: Floats
+    std: Floats
+    folded: int
+
+
+def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> Placed:
+    """Return heights at the places that they belong to: ground that is higher than assumed shows where it is not.
+
+    Parameters
+    ----------
+    ground_m
+        (y, x) float64, heights that the images assume.
+    rise_m, std_m
+        (y, x) float64, how much higher the ground shown by a pixel is, NaN where that is not known; its deviation.
+    shift_px
+        (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of rise.
+
+    Notes
+    -----
+    Source: docs/theory/interferometry.md, eq. 16.
+
+    Examples
+    --------
+    >>> flat, rise = np.zeros((9, 9)), np.full((9, 9), 0.5)
+    >>> told = placed(flat, rise, 0.1 * rise, np.full((9, 9, 2), [0.0, 4.0]))
+    >>> told.height[4].round(2)
+    array([nan, nan, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5])
+    """
+    from scipy.ndimage import distance_transform_edt, map_coordinates
+
+    known = np.isfinite(rise_m)
+    if not known.any():
+        return Placed(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    moved = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]  # a pixel beside all that are known leads on to them
+    place = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
+    shown, apart = place, np.full(rise_m.shape, np.inf)
+    for _ in range(_STEPS):
+        target = place - [map_coordinates(one, shown, order=1, mode="nearest") for one in moved]
+        apart, shown = np.abs(target - shown).max(axis=0), target
+        if not (apart > _FOUND_PX).any():
+            break
+    folds = _covered(place + moved, np.abs(_stretch(moved)) * known) > _MOST_COVERED
+    found = (apart <= _FOUND_PX) & ~folds
+    height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))
+    folded = int(((apart > _FOUND_PX) | folds)[np.isfinite(height)].sum())
+    return Placed(np.where(found, height, np.nan), np.where(found, std, np.nan), folded)
+
+
+def _covered(to: Floats, area: Floats) -> Floats:
+    """Return how often each place is shown: the mean over 3 × 3 of the areas of the pixels that show it."""
+    from scipy.ndimage import uniform_filter
+
+    inside = np.logical_and.reduce(
+        [(np.round(at) >= 0) & (np.round(at) < size) for at, size in zip(to, area.shape, strict=True)]
+    )
+    row, column = (np.round(at[inside]).astype(np.int64) for at in to)
+    cover = np.bincount(row * area.shape[1] + column, area[inside], minlength=area.size).reshape(area.shape)
+    return np.asarray(uniform_filter(cover, 3, mode="nearest"))
+
+
+def _stretch(moved: Floats) -> Floats:
+    """Return the area of ground that a pixel shows, in pixels: negative where it is folded over."""
+    size = moved.shape[1:]
+    rows, columns = (
+        [np.gradient(one, axis=axis) if size[axis] > 1 else np.zeros(size) for axis in (0, 1)] for one in moved
+    )
+    return np.asarray((1 + rows[0]) * (1 + columns[1]) - rows[1] * columns[0])

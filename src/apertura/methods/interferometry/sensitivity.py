@@ -1,0 +1,172 @@
+"""How the phase between two images answers to height: radians per metre, where the ground then lies, what both see."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+
+Floats = NDArray[np.float64]
+Legs = tuple[Floats, Floats]
+"""Phase centres of transmitter and receiver of the pulses that make each place, (place, pulse, 3) metres each."""
+
+PROBE = 0.02
+"""Height that the answer is measured at, as a share of the range: large against rounding, small against the range."""
+
+_STEPS = 4  # of Gauss and Newton; the first is right to first order in PROBE, each other squares what is left
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """What ground that lies higher than the images assume does to their phase.
+
+    Attributes
+    ----------
+    slope, bend
+        (...) float64: phase = slope · h + bend · h², rad for h in metres; of the first image less that of the second.
+    shift
+        (..., 2) float64, metres east and north that the ground shown by a pixel lies away from it, per metre of height.
+    overlap
+        (...) float64, share of what the two images sample of the scene's spectrum that both do; 0: no coherence.
+    range_m
+        (...) float64, half the mean of both total paths.
+
+    Notes
+    -----
+    Source: docs/theory/interferometry.md, eqs. 9 to 11 and 14.
+    """
+
+    slope: Floats
+    bend: Floats
+    shift: Floats
+    overlap: Floats
+    range_m: Floats
+
+    @property
+    def ambiguity_m(self) -> Floats:
+        """Height that turns the phase once, metres; infinite where height does not turn it."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(2 * np.pi / np.abs(self.slope))
+
+    def height(self, phase_rad: Floats) -> Floats:
+        """Return the height above the ground that was assumed, metres; NaN where no height has such a phase.
+
+        Examples
+        --------
+        >>> one = np.ones(1)
+        >>> Sensitivity(4 * one, 2 * one, np.zeros((1, 2)), one, one).height(np.array([4 * 0.5 + 2 * 0.25]))
+        array([0.5])
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = np.sqrt(self.slope**2 + 4 * self.bend * phase_rad)
+            return np.asarray(2 * phase_rad / (self.slope + np.copysign(root, self.slope)))
+
+
+def sensitivity(
+    places_m: Floats, axes: Floats, first: Legs, second: Legs, *, band_hz: tuple[float, float]
+) -> Sensitivity:
+    """Return how the phase between two images answers to height at some places.
+
+    Parameters
+    ----------
+    places_m
+        (place, 3) float64, metres: pixels on the ground that both images assume.
+    axes
+        (3, 3) float64, unit vectors east, north and up.
+    first, second
+        Phase centres of pulses spread over each image's aperture, place by place, in the frame of `places_m`.
+    band_hz
+        Lowest and highest frequency.
+
+    Examples
+    --------
+    Two tracks along x, 20 m away and 20 m high, the second 1 m higher, so that it looks 0.0244 rad steeper: 4π/λ times
+    that over sin θ = 0.7, and what lies higher shows nearer by cot θ.
+
+    >>> along = np.linspace(-4.0, 4.0, 9)[None, :, None] * [1.0, 0.0, 0.0]
+    >>> low, high = along + [0.0, -20.0, 20.0], along + [0.0, -20.0, 21.0]
+    >>> told = sensitivity(np.zeros((1, 3)), np.eye(3), (low, low), (high, high), band_hz=(1.1e9, 1.3e9))
+    >>> told.slope.round(2), told.shift.round(2), told.overlap.round(2)
+    (array([-1.75]), array([[-0.  ,  1.03]]), array([0.84]))
+    """
+    wavenumber = np.pi * (band_hz[0] + band_hz[1]) / SPEED_OF_LIGHT_M_S
+    paths = [_path(places_m, legs) for legs in (first, second)]
+    range_m = np.mean([path.mean(axis=-1) for path in paths], axis=0) / 2
+    probe = PROBE * range_m
+    phases, shifts = [], []
+    for height_m in (probe, -probe):
+        moved = _moved(places_m, axes, (first, second), paths, height_m)
+        one, other = (_less(paths[at], moved, legs) for at, legs in enumerate((first, second)))
+        phases.append(wavenumber * (one.mean(axis=-1) - other.mean(axis=-1)))
+        shifts.append((moved - places_m) @ axes[:2].T)
+    return Sensitivity(
+        slope=(phases[0] - phases[1]) / (2 * probe),
+        bend=(phases[0] + phases[1]) / (2 * probe**2),
+        shift=(shifts[0] - shifts[1]) / (2 * probe[:, None]),
+        overlap=_overlap(places_m, axes, first, second, band_hz),
+        range_m=range_m,
+    )
+
+
+def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
+    """Return where ground that is `height_m` higher lies if it shows at `places_m` in both images.
+
+    Its path differs by the same from pulse to pulse, else it would be sharp elsewhere along the track, and by nothing
+    in the mean of both images, else it would be elsewhere in range (docs/theory/interferometry.md, eq. 10).
+    """
+    east_north, moved = axes[:2], places_m + height_m[:, None] * axes[2]
+    for _ in range(_STEPS):
+        wrong, turned = [], []
+        for legs, path in zip(images, paths, strict=True):
+            left, gradient = -_less(path, moved, legs), _gradient(moved, legs) @ east_north.T
+            wrong.append(left)
+            turned.append(gradient)
+        rows = [left - left.mean(axis=1, keepdims=True) for left in wrong]
+        slopes = [one - one.mean(axis=1, keepdims=True) for one in turned]
+        rows.append(sum(left.mean(axis=1, keepdims=True) for left in wrong) / 2)
+        slopes.append(sum(one.mean(axis=1, keepdims=True) for one in turned) / 2)
+        design, missed = np.concatenate(slopes, axis=1), np.concatenate(rows, axis=1)
+        step = np.einsum("pij,pj->pi", np.linalg.pinv(design), -missed)
+        moved = moved + step @ east_north
+    return np.asarray(moved)
+
+
+def _path(places_m: Floats, legs: Legs) -> Floats:
+    """Return the total paths, (place, pulse)."""
+    tx, rx = (np.linalg.norm(places_m[:, None] - leg, axis=-1) for leg in legs)
+    return np.asarray(tx + rx)
+
+
+def _less(path: Floats, moved: Floats, legs: Legs) -> Floats:
+    """Return how much longer the paths are than those to places moved."""
+    return np.asarray(path - _path(moved, legs))
+
+
+def _gradient(places_m: Floats, legs: Legs) -> Floats:
+    """Return the gradients of the total paths, (place, pulse, 3)."""
+    total = np.zeros_like(legs[0])
+    for leg in legs:
+        apart = places_m[:, None] - leg
+        total += apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+    return total
+
+
+def _overlap(places_m: Floats, axes: Floats, first: Legs, second: Legs, band_hz: tuple[float, float]) -> Floats:
+    """Return the share of the spectrum that both images sample: along range, times across it."""
+    ground = [_gradient(places_m, legs) @ axes[:2].T for legs in (first, second)]
+    middle = [one.mean(axis=1) for one in ground]
+    along = middle[0] + middle[1]
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    in_range = [np.sort(np.multiply.outer((one * along).sum(-1), np.array(band_hz)), axis=-1) for one in middle]
+    turned = [np.einsum("pmi,pi->pm", one, across) for one in ground]
+    in_angle = [np.stack([one.min(axis=1), one.max(axis=1)], axis=-1) for one in turned]
+    return np.asarray(_shared(*in_range) * _shared(*in_angle))
+
+
+def _shared(one: Floats, other: Floats) -> Floats:
+    """Return the length that two intervals (place, 2) share over the geometric mean of theirs."""
+    both = np.minimum(one[:, 1], other[:, 1]) - np.maximum(one[:, 0], other[:, 0])
+    mean = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
+    return np.asarray(np.clip(both / np.maximum(mean, 1e-12), 0, 1))

@@ -1,0 +1,215 @@
+"""By how much a recorder's clock is behind its log's, and its range beyond geometry: where the image is sharpest.
+
+First when the node moved, then where its echoes add up: here at a point whose place is known.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.phasors import phasors, turned
+from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex64]
+MOST_PULSES = 1024
+"""That offsets are tried on."""
+
+RIVAL_DB = -1.0
+"""Another offset that adds up so well makes it uncertain which is the right one."""
+
+LEAST_CONTRAST_DB = 6.0
+"""Peak over what other offsets give: less is chance."""
+
+_STEPS_PER_WAVE = 8
+_OVERSAMPLING = 8
+_WIDTH_DB = -1.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How a recorder stands to its log.
+
+    Attributes
+    ----------
+    offset_s, path_m
+        To be added to the recorder's times; electrical path beyond geometry, metres of total path.
+    offset_width_s, path_width_m
+        Within which the peak falls by a decibel: by so much an offset may be off before it costs that.
+    contrast_db
+        Peak above what other offsets give.
+    report
+        What was found on the way.
+    drift_ppm
+        By which more is to be added for every second since the first pulse.
+    flags
+        Edge crossed → what was measured, in one line.
+    """
+
+    offset_s: float
+    path_m: float
+    offset_width_s: float
+    path_width_m: float
+    contrast_db: float
+    report: Mapping[str, Any] = field(default_factory=dict)
+    drift_ppm: float = 0.0
+    flags: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Gathering:
+    """How well echoes add up at one point, by offset and path.
+
+    Attributes
+    ----------
+    echo, log
+        What was recorded, and flown.
+    point_m
+        (3,) float64, metres, in the frame of the antennas.
+    """
+
+    echo: Recorded
+    log: Logged
+    point_m: Floats
+
+    def spectrum(self, offset_s: float) -> Complexes:
+        """Return (subcarrier,) complex128: pulses turned to the point's path and added, weighed by the way flown."""
+        at_s = self.echo.time_s + offset_s
+        kept = self.log.inside(at_s)
+        some, speed = self.echo[kept], self.log.speeds_m_s(at_s)[kept]
+        paths_s = self.log.placed(at_s[kept]).path(self.point_m) / SPEED_OF_LIGHT_M_S - some.reference_delay_s
+        frequency = self.echo.frequency_hz
+        spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
+        weight = speed / max(float(speed.sum()), 1e-30)
+        start = turned(weight, paths_s * frequency[0])[:, None]
+        taper = np.hanning(frequency.size + 2)[1:-1]
+        summed: Complexes = (some.transfer * (start * phasors(paths_s * spacing_hz, frequency.size))).sum(0)
+        return np.asarray(summed * (taper / taper.sum()), np.complex64)
+
+    def powers(self, offset_s: float) -> tuple[Floats, Floats]:
+        """Return paths beyond geometry (m), as far as they are told apart, and the power of the point there."""
+        frequency = self.echo.frequency_hz
+        length = _OVERSAMPLING * frequency.size
+        spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
+        power = np.abs(np.fft.ifft(self.spectrum(offset_s), length) * length) ** 2
+        path_m = np.fft.fftfreq(length) * SPEED_OF_LIGHT_M_S / spacing_hz
+        order = np.argsort(path_m)
+        return np.asarray(path_m[order], np.float64), np.asarray(power[order], np.float64)
+
+    def power(self, offset_s: float, path_m: float) -> float:
+        """Return the power of the point at one offset and path."""
+        turns = self.echo.frequency_hz * (path_m / SPEED_OF_LIGHT_M_S)
+        return float(np.abs(self.spectrum(offset_s) @ np.exp(2j * np.pi * turns)) ** 2)
+
+
+def align_on_point(
+    echo: Recorded, log: Logged, point_m: Floats, *, within_s: tuple[float, float], search_m: float
+) -> Alignment:
+    """Return the offset and the path at which echoes add up best at a point whose place is known.
+
+    Parameters
+    ----------
+    echo, log
+        What was recorded, and flown.
+    point_m
+        (3,) float64, metres, in the frame of the antennas.
+    within_s
+        Offsets that are thought possible.
+    search_m
+        Paths of either sign up to this are considered, metres; 0: none is sought.
+
+    Raises
+    ------
+    ValueError
+        If no offset puts half of the pulses inside the log, or nothing adds up.
+
+    Notes
+    -----
+    Source: docs/theory/tracks.md, "Clock of the recorder".
+    """
+    some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
+    low, high = plausible_offsets(echo, log, within_s)
+    gathering = Gathering(some, log, point_m)
+    offsets_s = offset_steps(some, log, low, high)
+    searched = [gathering.powers(offset_s) for offset_s in offsets_s]
+    near = np.abs(searched[0][0]) <= max(search_m, 1e-9)
+    paths_m, power = searched[0][0][near], np.array([one[near] for _, one in searched])
+    row, column = np.unravel_index(int(power.argmax()), power.shape)
+    found = polished(
+        gathering.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
+    )
+    apart = widths(gathering.power, *found, _steps(offsets_s, paths_m, search_m))
+    contrast_db = 10 * float(np.log10(gathering.power(*found) / max(float(np.median(power)), 1e-300)))
+    flags = doubts(power.max(axis=1), offsets_s, found[0], apart[0], contrast_db)
+    report = {"method": "point", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
+    return Alignment(*found, *apart, contrast_db, report, flags=flags)
+
+
+def offset_steps(echo: Recorded, log: Logged, low: float, high: float) -> Floats:
+    """Return offsets so near to each other that no path changes by more than a part of a wave in between."""
+    step_s = offset_step_s(echo, log)
+    return np.arange(low, high + step_s, step_s)
+
+
+def offset_step_s(echo: Recorded, log: Logged) -> float:
+    """Return in which time no path changes by more than a part of a wave, seconds."""
+    times_s = np.linspace(log.first_s, log.last_s, 2048)
+    fastest = float(np.quantile(log.speeds_m_s(times_s), 0.95))
+    return echo.shortest_wave_m / (_STEPS_PER_WAVE * max(fastest, 1e-6))
+
+
+def _steps(offsets_s: Floats, paths_m: Floats, search_m: float) -> tuple[float, float]:
+    """Return the steps between offsets and paths; that of paths is 0 where none is sought."""
+    return float(offsets_s[1] - offsets_s[0]), float(paths_m[1] - paths_m[0]) if search_m > 0 else 0.0
+
+
+def polished(
+    power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the maximum next to a place of a grid."""
+    from scipy.optimize import minimize  # slow to import
+
+    def falls(at: Floats) -> float:
+        return -power(offset_s + at[0] * steps[0], path_m + at[-1] * steps[1])
+
+    free = 2 if steps[1] else 1
+    simplex = np.vstack([np.zeros(free), np.eye(free)])
+    done = minimize(falls, np.zeros(free), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 1e-3})
+    return offset_s + float(done.x[0]) * steps[0], path_m + float(done.x[-1]) * steps[1]
+
+
+def widths(
+    power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
+) -> tuple[float, float]:
+    """Return by how much offset and path may each be off before the peak falls by a decibel."""
+    least = power(offset_s, path_m) * 10 ** (_WIDTH_DB / 10)
+
+    def width(step: float, at: Callable[[float], float]) -> float:
+        reach = step / 8
+        while reach < 64 * step and min(at(reach), at(-reach)) > least:
+            reach *= 1.1
+        return reach
+
+    path_width = width(steps[1], lambda apart: power(offset_s, path_m + apart)) if steps[1] else 0.0
+    return width(steps[0], lambda apart: power(offset_s + apart, path_m)), path_width
+
+
+def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> dict[str, str]:
+    """Return what makes an offset doubtful: others nearly as good, the edge of the search, little contrast."""
+    flags: dict[str, str] = {}
+    away = np.abs(offsets_s - best_s) > 4 * width_s
+    rival = float(power.max(initial=0.0, where=away)) / float(power.max())
+    if rival > 10 ** (RIVAL_DB / 10):
+        other_s = float(offsets_s[np.where(away, power, 0.0).argmax()])
+        flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-10 * np.log10(rival):.1f} dB worse"
+    if 2 * width_s > offsets_s[-1] - offsets_s[0]:
+        flags["alignment_ambiguous"] = f"all offsets from {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s do as well"
+    if min(best_s - offsets_s[0], offsets_s[-1] - best_s) < width_s:
+        flags["alignment_at_edge"] = f"{best_s:.3f} s lies at an end of {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s"
+    if contrast_db < LEAST_CONTRAST_DB:
+        flags["alignment_uncertain"] = f"the best offset is only {contrast_db:.1f} dB above the others"
+    return flags

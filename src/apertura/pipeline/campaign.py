@@ -1,0 +1,222 @@
+"""A campaign folder as one value: its settings, its flights, and where everything in it lies."""
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.pipeline.config import (
+    CLOCKS,
+    CONFIG,
+    FLIGHTS,
+    SEGMENTS,
+    Antenna,
+    Clock,
+    Flight,
+    Node,
+    Segment,
+    check_interferometry,
+    read_clocks,
+    read_flights,
+    read_segments,
+    read_settings,
+)
+from apertura.pipeline.raw_folder import RawFolder
+
+
+@dataclass(frozen=True)
+class Campaign(RawFolder):
+    """A validated campaign folder.
+
+    Examples
+    --------
+    >>> Campaign.load("nowhere")
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
+    """
+
+    flights: tuple[Flight, ...]
+    segments: tuple[Segment, ...] = ()
+    clocks: tuple[Clock, ...] = ()
+
+    @classmethod
+    def load(cls, root: str | Path) -> "Campaign":
+        """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
+        root = Path(root)
+        config, table, segments, clocks = (
+            inside(root, path.as_posix(), where=root) for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
+        )
+        settings = read_settings(config)
+        flights = tuple(read_flights(table, nodes=settings.nodes))
+        images = [f"{one.name}/{pair}" for one in flights if one.kind == "image" for pair in one.pairs]
+        check_interferometry(settings.interferometry, images, where=CONFIG)
+        imaging = tuple(read_segments(segments, flights=flights))
+        return cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
+
+    @property
+    def image_flights(self) -> tuple[Flight, ...]:
+        """Flights that become images."""
+        return tuple(flight for flight in self.flights if flight.kind == "image")
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """The settings as JSON values, but for those that say where to compute and change no result."""
+        return self.settings.model_dump(mode="json", exclude={"processing": {"scheduler"}})
+
+    @property
+    def results(self) -> Path:
+        """The folder of everything the pipeline writes."""
+        return self.root / "results"
+
+    def stage(self, stage: str, *where: str) -> Path:
+        """Return the folder of a stage: results/<where…>/<stage>.zarr.
+
+        Examples
+        --------
+        >>> Campaign(Path("c"), None, ()).stage("echo", "f01", "uav1-uav2").as_posix()
+        'c/results/f01/uav1-uav2/echo.zarr'
+        """
+        return self.result(*where, f"{stage}.zarr")
+
+    def result(self, *where: str) -> Path:
+        """Return results/<where…>; raise CampaignError if that leads through a link."""
+        return inside(self.root, "/".join(["results", *where]), where=self.root)
+
+    def manifest(self, stage: str, *where: str) -> str:
+        """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
+        return "/".join(["results", *where, f"{stage}.manifest.json"])
+
+    def file(self, name: str, key: str) -> Path:
+        """Return a file that `key` of the config names; raise CampaignError unless it lies in the campaign folder."""
+        return inside(self.root, name, where=f"{CONFIG}: {key}")
+
+    @property
+    def sent_file(self) -> Path:
+        """The file of what was transmitted: code symbols, or the samples of a pulse."""
+        key = getattr(self.settings.waveform, "file_key", "")
+        return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
+
+    def relative(self, path: Path) -> str:
+        """Return a path inside the campaign folder as the workflow names it."""
+        return path.relative_to(self.root).as_posix()
+
+    def height_files(self) -> dict[str, Path]:
+        """Return role → file of the DEM and of the grid of the geoid, where the config names them."""
+        scene = self.settings.scene
+        named = {"dem": scene.dem, "geoid": scene.geoid}
+        return {role: self.file(name, f"scene.{role}") for role, name in named.items() if name}
+
+    def antennas(self, pair: str) -> dict[str, tuple[str, Antenna]]:
+        """Return which antennas of a pair have beams: radar_tx, radar_rx → node and antenna."""
+        nodes = zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True)
+        found = {point: (name, getattr(self.settings.nodes[name].antennas, point)) for point, name in nodes}
+        return {point: (name, antenna) for point, (name, antenna) in found.items() if antenna is not None}
+
+    def pattern_files(self, pair: str) -> dict[str, Path]:
+        """Return key of the config → file of each sampled pattern of a pair's antennas."""
+        named = {
+            f"nodes.{node}.antennas.{point}.pattern": antenna.pattern
+            for point, (node, antenna) in self.antennas(pair).items()
+            if antenna.pattern
+        }
+        return {key: self.file(name, key) for key, name in named.items()}
+
+    def segments_of(self, flight: str, pair: str) -> list[tuple[str, str]]:
+        """Return start and end (UTC) of the parts of the track that image a pair; none: all of it."""
+        return self._segments.get((flight, pair), [])
+
+    @cached_property
+    def _segments(self) -> dict[tuple[str, str], list[tuple[str, str]]]:
+        own: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        for segment in sorted(self.segments, key=lambda one: (one.start, one.end)):
+            own.setdefault((segment.flight, segment.pair), []).append((segment.start, segment.end))
+        return own
+
+    def clock(self, flight: str, node: str) -> Clock:
+        """Return how a node's recorder stands to its log in a flight."""
+        return self._clocks.get((flight, node), Clock(flight, node))
+
+    def node(self, flight: str, node: str) -> Node:
+        """Return the settings of a node as they hold in a flight: what clocks.tsv says of its tags goes first."""
+        stated, std_s = self.settings.nodes[node], self.clock(flight, node).std_s
+        return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
+
+    @cached_property
+    def _clocks(self) -> dict[tuple[str, str], Clock]:
+        return {(clock.flight, clock.node): clock for clock in self.clocks}
+
+    def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
+        """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
+        settings, processing = self.values, self.values["processing"]
+        beams = self.antennas(pair) if pair else {}
+        stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
+        antennas = {"antennas": stated} if stated else {}
+        chosen: dict[str, dict[str, Any]] = {
+            "echo": self._relevant_to_echo(flight, pair, beams),
+            "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
+            "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
+            "scene": {
+                "scene": {key: value for key, value in settings["scene"].items() if key != "reference_points"},
+            },
+            "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
+            "profile": {name: processing[name] for name in ("window", "integration")} | antennas,
+            "refined_track": {
+                **{key: processing[key] for key in ("autofocus", "autofocus_method")},
+                "reference_points": settings["scene"]["reference_points"],
+            },
+            "assess": {"fusion": processing["fusion"]},
+            "image": {
+                name: value
+                for name, value in processing.items()
+                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion", "autofocus", "autofocus_method"}
+            }
+            | antennas,
+            "layers": {"integration": processing["integration"], **antennas},
+            "interferogram": {
+                "window_px": settings["interferometry"]["window_px"],
+                "reference_points": settings["scene"]["reference_points"],
+                "integration": processing["integration"],
+            },
+        }
+        return chosen.get(stage, {})
+
+    def _relevant_to_echo(self, flight: str, pair: str, beams: Collection[str]) -> dict[str, Any]:
+        """Return what matters for a pair's echo: whether there are beams, not what they are."""
+        settings = self.values
+        nodes = {
+            node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
+            for node in pair.split("-")
+            if node
+        }
+        stated = {
+            "beams": sorted(beams),
+            "segments": [list(segment) for segment in self.segments_of(flight, pair)],
+            "clocks": [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks],
+        }
+        asked = {key: settings["processing"][key] for key in ("sidelink", "accuracy_db")}
+        always = {"waveform": settings["waveform"], "nodes": nodes, **asked}
+        return always | {name: value for name, value in stated.items() if value}
+
+    def log_settings(self, node: str) -> dict[str, Any]:
+        """Return the settings that a node's log is read by, as JSON values."""
+        stated: dict[str, Any] = self.values["nodes"][node]["log"]
+        return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
+
+    def flight(self, name: str) -> Flight:
+        """Return the flight called `name`; raise CampaignError with the names there are if it is none of them."""
+        if name not in self._flights:
+            raise CampaignError(
+                f"no flight {name!r}",
+                where=self.root / FLIGHTS,
+                expected=f"one of {', '.join(self._flights)}",
+                remedy="Correct the flight's name, or add its line.",
+            )
+        return self._flights[name]
+
+    @cached_property
+    def _flights(self) -> dict[str, Flight]:
+        return {flight.name: flight for flight in self.flights}

@@ -1,0 +1,256 @@
+"""A campaign while it is checked: recordings, logs and grid opened once, whoever asks for them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import ProjError
+
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
+from apertura.formats.names import PHASE_HISTORIES
+from apertura.formats.reading import open_recording, read_track
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import SampledWaveform
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apertura.core.scene.grid import SceneGrid
+    from apertura.formats.recordings.recording import Recording
+    from apertura.pipeline.opening.ground import Ground
+    from apertura.pipeline.opening.transmitted import Transmitted
+
+T = TypeVar("T")
+Key = tuple[str, str]
+"""Flight and node."""
+
+_SMALL_BYTES = 64 << 20  # of phase history, which is read to be checked
+_NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A campaign, and what its checks open of it.
+
+    What cannot be opened is missing here: 'files', 'recordings', 'tracks' and 'crs' say why, once.
+    """
+
+    campaign: Campaign
+
+    @property
+    def waveform(self) -> SampledWaveform | None:
+        """What was transmitted, where it was recorded as samples; None: phase history."""
+        stated = self.campaign.settings.waveform
+        return stated if isinstance(stated, SampledWaveform) else None
+
+    @property
+    def sent(self) -> "Transmitted | None":
+        """What was transmitted; None without samples, or where the file is not what the waveform says."""
+        return self._sent[0]
+
+    @property
+    def unsent(self) -> list[CampaignError]:
+        """What is wrong with the file."""
+        return self._sent[1]
+
+    @cached_property
+    def _sent(self) -> "tuple[Transmitted | None, list[CampaignError]]":
+        from apertura.pipeline.opening.transmitted import transmitted
+
+        try:
+            return (transmitted(self.campaign, self.waveform) if self.waveform else None), []
+        except CampaignError as problem:
+            return None, [problem]
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Every flight and node of which a log is needed."""
+        every = ((flight.name, node) for flight in self.campaign.flights for node in flight.participants)
+        return tuple(key for key in every if self.waveform or self.campaign.logged(*key))
+
+    @property
+    def recordings(self) -> dict[Key, "Recording"]:
+        """Recordings that open."""
+        return self._recordings[0]
+
+    @property
+    def unopened(self) -> list[CampaignError]:
+        """What is wrong with the others."""
+        return self._recordings[1]
+
+    @property
+    def tracks(self) -> dict[Key, "xr.Dataset"]:
+        """Flight logs that can be read, as `track` stages."""
+        return self._tracks[0]
+
+    @property
+    def unread(self) -> list[CampaignError]:
+        """What is wrong with the others."""
+        return self._tracks[1]
+
+    @cached_property
+    def unread_histories(self) -> list[CampaignError]:
+        """What is wrong with phase history: of every pair whose files are small, and of one that the frame rests on."""
+        if self.waveform is not None:
+            return []
+        from apertura.pipeline.opening.recorded import recorded_echo
+
+        wrong: list[CampaignError] = []
+        pairs = [(flight.name, pair) for flight in self.campaign.flights for pair in flight.pairs]
+        for number, (flight, pair) in enumerate(pairs):
+            try:
+                files = self.campaign.history_files(flight, pair.split("-")[1])
+            except CampaignError:  # for 'files' to name
+                continue
+            size = sum(path.stat().st_size for path in files)
+            if not size or (size > _SMALL_BYTES and (number or self.frame)):
+                continue
+            try:
+                recorded_echo(self.campaign, flight, pair)
+            except CampaignError as problem:
+                wrong.append(problem)
+        return wrong
+
+    @cached_property
+    def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
+        return self._each(self.campaign.recording_files, self._opened)
+
+    def _opened(self, files: tuple[Path, ...], key: Key) -> "Recording":
+        """Return a recording by the clock of its node's log."""
+        recording = open_recording(files)
+        captures = recording.captures
+        return replace(recording, captures=replace(captures, time=self.campaign.clock(*key).utc(captures.time)))
+
+    @cached_property
+    def _tracks(self) -> tuple[dict[Key, "xr.Dataset"], list[CampaignError]]:
+        def files(flight: str, node: str) -> tuple[Path, ...]:
+            return (self.campaign.track_file(flight, node),)
+
+        options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
+        return self._each(files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]))
+
+    def _each(
+        self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], Key], T]
+    ) -> tuple[dict[Key, T], list[CampaignError]]:
+        """Open what lies there and is not empty; the others are for 'files' to name."""
+        found: dict[Key, T] = {}
+        wrong: list[CampaignError] = []
+        for flight, node in self.keys:
+            try:
+                paths = files(flight, node)
+            except CampaignError:
+                continue
+            if not all(path.stat().st_size for path in paths):
+                continue
+            try:
+                found[flight, node] = opened(paths, (flight, node))
+            except CampaignError as problem:
+                wrong.append(problem)
+        return found, wrong
+
+    @cached_property
+    def geodetic(self) -> dict[Key, NDArray[np.float64]]:
+        """Flight and node → (epoch, 3) float64: latitude, longitude (deg), ellipsoidal height (m) of a log on Earth."""
+        places = {key: track.position.values for key, track in self.tracks.items() if track.attrs["frame"] == "ecef"}
+        return {key: geodetic_from_ecef(position_m) for key, position_m in places.items()}
+
+    @property
+    def frame(self) -> str:
+        """What positions are in, ecef or local; empty where only the samples say."""
+        logged = [track.attrs["frame"] for track in self.tracks.values()]
+        if logged or self.waveform:
+            return next(iter(logged), "ecef")
+        return PHASE_HISTORIES[self.campaign.settings.waveform.format].frame  # type: ignore[union-attr]
+
+    @cached_property
+    def crs(self) -> str | None:
+        """CRS of the scene; `auto` is the zone of the first image flight; None where nobody can tell, or it is none."""
+        asked = self.campaign.settings.scene.crs
+        if asked != "auto":
+            return asked if asked == LOCAL or in_metres(asked) else None
+        from apertura.core.scene.auto_grid import utm_crs
+
+        middle = self.middle_m
+        return None if middle is None else utm_crs(middle)
+
+    @property
+    def other_frame(self) -> bool:
+        """Whether the scene's CRS is another frame than positions are in."""
+        return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
+
+    @cached_property
+    def middle_m(self) -> NDArray[np.float64] | None:
+        """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
+        first = {flight.name for flight in self.campaign.image_flights[:1]}
+        logs = [self.tracks[key].position.values for key in self.geodetic if key[0] in first]
+        return np.median(np.concatenate(logs), axis=0) if logs else None
+
+    @cached_property
+    def grid(self) -> "SceneGrid | None":
+        """The scene's pixels, coarser ones where the spacing is `auto`; None where bounds are, or the CRS is wrong."""
+        from apertura.core.scene.grid import SceneGrid
+
+        asked = self.campaign.settings.scene
+        if self.crs is None or asked.bounds_m == "auto" or self.other_frame:
+            return None
+        xmin, ymin, xmax, ymax = asked.bounds_m
+        spacing = min(xmax - xmin, ymax - ymin) / _NODES if asked.spacing_m == "auto" else asked.spacing_m
+        try:
+            return SceneGrid.from_bounds(self.crs, asked.bounds_m, spacing_m=spacing)
+        except CampaignError:
+            return None
+
+    @property
+    def ground(self) -> "Ground | None":
+        """The ground as the config states it, opened; None where it cannot be, or nobody knows in which CRS."""
+        return self._ground[0]
+
+    @property
+    def no_ground(self) -> list[CampaignError]:
+        """Why it cannot be opened."""
+        return self._ground[1]
+
+    @property
+    def level_m(self) -> float:
+        """Height of flat ground under the grid, metres above the ellipsoid; of the track, where a DEM says it."""
+        return self._ground[2]
+
+    @cached_property
+    def _ground(self) -> "tuple[Ground | None, list[CampaignError], float]":
+        from apertura.pipeline.opening.ground import Ground
+
+        flown_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
+        asked = self.campaign.settings.scene
+        try:
+            files = self.campaign.height_files()
+        except CampaignError:
+            return None, [], flown_m
+        if self.crs is None or not all(path.is_file() and path.stat().st_size for path in files.values()):
+            return None, [], flown_m
+        try:
+            ground = Ground.of(asked, files, crs=self.crs)
+            return ground, [], flown_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
+        except CampaignError as problem:
+            return None, [problem], flown_m
+
+
+def in_metres(crs: str) -> bool:
+    """Return whether PROJ knows a CRS and it is projected in metres.
+
+    Examples
+    --------
+    >>> [in_metres(crs) for crs in ("EPSG:32632", "EPSG:4326", "EPSG:2225", "EPSG:5555", "EPSG:99999")]
+    [True, False, False, False, False]
+    """
+    try:
+        system = CRS(crs)
+    except ProjError:
+        return False
+    metres = all(axis.unit_name == "metre" for axis in system.axis_info)
+    return system.is_projected and not system.is_compound and metres

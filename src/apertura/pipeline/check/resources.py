@@ -1,0 +1,90 @@
+"""Whether memory and disk are enough for what is certain to be needed."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from apertura.common.errors import CampaignError
+from apertura.pipeline.check.inspected import Inspected
+
+_BASE_BYTES = 120_000_000  # the interpreter and its libraries
+_CAPTURE_BYTES = 1100  # of the metadata of a capture while they are read; samples are read in blocks
+_RAW_BYTES = 10  # of a capture in the stage raw, compressed
+_ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, which are not compressed; the rest for pulses that drop out
+_PIXEL_BYTES = 36  # per pixel and pair: image, its part of the cube, three rasters, compressed; 76 before
+
+MEMINFO = Path("/proc/meminfo")
+
+
+def check_memory(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield a problem where the metadata of the longest recording do not fit into memory; samples need none."""
+    if not inspected.recordings:
+        return
+    key, largest = max(inspected.recordings.items(), key=lambda item: len(item[1].captures.start))
+    captures = len(largest.captures.start)
+    needed = _BASE_BYTES + _CAPTURE_BYTES * captures
+    if needed > (free := free_memory()):
+        yield CampaignError(
+            f"{captures} captures of {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of memory",
+            where=largest.files[-1],
+            expected=f"at most the {free / 1e9:.1f} GB that this process may use now",
+            remedy="Run on a machine with more memory, end other work, or cut the recording into several flights.",
+        )
+
+
+def free_memory(meminfo: Path = MEMINFO) -> int:
+    """Return the bytes of memory that are free for this process: the machine's, or what its control group allows.
+
+    Examples
+    --------
+    >>> 0 < free_memory() <= free_memory(Path("none"))
+    True
+    """
+    from apertura.core.planning.memory import memory_limit
+
+    lines = meminfo.read_text(encoding="utf-8").splitlines() if meminfo.is_file() else []
+    stated = [int(line.split()[1]) * 1024 for line in lines if line.startswith(("MemAvailable:", "SwapFree:"))]
+    return min(memory_limit(), sum(stated)) if stated else memory_limit()
+
+
+def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
+    """Yield a problem where the file system of the results has less left than the stages still to be made."""
+    campaign = inspected.campaign
+    needed = sum(disk_bytes(inspected).values())
+    folder = campaign.results if campaign.results.is_dir() else campaign.root
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(inspected).items() if size)
+        yield CampaignError(
+            f"results take at least {needed / 1e6:.0f} MB more ({parts})",
+            where=folder,
+            expected=f"at most the {free / 1e6:.0f} MB that are free",
+            remedy="Free some space, copy the campaign to a larger disk, or make the scene smaller.",
+        )
+
+
+def disk_bytes(inspected: Inspected) -> dict[str, int]:
+    """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
+    campaign, sent = inspected.campaign, inspected.sent
+    raw = sum(
+        _RAW_BYTES * len(recording.captures.start)
+        for key, recording in inspected.recordings.items()
+        if recording.framing is None and not _made(inspected, "raw", *key)
+    )
+    pixels = inspected.grid.shape[0] * inspected.grid.shape[1] if inspected.grid else 0
+    if campaign.settings.scene.spacing_m == "auto":
+        pixels = 0
+    echo = images = 0
+    for flight in campaign.flights:
+        recorded = inspected.recordings.get((flight.name, flight.transmitter))
+        pulses = len(recorded.captures.time) if recorded and recorded.framing is None else 0
+        for pair in flight.pairs:
+            if sent and not _made(inspected, "echo", flight.name, pair):
+                echo += round(_ECHO_SHARE * 8 * pulses * sent.numerology.numbers.size)
+            if flight.kind == "image" and not _made(inspected, "image", flight.name, pair):
+                images += _PIXEL_BYTES * pixels
+    return {"raw": raw, "echo": echo, "images": images}
+
+
+def _made(inspected: Inspected, stage: str, *where: str) -> bool:
+    return (inspected.campaign.root / inspected.campaign.manifest(stage, *where)).is_file()

@@ -1,0 +1,198 @@
+"""Results that another file, another setting or other code has overtaken, whatever the times of files say."""
+
+import re
+import sys
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from apertura.common.atomic import date
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.formats.catalog import CATALOG, CRATE
+from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY, exports_in
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import Result, digest_of
+from apertura.pipeline.lineage import results_of
+from apertura.pipeline.store import damaged_files, read_manifest
+
+_ONLY_LOOKS = (
+    r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
+    r"report.*|unlock|cleanup.*|containerize|export-cwl|archive|compilation|print-compilation|delete-.*|help|version)"
+)
+"""Options with which snakemake reads a workflow and runs none of it."""
+
+
+def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
+    """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
+
+    The reason is empty where it only stands on one that is made again.
+
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
+    paranoid
+        Read every file, also where its state is that of a hash taken before.
+    """
+    stale: dict[str, str] = {}
+    for name, result in results_of(campaign):
+        path = inside(campaign.root, result.manifest, where=campaign.root)
+        if not path.is_file():
+            if any((path.parent / file).is_file() for file in _PRODUCTS.get(name, ())):
+                stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
+            continue
+        try:
+            reasons = list(_reasons(campaign.root, result, read_manifest(path), paranoid=paranoid))
+        except CampaignError:
+            reasons = ["its manifest is damaged"]
+        if reasons or not stale.keys().isdisjoint(result.sources):
+            stale[result.manifest] = "; ".join(reasons)
+    return stale
+
+
+def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
+    """Give results that are not stale times that say so: not before what they were made from, and not after now.
+
+    Snakemake makes again what is older than its input, also where a copy has lost the times, and refuses an input from
+    the future, as a clock that was set back leaves it.
+    """
+    results, now_ns = [result for _, result in results_of(campaign)], time.time_ns()
+    inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
+    newest_ns = _newest_ns(campaign.root, inputs)
+    for result in results:
+        newest_ns = max(newest_ns, _newest_ns(campaign.root, result.sources))
+        path = campaign.root / result.manifest
+        if result.manifest not in stale and path.is_file():
+            files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
+            date([path, *files], earliest_ns=newest_ns, latest_ns=now_ns)
+    benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")  # Snakemake's oldest output may be one
+    date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
+
+
+def _newest_ns(root: Path, names: Iterable[str]) -> int:
+    return max((path.stat().st_mtime_ns for path in (root / name for name in names) if path.is_file()), default=0)
+
+
+def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
+    """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
+    for line in stale_lines(stale):
+        print(line, file=sys.stderr, flush=True)
+    for manifest in reversed(list(stale)) if remove else ():  # what stands on others first: a kill leaves no gap below
+        for kept in _kept(campaign.root, manifest):
+            print(f"what was edited by hand is kept as {kept}", file=sys.stderr, flush=True)
+        (campaign.root / manifest).unlink(missing_ok=True)
+    if stale and not remove:
+        print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
+
+
+def _kept(root: Path, manifest: str) -> Iterator[str]:
+    """Put files of a result that were edited since out of the workflow's way; yield their new names."""
+    path = root / manifest
+    try:
+        files = read_manifest(path)["files"]
+    except CampaignError:  # nobody knows how they were
+        return
+    for name, digest in files.items():
+        file = inside(path.parent, name, where=path)
+        if ".zarr/" in name or not file.is_file() or digest_of(root, file.relative_to(root).as_posix()) == digest:
+            continue
+        free = (file.with_stem(f"{file.stem}.edited{f'-{number}' if number else ''}") for number in count())
+        kept = next(other for other in free if not other.exists())
+        file.rename(kept)
+        yield kept.relative_to(root).as_posix()
+
+
+def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for each reason and the results it holds for, and one for those that only stand on them.
+
+    Examples
+    --------
+    >>> list(stale_lines({"a.json": "its code has changed", "b.json": "its code has changed", "c.json": ""}))
+    ['a.json and 1 more: stale, its code has changed', '1 result stands on that: stale, too']
+    """
+    holds_for: dict[str, list[str]] = {}
+    for manifest, why in stale.items():
+        holds_for.setdefault(why, []).append(manifest)
+    standing = len(holds_for.pop("", ()))
+    for why, manifests in holds_for.items():
+        more = f" and {len(manifests) - 1} more" if len(manifests) > 1 else ""
+        yield f"{manifests[0]}{more}: stale, {why}"
+    if standing:
+        yield f"{standing} results stand on that: stale, too" if standing > 1 else "1 result stands on that: stale, too"
+
+
+def forms_results(arguments: Sequence[str]) -> bool:
+    """Return whether snakemake, called so, runs jobs; while it reads the workflow it says so nowhere else.
+
+    Examples
+    --------
+    >>> forms_results(["snakemake", "--cores", "2"]), forms_results(["snakemake", "-np"])
+    (True, False)
+    """
+    return not any(re.fullmatch(_ONLY_LOOKS, argument) for argument in arguments[1:])
+
+
+def damaged_results(campaign: Campaign) -> dict[str, str]:
+    """Return manifest → what of a result is not as it was written, of those that are there; every byte is read."""
+    damaged = {}
+    for _, result in results_of(campaign):
+        path = inside(campaign.root, result.manifest, where=campaign.root)
+        if path.is_file():
+            try:
+                files = damaged_files(path)
+            except CampaignError:
+                damaged[result.manifest] = "its manifest is damaged"
+                continue
+            if files:
+                damaged[result.manifest] = f"{files[0]} is not as it was written" + (
+                    f", nor are {len(files) - 1} others" if len(files) > 1 else ""
+                )
+    return damaged
+
+
+_PRODUCTS = {
+    "coverage": COVERAGE,
+    "cphd": (PHASE_HISTORY,),
+    "stac": (f"stac/{CATALOG}",),
+    "ro_crate": (CRATE,),
+    "map": (Path(MAP).name,),
+    **{
+        name: tuple(row.file for row in exports_in(kind))
+        for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()
+    },
+}
+"""Result → the files that people open."""
+
+
+def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
+    if not {"sources", "settings", "code"} <= recorded.keys():
+        yield "it does not say what it was made from"
+        return
+    yield from _spoilt(root, result.manifest, recorded["files"])
+    for source in sorted({*result.sources, *recorded["sources"]}):
+        was = recorded["sources"].get(source)
+        if was is None:
+            yield f"{source} is new to it"
+        elif not inside(root, source, where=root / result.manifest).is_file():
+            yield f"{source} is gone"
+        elif digest_of(root, source, paranoid=paranoid) != was:
+            yield f"{source} has changed"
+    if recorded["settings"] != result.settings_sha256:
+        yield "its settings have changed"
+    if recorded["code"] != result.code_sha256:
+        yield "its code has changed"
+
+
+def _spoilt(root: Path, manifest: str, files: Mapping[str, str]) -> Iterator[str]:
+    """Yield what of a result's own files is gone, or edited since; arrays are looked into where they are opened."""
+    folder = (root / manifest).parent
+    for name, digest in files.items():
+        path = inside(folder, name, where=root / manifest)
+        if not path.is_file():
+            yield f"{name} is gone"
+            return
+        if ".zarr/" not in name and digest_of(root, path.relative_to(root).as_posix()) != digest:
+            yield f"{name} is not as it was written"

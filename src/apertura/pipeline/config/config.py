@@ -1,0 +1,96 @@
+"""The config as one value: from config/config.yaml to `Settings`, or to the message that says all that is wrong."""
+
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from apertura.common import validation
+from apertura.common.documents import read_yaml
+from apertura.pipeline.config.history_waveforms import PhaseHistoryWaveform
+from apertura.pipeline.config.interferometry import Interferometry
+from apertura.pipeline.config.nodes import Node
+from apertura.pipeline.config.processing import Calibration, Processing
+from apertura.pipeline.config.scene import Scene
+from apertura.pipeline.config.section import Name, Section, Title
+from apertura.pipeline.config.waveform import Waveform
+
+CONFIG = Path("config/config.yaml")
+"""Where the config lies in a campaign folder."""
+
+
+class Settings(Section):
+    """config/config.yaml."""
+
+    campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
+    waveform: Waveform = Field(description="what was transmitted")
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
+    scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
+    processing: Processing = Field(default_factory=Processing, description="how to compute")
+    calibration: Calibration | None = Field(
+        None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+    )
+
+    interferometry: Interferometry = Field(
+        default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
+    )
+
+    @model_validator(mode="after")
+    def _calibration_needs_a_place(self) -> Self:
+        if self.calibration is not None and self.scene.crs == "auto":
+            raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+        return self
+
+    @model_validator(mode="after")
+    def _beams_need_a_log(self) -> Self:
+        named = [name for name, node in self.nodes.items() if node.antennas.any()]
+        if named and isinstance(self.waveform, PhaseHistoryWaveform):
+            raise ValueError(
+                f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
+            )
+        return self
+
+
+def read_settings(path: Path) -> Settings:
+    """Return the settings in a config file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, is not YAML, or `validated` refuses it.
+    """
+    remedy = "`apertura init` writes a commented one."
+    return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
+
+
+def located(message: str) -> str:
+    """Return a message with the config's place before it, where it begins with a key of it: wings know no files.
+
+    Examples
+    --------
+    >>> located("scene.dem: no such file; ..."), located("scene.tif: no such file; ...")
+    ('config/config.yaml: scene.dem: no such file; ...', 'scene.tif: no such file; ...')
+    """
+    section, _, key = message.partition(": ")[0].partition(".")
+    field = Settings.model_fields.get(section)
+    known = field is not None and (not key or key in getattr(field.annotation, "model_fields", {}))
+    return f"{CONFIG}: {message}" if known else message
+
+
+def validated(document: object, *, where: object) -> Settings:
+    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+
+    Raises
+    ------
+    CampaignError
+        With file, key, what was found and what was expected.
+
+    Examples
+    --------
+    >>> validated({"campaing": "x"}, where="config.yaml")
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
+    """
+    expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
+    return validation.validated(Settings, document, where=where, expected=expected)

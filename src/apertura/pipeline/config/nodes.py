@@ -1,0 +1,126 @@
+"""Section `nodes`: what each UAV carries, where it sits, where its antennas look."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from apertura.pipeline.config.log import Log
+from apertura.pipeline.config.section import Metres3, Section
+
+StandardDeviation = Annotated[float, Field(gt=0)]
+Beamwidth = Annotated[float, Field(gt=0, le=180)]
+
+
+class Antenna(Section):
+    """Where one antenna looks and how widely; its horizontal axis lies in the body's forward-right plane."""
+
+    boresight_deg: tuple[Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]] = Field(
+        description="azimuth clockwise from forward, elevation above the forward-right plane (down is negative), deg"
+    )
+    beamwidth_deg: tuple[Beamwidth, Beamwidth] | None = Field(
+        None, description="full width at -3 dB (one way) in azimuth and elevation of a Gaussian beam, deg"
+    )
+    pattern: str | None = Field(
+        None,
+        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, gain_db",
+    )
+    cutoff_db: float = Field(
+        -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"
+    )
+
+    @model_validator(mode="after")
+    def _one_pattern(self) -> Self:
+        if (self.beamwidth_deg is None) == (self.pattern is None):
+            raise ValueError("give either beamwidth_deg, [azimuth, elevation], or pattern, a CSV file")
+        return self
+
+
+_BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
+
+
+class Antennas(Section):
+    """The beams of a node."""
+
+    radar_tx: Antenna | None = Field(None, description=f"transmitting radar antenna: {_BEAM}")
+    radar_rx: Antenna | None = Field(None, description=f"receiving radar antenna: {_BEAM}")
+
+    def any(self) -> bool:
+        """Return whether one of them is stated."""
+        return self.radar_tx is not None or self.radar_rx is not None
+
+
+class LeverArms(Section):
+    """From the logged point to each phase centre, body axes forward-right-down."""
+
+    radar_tx: Metres3 = Field((0.0, 0.0, 0.0), description="transmitting radar antenna, m")
+    radar_rx: Metres3 = Field((0.0, 0.0, 0.0), description="receiving radar antenna, m")
+    sidelink: Metres3 = Field((0.0, 0.0, 0.0), description="sidelink antenna, m")
+
+    def any(self) -> bool:
+        """Return whether one of them is not zero."""
+        return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
+
+
+class PathOffsets(Section):
+    """Electrical path beyond geometry, metres of total path, of the receiving node."""
+
+    radar: float = Field(0.0, description="radar channel, m")
+    sidelink: float = Field(0.0, description="sidelink channel, m")
+
+
+class Node(Section):
+    """One UAV."""
+
+    lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
+    antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
+    path_offset_m: PathOffsets = Field(
+        default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
+    )
+    attitude: Literal["log", "course", "none"] = Field(
+        "none", description="where attitude comes from: the log, the course over ground, or none"
+    )
+    log: Log = Field(default_factory=Log, description="how the flight log is read, where it leaves that open")
+    worst_fix: Literal["auto", "fix", "float", "any"] = Field(
+        "auto",
+        description="poorest solution to image with, where the log says: fix, float, or any; auto: fix where the log "
+        "has RTK at all, else any; pulses of poorer ones are left out",
+    )
+    position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
+        None,
+        description="error of logged positions where the log does not state it, standard deviation, m: one number, "
+        "or [north, east, up]; null: nobody knows",
+    )
+    position_correlation_s: float = Field(
+        1.0,
+        gt=0,
+        description="how long an error of position lasts, as white noise after a moving average so long: its "
+        "autocorrelation falls in a straight line to zero there, to 1/e at 0.63 of it, s",
+    )
+    position_drift_m: float = Field(
+        0.0,
+        ge=0,
+        description="slow error of position over a flight, offset, slope and bow, standard deviation in each axis, m: "
+        "what a refinement of tracks may correct beside what position_std_m allows",
+    )
+    time_tag_std_s: float = Field(
+        3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
+    )
+
+    @property
+    def poorest_fix(self) -> str:
+        """What `worst_fix` asks of a log with RTK."""
+        return "fix" if self.worst_fix == "auto" else self.worst_fix
+
+    @model_validator(mode="after")
+    def _lever_arm_needs_attitude(self) -> Self:
+        if self.attitude == "none" and self.lever_arms_m.any():
+            raise ValueError(
+                "lever_arms_m is not zero but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the lever arms to zero"
+            )
+        if self.attitude == "none" and self.antennas.any():
+            raise ValueError(
+                "antennas has a beam but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the beam to null"
+            )
+        return self

@@ -1,0 +1,199 @@
+"""Waveforms that are recorded as samples: OFDM symbols, and pulses given by their samples."""
+
+from abc import abstractmethod
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from apertura.pipeline.config.section import WAVEFORM_KINDS, Section
+
+
+class SampledWaveform(Section):
+    """One pulse per trigger, recorded as samples: what the road from captures to transfer functions asks of any kind.
+
+    Kinds say by `file_key` which of their keys names the file of what was sent, by `delay_key` and `held_by` what holds
+    an echo whole.
+    """
+
+    file_key: ClassVar[str]
+    delay_key: ClassVar[str]
+    held_by: ClassVar[str]
+
+    kind: str = Field(description=WAVEFORM_KINDS)
+    carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
+
+    @property
+    @abstractmethod
+    def longest_delay_s(self) -> float:
+        """Delay up to which an echo is held whole, seconds."""
+
+    @property
+    @abstractmethod
+    def middle_s(self) -> float:
+        """When the middle of what an echo is measured by was sent, seconds after the pulse began."""
+
+    @property
+    @abstractmethod
+    def capture_s(self) -> float:
+        """How long a capture lasts, seconds; nothing beyond is used."""
+
+    @property
+    @abstractmethod
+    def needed_samples(self) -> int:
+        """Samples that a capture must hold."""
+
+    @property
+    @abstractmethod
+    def most_subcarriers(self) -> int:
+        """Frequencies that an echo is measured at, at most."""
+
+    @property
+    @abstractmethod
+    def widest_band_hz(self) -> float:
+        """Bandwidth, at most."""
+
+    @property
+    def capture_samples(self) -> int:
+        """Samples of a whole capture."""
+        return round(self.capture_s * self.sample_rate_hz)
+
+
+class OfdmWaveform(SampledWaveform):
+    """One OFDM symbol per pulse."""
+
+    file_key, delay_key, held_by = "codes", "cyclic_prefix_s", "the cyclic prefix"
+
+    kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
+    codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
+    carrier_is: Literal["band_start", "band_centre"] = Field(
+        "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+    )
+    subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
+    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
+    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s", examples=[12.5e-6])
+    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s", examples=[3.125e-6])
+
+    @property
+    def longest_delay_s(self) -> float:
+        """The cyclic prefix."""
+        return self.cyclic_prefix_s
+
+    @property
+    def middle_s(self) -> float:
+        """The middle of the symbol."""
+        return self.cyclic_prefix_s + self.symbol_s / 2
+
+    @property
+    def capture_s(self) -> float:
+        """Prefix and symbol."""
+        return self.cyclic_prefix_s + self.symbol_s
+
+    @property
+    def prefix_samples(self) -> int:
+        """T_cp·f_s."""
+        return round(self.cyclic_prefix_s * self.sample_rate_hz)
+
+    @property
+    def dft_samples(self) -> int:
+        """f_s/Δf."""
+        return round(self.sample_rate_hz / self.subcarrier_spacing_hz)
+
+    @property
+    def needed_samples(self) -> int:
+        """Prefix and one period 1/Δf."""
+        return self.prefix_samples + self.dft_samples
+
+    @property
+    def most_subcarriers(self) -> int:
+        """N."""
+        return self.subcarriers
+
+    @property
+    def widest_band_hz(self) -> float:
+        """NΔf."""
+        return self.subcarriers * self.subcarrier_spacing_hz
+
+    @model_validator(mode="after")
+    def _dft_fits(self) -> Self:
+        length = self.sample_rate_hz / self.subcarrier_spacing_hz
+        if abs(length - round(length)) > 1e-6 * length:
+            raise ValueError(
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer: it is the DFT length"
+            )
+        if self.subcarriers > round(length):
+            raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
+        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
+            raise ValueError(
+                f"symbol_s={self.symbol_s:g} is shorter than the DFT window 1/subcarrier_spacing_hz = "
+                f"{1 / self.subcarrier_spacing_hz:g} s"
+            )
+        return self
+
+
+class PulseWaveform(SampledWaveform):
+    """A pulse given by its samples and sent once per trigger: a chirp, a code, whatever a loop-back captured."""
+
+    file_key, delay_key, held_by = "pulse", "listen_s", "the listening time"
+
+    kind: Literal["samples"] = Field(description=WAVEFORM_KINDS)
+    pulse: str = Field(
+        "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
+    )
+    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s", examples=[1e-6])
+    lead_s: float = Field(0.0, ge=0, description="how long before the pulse a capture begins, s")
+    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s", examples=[2e-6])
+    band_hz: tuple[float, float] | None = Field(
+        None, description="baseband frequencies that images are made of, Hz; null: where the pulse has its energy"
+    )
+    filter: Literal["auto", "inverse", "matched"] = Field(
+        "auto",
+        description="inverse leaves the window's sidelobes, matched the least noise; "
+        "auto: inverse, unless the spectrum is flat or has too many gaps",
+    )
+
+    @property
+    def longest_delay_s(self) -> float:
+        """As stated."""
+        return self.listen_s
+
+    @property
+    def middle_s(self) -> float:
+        """The middle of the pulse."""
+        return self.pulse_s / 2
+
+    @property
+    def capture_s(self) -> float:
+        """What goes before, the pulse, and its longest delay."""
+        return self.lead_s + self.pulse_s + self.listen_s
+
+    @property
+    def needed_samples(self) -> int:
+        """All of a capture: its end holds the end of the last echo."""
+        return self.capture_samples
+
+    @property
+    def most_subcarriers(self) -> int:
+        """Those of the band."""
+        return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
+
+    @property
+    def widest_band_hz(self) -> float:
+        """As stated, or all that the samples carry."""
+        return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
+
+    @model_validator(mode="after")
+    def _fits_its_samples(self) -> Self:
+        if self.band_hz is not None:
+            low, high = self.band_hz
+            half = self.sample_rate_hz / 2
+            if not -half <= low < high <= half:
+                raise ValueError(
+                    f"band_hz={[low, high]} must rise within ±sample_rate_hz/2 = ±{half:g} Hz: beyond, it aliases"
+                )
+        if self.capture_s * self.prf_hz > 1:
+            raise ValueError(
+                f"lead_s + pulse_s + listen_s = {self.capture_s:g} s is longer than 1/prf_hz = {1 / self.prf_hz:g} s"
+            )
+        return self

@@ -1,0 +1,109 @@
+"""The commented config every campaign starts from, and its JSON schema, both generated from `Settings`."""
+
+import json
+import types
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from apertura.common.errors import CampaignError, quoted
+from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.pipeline.config import Node, Settings
+from apertura.pipeline.config.waveform import Waveform
+
+WAVEFORMS: dict[str, type[BaseModel]] = {
+    get_args(one.model_fields["kind"].annotation)[0]: one for one in get_args(get_args(Waveform)[0])
+}
+"""waveform.kind and the section that it stands for."""
+
+_FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1,uav2\n"
+
+
+def config_template(kind: str = "ofdm") -> str:
+    """Return config/config.yaml with every key, its meaning as a comment, and its default or an example.
+
+    Parameters
+    ----------
+    kind
+        Of waveform: a key of `WAVEFORMS`.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such kind.
+
+    Examples
+    --------
+    >>> print(config_template().splitlines()[2])
+    # name of the campaign
+    """
+    if kind not in WAVEFORMS:
+        raise CampaignError(
+            f"kind {quoted(kind)}", where="apertura init", expected=", ".join(WAVEFORMS), remedy="Choose one of them."
+        )
+    examples = {"waveform": WAVEFORMS[kind], "nodes": {"uav1": Node, "uav2": Node}}
+    header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
+    return header + "\n".join(_section(Settings, 0, examples)) + "\n"
+
+
+def flights_template() -> str:
+    """Return config/flights.tsv with one flight."""
+    return _FLIGHTS
+
+
+def config_schema() -> str:
+    """Return the JSON schema of config/config.yaml."""
+    return json.dumps(Settings.model_json_schema(), indent=1) + "\n"
+
+
+def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
+    lines: list[str] = []
+    for name, field in model.model_fields.items():
+        indent = "  " * depth
+        lines.append(f"{indent}# {field.description}{_choices(field)}")
+        if name == "engine_options":
+            lines += [f"{indent}#   {line}" for line in _options_of_each_engine()]
+        value = examples[name] if name in examples else _value(field)
+        if isinstance(value, type) and issubclass(value, BaseModel):
+            lines += [f"{indent}{name}:", *_section(value, depth + 1)]
+        elif isinstance(value, dict) and value:
+            lines.append(f"{indent}{name}:")
+            for key, inner in value.items():
+                lines += [f"{indent}  {key}:", *_section(inner, depth + 2)]
+        else:
+            lines.append(f"{indent}{name}: {_scalar(value)}")
+    return lines
+
+
+def _options_of_each_engine() -> list[str]:
+    engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
+    return [f"{name}.{key}: {field.description}" for name, fields in engines.items() for key, field in fields.items()]
+
+
+def _value(field: FieldInfo) -> Any:
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+        return field.annotation
+    if field.examples:
+        return field.examples[0]
+    if field.default is not PydanticUndefined:
+        return field.default
+    if field.default_factory is dict:
+        return {}
+    return get_args(field.annotation)[0]  # a Literal without default: its first choice
+
+
+def _choices(field: FieldInfo) -> str:
+    kinds = get_args(field.annotation) if get_origin(field.annotation) is types.UnionType else (field.annotation,)
+    words = [word for kind in kinds if str(kind).startswith("typing.Literal") for word in get_args(kind)]
+    listed = [word for word in words if word not in (field.description or "")]
+    return f" ({' | '.join(words)})" if listed else ""
+
+
+def _scalar(value: Any) -> str:
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True).removesuffix("\n").removesuffix("\n...")

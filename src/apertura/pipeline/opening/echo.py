@@ -1,0 +1,247 @@
+"""The echo of a pair from what its nodes recorded: which pulses, from where, and how their transfer functions form."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.association import Association
+from apertura.core.echo.association_edges import tag_jitter_s
+from apertura.core.echo.captures import Pulses, Saturation, blocks_of
+from apertura.core.echo.demodulate import remove_path
+from apertura.core.echo.missing_pulses import missing_flags
+from apertura.core.echo.pulse_filter import cut_pulses
+from apertura.core.echo.sidelink import DIVIDING
+from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
+from apertura.core.quality.budget import strictest_accuracy_db
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Processing, PulseWaveform
+from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
+from apertura.pipeline.opening.node_log import Times
+from apertura.pipeline.opening.positions import Placed, place
+from apertura.pipeline.opening.segments import keep_segments
+from apertura.pipeline.opening.transmitted import Transmitted
+
+Complexes = NDArray[np.complex64]
+
+
+@dataclass(frozen=True, eq=False)
+class PairEcho:
+    """The echo of a pair, whose transfer functions are formed when they are asked for, block by block.
+
+    Attributes
+    ----------
+    dataset
+        The stage without `transfer`, and with `row` (pulse,): what `form` calls each pulse.
+    form
+        Rows (pulse,) int64, ascending → transfer functions of a few pulses, (pulse, subcarrier) complex64.
+    saturation
+        Of the samples read so far.
+    """
+
+    dataset: xr.Dataset
+    form: Callable[[Pulses], Complexes]
+    saturation: Saturation
+
+    @classmethod
+    def recorded(cls, echo: xr.Dataset) -> "PairEcho":
+        """Return the echo of a recorder that hands over transfer functions."""
+        history = echo.transfer
+
+        def form(rows: Pulses) -> Complexes:
+            return np.asarray(history[rows].values)
+
+        return cls(echo.drop_vars("transfer").assign(row=_rows(len(history))), form, Saturation())
+
+    def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
+        """Return the echo inside the segments of its pair."""
+        return replace(self, dataset=keep_segments(campaign, flight, pair, self.dataset))
+
+    @property
+    def promised(self) -> xr.Dataset:
+        """The stage, with zeros that take no memory for `transfer`."""
+        shape = self.dataset.sizes["pulse"], self.dataset.sizes["subcarrier"]
+        zeros = np.broadcast_to(np.complex64(0), shape)
+        return self.dataset.drop_vars("row").assign(transfer=(("pulse", "subcarrier"), zeros))
+
+    def blocks(self) -> Iterator[Complexes]:
+        """Yield `transfer` from its beginning, some pulses at a time."""
+        return map(self.form, blocks_of(self.dataset.row.values))
+
+    def at(self, pulses: slice) -> xr.Dataset:
+        """Return the stage at some pulses, formed."""
+        some = replace(self, dataset=self.dataset.isel(pulse=pulses))
+        return some.promised.assign(transfer=(("pulse", "subcarrier"), np.concatenate(list(some.blocks()))))
+
+
+def _rows(count: int) -> tuple[str, Pulses]:
+    return "pulse", np.arange(count)
+
+
+def pair_echo(
+    tx: Acquisition,
+    rx: Acquisition,
+    sent: Transmitted,
+    processing: Processing,
+    calibration: dict[str, Any] | None,
+) -> PairEcho:
+    """Return the echo of a pair from what its nodes recorded; path offsets are the calibration's, or the config's."""
+    pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
+    paired = np.flatnonzero(~pulses.outlier)
+    placed = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
+    paired = paired[placed.good]
+    at = tx.raw.time.values[pulses.tx_index[paired]]
+    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing)
+    at = at[measured.kept]
+    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
+    beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
+    frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
+    captures = np.flatnonzero(measured.kept)
+
+    def form(rows: Pulses) -> Complexes:
+        return remove_path(measured.form(captures[rows]), frequency, delay_s=delay_s[rows])
+
+    dataset = xr.Dataset(
+        {
+            "time": ("pulse", at),
+            "row": _rows(len(at)),
+            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", at)),
+            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", at)),
+            "frequency": ("subcarrier", frequency),
+            "reference_delay": ("pulse", np.zeros(len(beyond_m))),
+            "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * sent.waveform.longest_delay_s - beyond_m),
+            **_sidelink(measured),
+            **_axes((tx, rx), at),
+            **_sidelink_vector((tx, rx), at),
+        },
+        attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
+        | {"stated_offset_m": offset_m},
+    )
+    return PairEcho(dataset, form, measured.saturation)
+
+
+def _attributes(
+    nodes: tuple[Acquisition, Acquisition],
+    pulses: Association,
+    placed: Placed,
+    measured: Transfer,
+    *,
+    at: Times,
+    calibration: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Return what was found on the way to the pulses used, those sent `at`: edges crossed, pulses left out."""
+    missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
+    attrs = {
+        "frame": "ecef",
+        "pair": "-".join(node.name for node in nodes),
+        **measured.report,
+        "positions": placed.report,
+        "time_tags": _time_tags(nodes[0], pulses),
+        "flags": {**pulses.flags, **placed.flags, **measured.flags, **missing},
+        "pulses": _counted(len(nodes[0].raw.time), pulses, placed, measured),
+    }
+    if calibration:
+        attrs["flags"] |= calibration["flags"]
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    return attrs
+
+
+def _transfer(
+    nodes: tuple[Acquisition, Acquisition],
+    captures: NDArray[np.int64],
+    at: Times,
+    sent: Transmitted,
+    processing: Processing,
+) -> tuple[Transfer, NDArray[np.float64]]:
+    """Return what some captures, sent `at` the transmitter's tags, measured, and the sidelink's length (m); 0 without.
+
+    Both of its ends are where the logs put them at the transmitter's tag (docs/theory.md, "Geometry").
+    """
+    tx, rx = nodes
+    if tx.name == rx.name:
+        read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
+        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
+        return _of_what_was_sent(measured, sent), np.zeros(len(at))
+    length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
+    measured = transfer_by_sidelink(
+        rx.reader(["radar", "sidelink"], captures),
+        sent.inverse,
+        rx.numerology,
+        symbol_samples=sent.waveform.capture_samples,
+        sidelink_m=length_m,
+        method=processing.sidelink,
+        accuracy_db=strictest_accuracy_db(processing.accuracy_db),
+        where=str(rx.files),
+    )
+    return _of_what_was_sent(measured, sent), length_m[measured.kept]
+
+
+def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
+    """Return what was measured of the sidelink in each pulse; nothing of a node that hears itself."""
+    known = {
+        "sidelink_delay": measured.sidelink_delay_m,
+        "sidelink_snr": measured.sidelink_snr_db,
+        "sidelink_phase": measured.sidelink_phase_rad,
+    }
+    return {name: ("pulse", values) for name, values in known.items() if values is not None}
+
+
+def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
+    """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
+    flags, waveform = dict(sent.flags), sent.waveform
+    if measured.report.get("sidelink", {}).get("method") in DIVIDING:
+        flags.pop("waveform_sidelobes", None)  # whatever the pulse is like, it is in both channels
+    if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
+        held = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
+        cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
+        flags |= cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **held)
+    report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
+    return replace(measured, flags={**measured.flags, **flags}, report=report)
+
+
+def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
+    """Return how the nodes' tags lie to each other, and what is known of the transmitter's own errors."""
+    return {
+        **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
+        "std_s": tx.settings.time_tag_std_s,
+        "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
+    }
+
+
+def _counted(sent: int, pulses: Association, placed: Placed, measured: Transfer) -> dict[str, Any]:
+    """Return how many of the pulses sent are used, how many not, and why."""
+    used = int(measured.kept.sum())
+    reasons = {
+        "unpaired": pulses.tx_dropped,
+        "time_tag_outlier": int(pulses.outlier.sum()),
+        **placed.reasons,
+        "sidelink_lost": int((~measured.kept).sum()),
+    }
+    return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
+
+
+def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return the body axes of the nodes whose antennas have a beam."""
+    beams = nodes[0].settings.antennas.radar_tx, nodes[1].settings.antennas.radar_rx
+    return {
+        name: (("pulse", "axis", "body"), node.body_axes(at))
+        for name, node, beam in zip(("tx_axes", "rx_axes"), nodes, beams, strict=True)
+        if beam is not None
+    }
+
+
+def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:
+    """Return b of docs/theory/autofocus.md, eq. 2, where the echo was given back its length."""
+    tx, rx = nodes
+    if tx.name == rx.name:
+        return {}
+    return {"sidelink_vector": (("pulse", "axis"), tx.antenna("sidelink", at) - rx.antenna("sidelink", at))}
+
+
+def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:
+    stated = rx.settings.path_offset_m
+    return stated.radar if monostatic else stated.radar - stated.sidelink

@@ -1,0 +1,154 @@
+"""Which pulses of a pair have positions that can be trusted, and how well they are known."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.track_checks import CheckedTrack
+from apertura.pipeline.config import Node
+from apertura.pipeline.opening.node_log import NodeLog, Times
+
+_LINES = {
+    "fix_poor": "the log's solution is poorer than {asked}",
+    "track_gap": "no epochs",
+    "track_outlier": "outliers or steps of the log",
+    "track_frozen": "epochs that repeat the position before them",
+}
+"""Flag → what is wrong with the log there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What the logs say of a pair's pulses.
+
+    Attributes
+    ----------
+    good
+        (pulse,) bool, pulses that both nodes have a position for.
+    reasons
+        Cause → number of pulses left out by it, each counted once.
+    flags
+        Edge crossed → what was measured, in one line.
+    report
+        tx, rx → node, std_m, correlation_s, stated_by, interpolation_m; smoothing_residual_m, source and remarks of the
+        log where there are any.
+    """
+
+    good: NDArray[np.bool_]
+    reasons: dict[str, int]
+    flags: dict[str, str]
+    report: dict[str, dict[str, Any]]
+
+
+def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
+    """Return which pulses, at the transmitter's tags `at`, both logs of a pair give positions for.
+
+    Raises
+    ------
+    CampaignError
+        If none is left.
+    """
+    good, reasons, flags = np.ones(len(at), bool), dict[str, int](), dict[str, str]()
+    for node in {one.name: one for one in (tx, rx)}.values():
+        barred = node.checked.barred(node.log_seconds(at))
+        for name, line in _flags(node, at, barred).items():
+            flags[name] = f"{flags[name]}; {line}" if name in flags else line
+        for cause, out in barred.items():
+            reasons[cause] = reasons.get(cause, 0) + int((out & good).sum())
+            good &= ~out
+    if not good.any():
+        raise CampaignError(
+            f"no pulse has a position: {'; '.join(flags.values())}",
+            where=" and ".join(dict.fromkeys((tx.log, rx.log))),
+            expected="logs whose epochs are sound while there are pulses",
+            remedy="Correct the log, or allow poorer solutions by nodes.<node>.worst_fix.",
+        )
+    report = {
+        leg: position_error(node.track, node.settings, at[good])
+        | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
+        | _told(node)
+        for leg, node in (("tx", tx), ("rx", rx))
+    }
+    return Placed(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
+
+
+def _told(node: NodeLog) -> dict[str, Any]:
+    """Return what a person should know of how a log was read and smoothed, where there is something."""
+    told = {"smoothing_residual_m": node.smoothing_residual_m} | {
+        name: node.track.attrs.get(name) for name in ("source", "remarks")
+    }
+    return {name: value for name, value in told.items() if value is not None}
+
+
+def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
+    """Return what is known of the error of a node's positions at some pulses.
+
+    Returns
+    -------
+    dict
+        std_m: [north, east, up], metres, the median over the pulses of what the log states, else the config's, else
+        None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds; drift_m: of
+        a slow error.
+    """
+    if "position_std" in track:
+        epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
+        stated = track.position_std.values[epochs]
+        stated = stated[(stated > 0).all(axis=1)]
+        if len(stated):
+            return stated_error(settings) | {"std_m": np.median(stated, axis=0).tolist(), "stated_by": "log"}
+    return stated_error(settings)
+
+
+def stated_error(settings: Node) -> dict[str, Any]:
+    """Return what the config says of the error of a node's positions, as `position_error`."""
+    stated = settings.position_std_m
+    std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
+    stated_by = "nobody" if stated is None else "config"
+    return {
+        "std_m": std_m,
+        "correlation_s": settings.position_correlation_s,
+        "drift_m": settings.position_drift_m,
+        "stated_by": stated_by,
+    }
+
+
+def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
+    """Return what of a node's log touches its pulses: flag → one line."""
+    checked, lines = node.checked, {}
+    begin, end = node.log_seconds(at[[0, -1]]) + np.array([-1.0, 1.0]) * 2 * node.interval_s
+    for name, what in _LINES.items():
+        out = int(barred[name].sum()) if name in barred else 0
+        faults = [fault for fault in checked.faults.get(name, ()) if begin <= fault[0] <= end]
+        if not (out or faults):
+            continue
+        worst = f"; {len(faults)} found, worst {_worst(node, faults)}" if faults else ""
+        longest = _longest(node, checked, name) if out else ""
+        asked = what.format(asked=node.settings.poorest_fix)
+        lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {asked}{longest}{worst}"
+    if node.track.attrs["dropped"]:
+        counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
+        lines["track_epochs_dropped"] = f"{node.name}: epochs of the log left out: {counted}"
+    if "track_times" in checked.faults:
+        lines["track_times"] = (
+            f"{node.name}: times of the log are written so coarsely that positions err by "
+            f"{checked.faults['track_times'][0][1]:.2f} m along the flight"
+        )
+    return lines
+
+
+def _worst(node: NodeLog, faults: list[tuple[float, float]]) -> str:
+    time_s, size_m = faults[0]
+    return f"{size_m:.3f} m at {node.log_time(time_s)}" if size_m else f"at {node.log_time(time_s)}"
+
+
+def _longest(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
+    holes = [hole for hole in checked.holes if hole.cause == cause and np.isfinite(hole.end_s - hole.start_s)]
+    if not holes:
+        return " at an end of the log"
+    hole = max(holes, key=lambda one: one.end_s - one.start_s)
+    error = f", where a spline may err by {hole.size_m:.2f} m" if np.isfinite(hole.size_m) else ""
+    return f", longest {hole.end_s - hole.start_s:.2f} s at {node.log_time(hole.start_s)}{error}"

@@ -1,0 +1,22 @@
+"""What lies in raw/ of a campaign, read as its config says: flight logs and phase histories."""
+
+from typing import TYPE_CHECKING
+
+from apertura.formats.reading import read_phase_history, read_track
+from apertura.pipeline.campaign import Campaign
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def read_log(campaign: Campaign, flight: str, node: str) -> "xr.Dataset":
+    """Return the `track` stage of a node's flight log."""
+    options = campaign.settings.nodes[node].log.options
+    return read_track(campaign.track_file(flight, node), node=node, options=options)
+
+
+def read_history(campaign: Campaign, flight: str, node: str, *, pair: str) -> "xr.Dataset":
+    """Return the phase history that a node of a pair recorded, as its format and the config say."""
+    described = campaign.settings.waveform.model_dump()
+    files = campaign.history_files(flight, node)
+    return read_phase_history(described["format"], files, pair=pair, described=described)

@@ -1,0 +1,225 @@
+"""What may be wrong with a flight, as geometries to try: each suspicion with the echoes as they would be then."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.stages import aperture_of, phase_history_of
+from apertura.pipeline.opening.acquisition import Acquisition
+from apertura.pipeline.opening.node_log import Times
+
+MOST_PULSES = 512
+"""Pulses of a pair that suspicions are tried on, evenly spread."""
+
+_SHIFTS_S = (18.0, 37.0, 19.0, 17.0, 5.0, 3.0, 2.0, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
+_HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 2.0, 1.0, 0.5)
+_PREFIX_SAMPLES = (1, 2, 3, 5, 10, 20, 50)
+_TIME_SYSTEMS = {
+    18.0: ": GPST taken for UTC?",
+    -18.0: ": UTC taken for GPST?",
+    37.0: ": TAI taken for UTC?",
+    19.0: ": TAI taken for GPST?",
+}
+_RANGES_M = (0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
+_AXES = ("forward", "right", "down")
+_POINTS = ("radar_tx", "radar_rx", "sidelink")
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The echo of a pair with what its geometry was made from.
+
+    Attributes
+    ----------
+    pair
+        Its name.
+    history
+        Of some of its pulses.
+    time
+        (pulse,) datetime64[ns], their tags.
+    sidelink_m
+        (pulse,) float64, length of the sidelink that was put into the echo, metres; 0 without.
+    """
+
+    pair: str
+    history: PhaseHistory
+    time: Times
+    sidelink_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """One thing that may be wrong.
+
+    Attributes
+    ----------
+    what
+        Said of the campaign: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
+    kind
+        Short name.
+    histories
+        The echoes of the flight's pairs if it is true.
+    height_m
+        By which the ground is higher.
+    """
+
+    what: str
+    kind: str
+    histories: tuple[PhaseHistory, ...]
+    height_m: float = 0.0
+
+
+def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
+    """Return the echo of a pair, weighted by a window, as evidence; give it `some_pulses`."""
+    tx, rx = (nodes[name] for name in pair.split("-"))
+    time = echo.time.values
+    return Evidence(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
+
+
+def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> list[Evidence]:
+    """Return the same echoes with antennas, and sidelinks given back, where other logs of their nodes put them."""
+    moved = []
+    for one, history in zip(found, _flown(nodes, found), strict=True):
+        tx, rx = (nodes[name] for name in one.pair.split("-"))
+        moved.append(replace(one, history=history, sidelink_m=_sidelink_m(tx, rx, one.time)))
+    return moved
+
+
+def some_pulses(echo: xr.Dataset) -> slice:
+    """Return the pulses of an echo that suspicions are tried on."""
+    return aperture_of(echo).sample(MOST_PULSES)
+
+
+def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+    """Yield everything that is worth a try on a flight, the likeliest first; what its logs cannot tell is left out.
+
+    Parameters
+    ----------
+    nodes
+        Every node of the flight.
+    found
+        The echo of each pair.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Hypotheses".
+    """
+    yield from _shifted_logs(nodes, found)
+    yield from _other_arms(nodes, found)
+    yield from _swapped_tracks(nodes, found)
+    for height_m in (sign * size for size in _HEIGHTS_M for sign in (1, -1)):
+        what = f"the ground lies {height_m:+.1f} m from where the config has it: another datum?"
+        yield Suspicion(what, "height", tuple(one.history for one in found), height_m)
+    yield from _longer_paths(nodes, found)
+
+
+def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+    groups = [*((name,) for name in nodes), *([tuple(nodes)] if len(nodes) > 1 else [])]
+    for shift_s in (sign * size for size in _SHIFTS_S for sign in (-1, 1)):
+        for group in groups:
+            who = f"the log of {group[0]}" if len(group) == 1 else "all logs"
+            late = f"{abs(shift_s):.2f} s {'late' if shift_s > 0 else 'early'}{_TIME_SYSTEMS.get(shift_s, '')}"
+            histories = _flown(nodes, found, shift_s=dict.fromkeys(group, shift_s))
+            if histories:
+                yield Suspicion(f"the times of {who} are {late}", "time", histories)
+
+
+def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+    for name, node in nodes.items():
+        arms = {point: np.array(getattr(node.settings.lever_arms_m, point)) for point in _POINTS}
+        if not any(arm.any() for arm in arms.values()):
+            continue
+        for axis, word in enumerate(_AXES):
+            flip = np.where(np.arange(3) == axis, -1.0, 1.0)
+            if any(arm[axis] for arm in arms.values()):
+                turned = {point: tuple(arm * flip) for point, arm in arms.items()}
+                histories = _flown({**nodes, name: _with_arms(node, turned)}, found)
+                if histories:
+                    yield Suspicion(
+                        f"{word} axis of the lever arms of {name} has the other sign", "lever arm", histories
+                    )
+
+
+def _with_arms(node: Acquisition, arms: Mapping[str, tuple[float, ...]]) -> Acquisition:
+    lever_arms = node.settings.lever_arms_m.model_copy(update=dict(arms))
+    return replace(node, settings=node.settings.model_copy(update={"lever_arms_m": lever_arms}))
+
+
+def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+    names = list(nodes)
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            swapped = {
+                **nodes,
+                first: _placed(nodes[first], nodes[second]),
+                second: _placed(nodes[second], nodes[first]),
+            }
+            histories = _flown(swapped, found)
+            if histories:
+                yield Suspicion(f"the tracks of {first} and {second} are swapped", "tracks swapped", histories)
+
+
+def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
+    """Return a node at the positions of another, turned as its own log says."""
+    at = node.log_seconds(other.track.time.values)
+    own = node.log_seconds(node.track.time.values)
+    turned = np.unwrap(node.track.attitude.values, axis=0)
+    attitude = np.stack([np.interp(at, own, angle) for angle in turned.T], axis=-1)
+    return replace(node, track=other.track.assign(attitude=(("epoch", "axis"), attitude)))
+
+
+def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+    for place, one in enumerate(found):
+        tx, rx = one.pair.split("-")
+        cell_m = SPEED_OF_LIGHT_M_S / nodes[tx].numerology.sample_rate_hz
+        samples = [(count * cell_m, f"{count:+d} samples") for size in _PREFIX_SAMPLES for count in (size, -size)]
+        ranges = [(sign * size, "") for size in _RANGES_M for sign in (1, -1)]
+        for path_m, count in (*(samples if tx == rx else ()), *ranges):
+            what = f"paths of {one.pair} are {path_m:+.2f} m off"
+            begin = "the prefix" if nodes[tx].numerology.prefix_samples else "where waveform.lead_s says"
+            what = f"{what}: captures begin {count} from {begin}?" if count else f"{what}: a path offset?"
+            histories = [other.history for other in found]
+            histories[place] = _delayed(one.history, -path_m)
+            yield Suspicion(what, "prefix" if count else "range", tuple(histories))
+
+
+def _flown(
+    nodes: Mapping[str, Acquisition], found: Sequence[Evidence], *, shift_s: Mapping[str, float] | None = None
+) -> tuple[PhaseHistory, ...]:
+    """Return the echoes with antennas where other logs, arms or times put them; nothing where a log does not reach."""
+    histories = []
+    for one in found:
+        tx, rx = (nodes[name] for name in one.pair.split("-"))
+        at = [one.time + _span((shift_s or {}).get(node.name, 0.0)) for node in (tx, rx)]
+        try:
+            aperture = Aperture(tx.antenna("radar_tx", at[0]), rx.antenna("radar_rx", at[1]))
+            length_m = _sidelink_m(tx, rx, *at)
+        except CampaignError:
+            return ()
+        moved = replace(one.history, aperture=aperture)
+        histories.append(_delayed(moved, length_m - one.sidelink_m))
+    return tuple(histories)
+
+
+def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times | None = None) -> NDArray[np.float64]:
+    if tx.name == rx.name:
+        return np.zeros(len(tx_at))
+    ends = tx.antenna("sidelink", tx_at), rx.antenna("sidelink", tx_at if rx_at is None else rx_at)
+    return np.asarray(np.linalg.norm(ends[0] - ends[1], axis=1))
+
+
+def _delayed(history: PhaseHistory, path_m: Any) -> PhaseHistory:
+    """Return an echo whose paths are longer than they were taken for."""
+    return replace(history, reference_delay_s=history.reference_delay_s + path_m / SPEED_OF_LIGHT_M_S)
+
+
+def _span(seconds: float) -> np.timedelta64:
+    return np.timedelta64(round(seconds * 1e9), "ns")

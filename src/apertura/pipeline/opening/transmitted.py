@@ -1,0 +1,216 @@
+"""What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
+from apertura.core.echo.framing import Framing
+from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
+from apertura.formats.npy import read_npy
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
+
+MOST_SYMBOLS = 1 << 24
+"""Code symbols of a waveform."""
+
+MOST_PULSE_SAMPLES = 1 << 22
+"""Of a pulse, and of a capture."""
+
+MOST_CHIPS = 1 << 20
+"""Chips of a preamble."""
+
+MOST_LEAD_SAMPLES = 1 << 26
+"""Samples before a symbol."""
+
+_FEWEST_BINS = 16  # of a band
+_LEAST_INSIDE = 0.01  # of the pulse's energy, in the band
+
+
+@dataclass(frozen=True, eq=False)
+class Transmitted:
+    """What was sent, as the road of an echo takes it: whatever the kind of waveform, nothing after it asks for more.
+
+    Attributes
+    ----------
+    waveform
+        As the config states it.
+    numerology
+        Grid of the frequencies that echoes are measured at.
+    inverse
+        (subcarrier,) complex64 that takes what was sent out of an echo.
+    report, flags
+        What was decided of it, and edges crossed.
+    """
+
+    waveform: SampledWaveform
+    numerology: Numerology
+    inverse: NDArray[np.complex64]
+    report: dict[str, Any] = field(default_factory=dict)
+    flags: dict[str, str] = field(default_factory=dict)
+
+
+def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
+    """Return what was transmitted, as a waveform says it of the campaign's file.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, or not what the waveform says.
+    """
+    if isinstance(waveform, OfdmWaveform):
+        inverse = 1 / read_codes(campaign.sent_file, waveform.subcarriers)
+        return Transmitted(waveform, symbol_numerology(waveform), inverse)
+    if isinstance(waveform, PulseWaveform):
+        return _pulse_sent(campaign.sent_file, waveform)
+    raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
+
+
+def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
+    """Return how receivers sample an OFDM symbol."""
+    return Numerology(
+        waveform.carrier_hz,
+        waveform.sample_rate_hz,
+        subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is),
+        prefix_samples=waveform.prefix_samples,
+        dft_samples=waveform.dft_samples,
+    )
+
+
+def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
+    """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
+    length = waveform.capture_samples
+    lead = waveform.lead_s * waveform.sample_rate_hz
+    spectrum = pulse_spectrum(read_pulse(path, waveform), lead=lead, length=length)
+    power = np.abs(spectrum) ** 2
+    if waveform.band_hz is None:
+        first, last = occupied_band(power)
+    else:
+        spacing_hz = waveform.sample_rate_hz / length
+        first = int(np.ceil(waveform.band_hz[0] / spacing_hz - 1e-6))
+        last = min(int(np.floor(waveform.band_hz[1] / spacing_hz + 1e-6)), first + length - 1)
+    numbers = np.arange(first, last + 1)
+    inside = float(power[numbers % length].sum() / power.sum())
+    if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
+        raise CampaignError(
+            f"{max(numbers.size, 0)} bins of {waveform.sample_rate_hz / length:g} Hz hold {inside:.2g} of its energy",
+            where=path,
+            expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
+            remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
+        )
+    chosen = pulse_filter(spectrum[numbers % length], asked=waveform.filter)
+    longest = length - round((waveform.lead_s + waveform.pulse_s) * waveform.sample_rate_hz)
+    numerology = Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, 0, length, longest)
+    band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
+    report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
+    return Transmitted(waveform, numerology, chosen.inverse, report, chosen.flags)
+
+
+def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
+    """Return a transmitted pulse, (sample,) complex128.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, is not as long as waveform.pulse_s, silent, or not finite.
+    """
+    count = round(waveform.pulse_s * waveform.sample_rate_hz)
+    expected = f"({count},) complex or ({count}, 2) integers, as {CONFIG}: waveform.pulse_s times sample_rate_hz"
+    remedy = "Use the samples that were transmitted, or correct the waveform."
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+    stored = read_npy(path, kinds="ci", most=2 * MOST_PULSE_SAMPLES, expected=expected, remedy=remedy)
+    if waveform.capture_samples > MOST_PULSE_SAMPLES:
+        raise CampaignError(
+            f"captures of {waveform.capture_samples} samples",
+            where=f"{CONFIG}: waveform",
+            expected=f"no more than {MOST_PULSE_SAMPLES} in lead_s, pulse_s and listen_s",
+            remedy="Shorten listen_s to the longest delay of the scene.",
+        )
+    pairs = stored.dtype.kind == "i" and stored.shape == (count, 2)
+    if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
+        raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+        pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
+        level = np.abs(pulse)
+    lost = int((~np.isfinite(level)).sum())
+    if lost or not level.max() > 0:
+        found = f"{lost} samples that are no number" if lost else "silence: every sample is zero"
+        raise CampaignError(found, where=path, expected=expected, remedy=remedy)
+    return np.asarray(pulse / level.max(), np.complex128)
+
+
+def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
+    """Return the transmitted code symbols, (subcarrier,) complex64.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, of another length, or a symbol is zero or not finite.
+    """
+    expected = f"({subcarriers},) complex64 without zeros, as config/config.yaml: waveform.subcarriers"
+    remedy = "Use the codes that were transmitted, or correct the waveform."
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+    stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+        codes = stored.astype(np.complex64)
+        zeros = int((codes == 0).sum())
+    usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
+    if not usable:
+        raise CampaignError(
+            f"{stored.dtype} of shape {codes.shape}, {zeros} of them zero, "
+            f"{int((~np.isfinite(codes)).sum())} not finite",
+            where=path,
+            expected=expected,
+            remedy=remedy,
+        )
+    return codes
+
+
+def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> Framing:
+    """Return what was sent before each symbol.
+
+    Parameters
+    ----------
+    path
+        .npy file of the preamble's chips, ±1.
+    described
+        The recorder's apertura:framing.
+    sample_rate_hz
+        Complex samples per second.
+    where
+        The file that describes it, for messages.
+
+    Raises
+    ------
+    CampaignError
+        If the preamble is missing, is not chips of ±1, or takes longer than any pulse.
+    """
+    if not path.is_file():
+        raise CampaignError(
+            "no such file",
+            where=path,
+            expected=f"the preamble that {where.name}: apertura:framing names",
+            remedy="Copy it there.",
+        )
+    expected = f"one dimension of chips +1 and -1, no more than {MOST_CHIPS}"
+    chips = read_npy(path, kinds="if", most=MOST_CHIPS, expected=expected, remedy="Save the preamble that was sent.")
+    if chips.ndim != 1 or not chips.size or not np.isin(chips, (-1, 1)).all():
+        found = f"{chips.dtype} of shape {chips.shape}, {int((~np.isin(chips, (-1, 1))).sum())} neither 1 nor -1"
+        raise CampaignError(found, where=path, expected=expected, remedy="Save the preamble that was sent.")
+    keys = ("chip_samples", "centre_hz", "counter_bits", "bit_chips", "guard_samples")
+    framing = Framing(chips.astype(np.int64), sample_rate_hz=sample_rate_hz, **{key: described[key] for key in keys})
+    if framing.lead_samples > MOST_LEAD_SAMPLES:
+        raise CampaignError(
+            f"{framing.lead_samples} samples of preamble, counter and guard before each symbol",
+            where=where,
+            expected=f"no more than {MOST_LEAD_SAMPLES}",
+            remedy="Correct apertura:framing.",
+        )
+    return framing

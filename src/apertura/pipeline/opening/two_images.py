@@ -1,0 +1,142 @@
+"""Two images of a campaign, opened to be compared in phase: what each pixel's pulses make of a height."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.common.errors import CampaignError
+from apertura.core.imaging.stages import aperture_of
+from apertura.core.scene.looks import Looks
+from apertura.methods.interferometry.comparison import Ground
+from apertura.methods.interferometry.level import Known
+from apertura.methods.interferometry.sensitivity import Legs, Sensitivity, sensitivity
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import CONFIG
+from apertura.pipeline.opening.layer import opened_layer
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.scene import OpenScene
+from apertura.pipeline.store import open_stage
+
+_SAME = 1e-6  # share by which two bands may differ
+
+
+@dataclass(frozen=True, eq=False)
+class TwoImages:
+    """Two images, and what both assume of the ground.
+
+    Attributes
+    ----------
+    names
+        flight/pair of each.
+    images
+        Their stages.
+    ground
+        Of each pixel of the grid.
+    """
+
+    names: tuple[str, str]
+    images: tuple[xr.Dataset, xr.Dataset]
+    ground: Ground
+
+
+def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
+    """Return the two images of an interferogram.
+
+    Parameters
+    ----------
+    campaign, scene
+        Settings, grid and ground.
+    name
+        A key of `interferometry.pairs`.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such key, or the two images are of other frequencies.
+    """
+    asked = campaign.settings.interferometry
+    if name not in asked.pairs:
+        expected = f"one of {', '.join(asked.pairs) or 'none: no two images are named'}"
+        raise CampaignError(f"no interferogram {name!r}", f"{CONFIG}: interferometry.pairs", expected, "Name it there.")
+    images = asked.images(name)
+    bands, legs, looks = [], [], []
+    for flight, pair in images:
+        echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+        opened = open_pair(campaign, flight, pair, echo=echo)
+        bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
+        looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
+        legs.append(_legs(looks[-1]))
+    if not np.allclose(bands[0], bands[1], rtol=_SAME, atol=0):
+        found = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
+        where = f"{CONFIG}: interferometry.pairs.{name}"
+        raise CampaignError(f"images of {found}", where, "two images of one band", "Name two of one band.")
+    first, second = ("/".join(image) for image in images)
+    stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
+    sensed = _sensed(scene, looks[0], legs, bands[0])
+    plain = np.logical_and(*(_plain(campaign, *image) for image in images))
+    return TwoImages((first, second), (stages[0], stages[1]), _ground(campaign, scene, sensed, plain))
+
+
+def _legs(looks: Looks) -> Legs:
+    """Return where some of the pulses of each node of the lattice were sent from and received, (node, pulse, 3)."""
+    pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
+    tx, rx = (leg[pulses] for leg in looks.aperture.legs)
+    return tx, rx
+
+
+def _sensed(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
+    """Return the answer to height at every pixel: told at the nodes of the lattice, between them bilinear."""
+    lattice, grid = looks.lattice, scene.grid
+    rows, columns = np.meshgrid(*lattice.nodes, indexing="ij")
+    places = scene.terrain.positions_at(grid, rows, columns).reshape(-1, 3)
+    at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz)
+    whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))
+
+    def between(name: str) -> NDArray[np.float64]:
+        values = getattr(at_nodes, name)
+        return lattice.between(values.reshape(*lattice.shape, *values.shape[1:]), whole)
+
+    return Sensitivity(**{name: between(name) for name in ("slope", "bend", "shift", "overlap", "range_m")})
+
+
+def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
+    """Return which pixels a pair sees without shadow or layover."""
+    with opened_layer(campaign, flight, pair, "mask.tif") as raster:
+        plain: NDArray[np.bool_] = raster.read(1) == 0
+    return plain
+
+
+def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, plain: NDArray[np.bool_]) -> Ground:
+    """Return what is assumed of the ground, and the points of known height as the images show them."""
+    height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
+    shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
+    points = [point.model_dump() for point in campaign.settings.scene.reference_points]
+    known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
+    return Ground(height_m, plain, sensed, shift_px, known)
+
+
+def _shown(
+    point: Mapping[str, Any],
+    scene: OpenScene,
+    sensed: Sensitivity,
+    height_m: NDArray[np.float64],
+    shift_px: NDArray[np.float64],
+) -> Known | None:
+    """Return the pixel that shows a point, and the phase that its height makes there; None beside the grid."""
+    x_m, y_m, z_m = point["position_m"]
+    place = np.array(scene.grid.pixel_of(x_m, y_m))
+    pixel = np.round(place).astype(int)
+    for _ in range(5):  # it shows where its own height moves it
+        if not ((pixel >= 0) & (pixel < scene.grid.shape)).all():
+            return None
+        row, column = pixel
+        rise = z_m - height_m[row, column]
+        pixel = np.round(place - shift_px[row, column] * rise).astype(int)
+    phase = sensed.slope[row, column] * rise + sensed.bend[row, column] * rise**2
+    return Known(point["name"], int(row), int(column), float(phase))

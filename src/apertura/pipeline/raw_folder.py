@@ -1,0 +1,101 @@
+"""raw/ of a campaign folder: which file holds what, by the names of flights and nodes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.formats.names import PHASE_HISTORIES, log_suffixes, recording_files
+from apertura.pipeline.config import FLIGHTS, SampledWaveform, Settings
+
+
+@dataclass(frozen=True)
+class RawFolder:
+    """What lies in raw/ of a campaign.
+
+    Attributes
+    ----------
+    root
+        The campaign folder.
+    settings
+        Its config.
+    """
+
+    root: Path
+    settings: Settings
+
+    def raw_files(self, flight: str, node: str) -> dict[str, Path]:
+        """Return role → file of everything recorded by `node` in `flight`."""
+        if isinstance(self.settings.waveform, SampledWaveform):
+            recorded = {path.suffix: path for path in self.recording_files(flight, node)}
+            return {**recorded, "track": self.track_file(flight, node)}
+        folder = self.flight_folder(flight)
+        files = self.history_files(flight, node)
+        history = {f"history.{path.relative_to(folder).as_posix()}": path for path in files}
+        return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
+
+    def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
+        """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
+        files = recording_files(self.flight_folder(flight), node)
+        return tuple(self._raw_file(flight, node, path.name) for path in files)
+
+    def history_files(self, flight: str, node: str) -> list[Path]:
+        """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
+        suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
+        folder = self.flight_folder(flight)
+        named = [path for path in sorted(folder.glob(f"{node}*{suffix}")) if path.name[len(node)] == "."]
+        found = [file for path in named if not _is_log(path, node) for file in _files(path)]
+        own = [path.relative_to(folder).as_posix() for path in found]
+        if not own:
+            raise CampaignError(
+                "no such file",
+                where=folder / f"{node}.*{suffix}",
+                expected=f"the phase history of node {node} in flight {flight}",
+                remedy=f"Copy the {suffix} files there, named <node>{suffix} or <node>.<anything>{suffix}.",
+            )
+        return [self._recorded(flight, name) for name in own]
+
+    def logged(self, flight: str, node: str) -> bool:
+        """Return whether a flight log of a node lies there."""
+        return any((self.flight_folder(flight)).glob(f"{node}.track.*"))
+
+    def track_file(self, flight: str, node: str) -> Path:
+        """Return the one raw/<flight>/<node>.track.* file."""
+        logs = sorted((self.flight_folder(flight)).glob(f"{node}.track.*"))
+        if len(logs) == 1:
+            return self._recorded(flight, logs[0].name)
+        raise CampaignError(
+            f"{len(logs)} track files {[path.name for path in logs]}",
+            where=self.flight_folder(flight) / f"{node}.track.*",
+            expected=f"exactly one flight log of node {node}",
+            remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
+        )
+
+    def flight_folder(self, flight: str) -> Path:
+        """Return raw/<flight>, which is no link: not even its names are read through one."""
+        return inside(self.root, f"raw/{flight}", where=self.root)
+
+    def _recorded(self, flight: str, name: str) -> Path:
+        return inside(self.root, f"raw/{flight}/{name}", where=self.root)
+
+    def _raw_file(self, flight: str, node: str, name: str) -> Path:
+        """Return raw/<flight>/<name>, which must exist."""
+        path = self._recorded(flight, name)
+        if not path.is_file():
+            raise CampaignError(
+                "no such file",
+                where=path,
+                expected=f"the recording of node {node} in flight {flight}",
+                remedy=f"Copy it there, or take {node} out of the nodes of {flight} in {FLIGHTS}.",
+            )
+        return path
+
+
+def _is_log(path: Path, node: str) -> bool:
+    return path.name.startswith(f"{node}.track.")
+
+
+def _files(path: Path) -> list[Path]:
+    """Return a file itself, or those of a folder; links are among them, to be refused."""
+    inside_it = sorted(path.rglob("*")) if path.is_dir() and not path.is_symlink() else [path]
+    return [file for file in inside_it if file.is_symlink() or not file.is_dir()]

@@ -1,0 +1,203 @@
+"""What a run shows: a line for each step that ends, and on a terminal bars for those under way."""
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO
+
+from apertura.common.errors import shown
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.runs.expectation import Outlook, Told
+from apertura.pipeline.runs.journal import Job, Run
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+NOTHING = "Nothing to be done: every result is there, and up to date."
+
+_MOST_BARS = 12
+_MARGIN = 3  # a terminal shows ^C behind the last line, which must not break there
+
+
+def span(seconds: float) -> str:
+    """Return a time as people say it.
+
+    Examples
+    --------
+    >>> span(0.24), span(8.3), span(75), span(4000), span(90000)
+    ('0.2 s', '8.3 s', '1 min 15 s', '1 h 06 min', '25 h 00 min')
+    """
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    return f"{whole // 60} min {whole % 60:02} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60:02} min"
+
+
+def about(seconds: float) -> str:
+    """Return a time that is only expected, as coarsely as it is known.
+
+    Examples
+    --------
+    >>> about(0.3), about(44), about(100), about(3000), about(9000)
+    ('1 s', '45 s', '2 min', '50 min', '2.5 h')
+    """
+    if seconds < 10:
+        return f"{max(1, round(seconds))} s"
+    if seconds < 90:
+        return f"{5 * round(seconds / 5)} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A line with a bar: what it is of, how far, and the seconds left."""
+
+    name: str
+    told: str
+    fraction: float
+    left_s: float
+
+    @property
+    def left(self) -> str:
+        """The time left, in words."""
+        return f"about {about(self.left_s)} left"
+
+
+def bars(campaign: Campaign, run: Run, outlook: Outlook) -> list[Bar]:
+    """Return a bar for each job under way, the oldest first, and in the end one of the whole run."""
+    now_s = time.time()
+    told = {number: Told.by(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
+    left = outlook.of_jobs(run, now_s, told)
+    steps = [_bar(job, told.get(number), left[number], now_s) for number, job in _running(run).items()]
+    done = len(run.finished) + sum(bar.fraction for bar in steps)
+    whole = Bar(f"{len(run.finished)} of {run.total} steps", "", done / max(run.total, 1), outlook.of_run(run, left))
+    return [*steps, whole]
+
+
+def _running(run: Run) -> dict[int, Job]:
+    return {number: job for number, job in run.jobs.items() if job.running}
+
+
+def _bar(job: Job, told: Told | None, left_s: float, now_s: float) -> Bar:
+    if told:
+        return Bar(job.name, f"{told.done} of {told.total} {told.what}", told.done / told.total, left_s)
+    passed = max(job.seconds(now_s), 0.0)
+    return Bar(job.name, "", min(passed / max(passed + left_s, 0.1), 0.95), left_s)
+
+
+def table(rows: list[Bar]) -> "Table":
+    """Return bars as a table for a terminal, as wide as that is."""
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(expand=True, padding=(0, 2, 0, 0))
+    grid.add_column(no_wrap=True, overflow="ellipsis", max_width=40)
+    grid.add_column(ratio=1, min_width=8)
+    grid.add_column(no_wrap=True, justify="right")
+    grid.add_column(no_wrap=True, justify="right", min_width=len("about 2.5 h left"))
+    *steps, whole = rows
+    for row in steps[:_MOST_BARS]:
+        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
+    if len(steps) > _MOST_BARS:
+        grid.add_row(Text(f"{'':8}and {len(steps) - _MOST_BARS} more", style="dim"))
+    grid.add_row(Text(whole.name, style="bold"), ProgressBar(1.0, whole.fraction), "", Text(whole.left, style="bold"))
+    return grid
+
+
+class Screen:
+    """Shows a run while it goes on: leave it with `with`, also by an error, and the terminal is as it was.
+
+    Parameters
+    ----------
+    campaign, outlook
+        Whose run, and how long it will take.
+    quiet
+        Show nothing.
+    stream
+        Where to; bars where it is a terminal, plain lines elsewhere.
+    """
+
+    def __init__(
+        self, campaign: Campaign, outlook: Outlook, *, quiet: bool = False, stream: TextIO | None = None
+    ) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._campaign, self._outlook, self._quiet = campaign, outlook, quiet
+        self._stream = stream or sys.stderr
+        self._told: dict[tuple[int, float], bool] = {}
+        console = Console(file=self._stream, highlight=False)
+        moving = not quiet and self._stream.isatty() and not console.is_dumb_terminal
+        self._live = Live(console=console, auto_refresh=False, transient=True) if moving else None
+
+    def __enter__(self) -> "Screen":
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def update(self, run: Run) -> None:
+        """Show what is new."""
+        whole: Bar | None = None  # of many jobs; the same for all that have ended since
+        for number, job in [] if self._quiet else run.jobs.items():
+            told = self._told.get((number, job.begun_s))  # a job that is tried again begins anew
+            if told is None and not self._live:
+                self._line(f"{_clock(job.begun_s)}  begun   {job.name}")
+            if not told and not job.running:
+                whole = whole or (None if self._live else bars(self._campaign, run, self._outlook)[-1])
+                self._ended(job, whole)
+            self._told[number, job.begun_s] = not job.running
+        if self._live:
+            from rich.constrain import Constrain
+
+            rows = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
+            self._live.update(Constrain(rows, self._live.console.width - _MARGIN), refresh=True)
+
+    def ended(self, run: Run) -> None:
+        """Say that all is done."""
+        done = f"{run.total} steps done in {span((run.ended_s or time.time()) - run.begun_s)}"
+        self._line(done if run.planned else NOTHING)
+
+    def _ended(self, job: Job, whole: Bar | None) -> None:
+        word = "failed" if job.failed else "done"
+        if self._live:
+            self._live.console.print(_line(word, job))
+        elif whole:
+            left = f", {whole.left}" if not job.failed and whole.fraction < 1 else ""
+            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {whole.name}{left}")
+
+    def _line(self, line: str) -> None:
+        if not self._quiet:
+            print(line, file=self._stream, flush=True)
+
+
+def _line(word: str, job: Job) -> "Table":
+    """Return the line of a job that has ended, for a terminal."""
+    from rich.table import Table
+    from rich.text import Text
+
+    line = Table.grid(expand=True)
+    line.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
+    line.add_column(no_wrap=True, justify="right")
+    line.add_row(Text.assemble((f"{word:8}", "red" if job.failed else "green"), job.name), span(job.seconds()))
+    return line
+
+
+def listed(counts: Mapping[str, int]) -> str:
+    """Return rules and how many jobs each has.
+
+    Examples
+    --------
+    >>> listed({"ingest": 2, "scene": 1})
+    '2 ingest, 1 scene'
+    """
+    return ", ".join(f"{count} {shown(rule)}" for rule, count in counts.items())
+
+
+def _clock(at_s: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at_s))

@@ -1,0 +1,48 @@
+"""Rule `echo`: recordings and tracks of a pair become calibrated transfer functions and phase centres."""
+
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from apertura.common.provenance import merged
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.acquisition import open_acquisition
+from apertura.pipeline.opening.echo import PairEcho, pair_echo
+from apertura.pipeline.opening.recorded import recorded_echo
+from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.steps.calibration import calibrated, calibration_spec
+from apertura.pipeline.steps.stamping import stamped
+from apertura.pipeline.store import finish, write_blocks, writing
+
+
+def echo(campaign: Campaign, flight: str, pair: str) -> Path:
+    """Write results/<flight>/<pair>/echo.zarr."""
+    lineage = result_of(campaign, "echo", flight, pair).begin(campaign.root)
+    waveform = campaign.settings.waveform
+    parents: list[xr.Dataset] = []
+    calibration = calibrated(campaign, flight, pair)
+    if not isinstance(waveform, SampledWaveform):
+        files = [campaign.root / name for name in lineage.result.sources]
+        formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
+    else:
+        files = [campaign.sent_file]
+        sent = transmitted(campaign, waveform)
+        tx, rx = pair.split("-")
+        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
+        parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
+        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration)
+    formed = formed.within(campaign, flight, pair)
+    inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
+    if calibration:
+        inputs = merged(inputs, calibration["inputs"])
+    relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
+    folder = campaign.stage("echo", flight, pair)
+    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
+    stage = stamped(formed.promised, "echo", **how)
+    with writing(folder) as wip:
+        write_blocks(wip, stage, "transfer", formed.blocks())
+        finish(wip, folder, lineage=lineage, flags={**stage.attrs["flags"], **formed.saturation.flags})
+    return folder

@@ -1,0 +1,179 @@
+"""Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from apertura.common.atomic import write_json
+from apertura.common.contracts import Window
+from apertura.core.focus.engines import instruction_set
+from apertura.core.focus.tiles import compute_tiles
+from apertura.core.imaging.certify import certified, measures
+from apertura.core.imaging.focus_check import focus_flags, focus_report
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.view import view_report
+from apertura.core.quality.budget import expected
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.antennas import antennas_report, pattern_digests
+from apertura.pipeline.opening.budget import arithmetic_line, budget_of
+from apertura.pipeline.opening.pair import OpenPair, open_pair
+from apertura.pipeline.opening.plan import plan_pair
+from apertura.pipeline.opening.refined import RefinedTrack, open_refined
+from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.steps.stamping import stamped
+from apertura.pipeline.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
+
+_MISSING = np.complex64(complex(np.nan, np.nan))
+"""What a tile that no pulse sees reads as; it is not stored."""
+
+_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
+
+
+def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
+    """Write results/<flight>/<pair>/image.zarr.
+
+    Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
+    """
+    lineage = result_of(campaign, "image", flight, pair).begin(campaign.root)
+    work = _open(campaign, flight, pair, threads=threads)
+    folder, echo, plan = work.folder, work.echo, work.formation.plan
+    with writing(folder) as wip:
+        missing = resume(wip, work.empty, "image", work.formation.windows)
+        target = open_array(wip, "image")
+        work.compute(missing, target)
+        budget = budget_of(campaign, work.pair, work.scene)
+        quality = {
+            "engine": plan.engine,
+            "instruction_set": instruction_set(plan.engine),
+            "models": plan.reasons,
+            "predicted_error_db": round(plan.predicted_error_db, 2),
+            **certified(
+                work.formation,
+                target,
+                accuracy_db=plan.accuracy_db,
+                threads=threads,
+                scheduler=work.scheduler,
+                rewriting=partial(mark_rewritten, wip, "image", work.formation.windows),
+            ),
+            **measures(work.formation, target),
+            **{name: echo.attrs[name] for name in _QUOTED if name in echo.attrs},
+            **work.scene.report,
+            **antennas_report(campaign, pair, plan.illumination),
+            **work.report,
+            "view": view_report(work.formation, work.pair.began, work.pair.time_s),
+            "autofocus": work.track.report(pair),
+        }
+        lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
+        focus = focus_report(work.formation, target)
+        quality |= {"focus": focus, "budget": [line.report for line in lines]}
+        expected_db = expected(lines).loss_db
+        focus["expected_db"] = round(expected_db, 3)
+        flags = {**echo.attrs["flags"], **work.track.stage.attrs["flags"], **plan.flags, **quality["flags"]}
+        quality["flags"] = {**flags, **focus_flags(focus, expected_db)}
+        finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
+    return folder
+
+
+def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: int = 1) -> Path:
+    """Form one job's share of a pair's tiles for `image` to finish; write results/<flight>/<pair>/tiles/<share>.json.
+
+    Parameters
+    ----------
+    campaign, flight, pair
+        Which image.
+    share
+        '2-of-8': every eighth tile, from the second on.
+    threads
+        Tiles in work at once.
+
+    Raises
+    ------
+    ValueError
+        If `share` is no such share.
+    """
+    number, jobs = (int(part) for part in share.split("-of-"))
+    if not 1 <= number <= jobs:
+        raise ValueError(f"{share=}: must be one of 1-of-{jobs} to {jobs}-of-{jobs}")
+    work = _open(campaign, flight, pair, threads=threads)
+    windows = work.formation.windows
+    mine = windows[number - 1 :: jobs]
+    with sharing(work.folder, work.empty, "image", windows) as (wip, missing):
+        todo = [window for window in mine if window in missing]
+        if todo:
+            work.compute(todo, open_array(wip, "image"))
+    receipt = work.folder.with_name("tiles") / f"{share}.json"
+    write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.formation.plan.setting.line})
+    return receipt
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What both rules open: where the stage goes, what it quotes, what forms it."""
+
+    folder: Path
+    echo: xr.Dataset
+    track: RefinedTrack
+    pair: OpenPair
+    scene: OpenScene
+    formation: Formation
+    empty: xr.Dataset
+    threads: int
+    scheduler: str
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What image.json says of which pulses and which tiles count."""
+        integration, formation = self.formation.plan.integration, self.formation
+        empty = 1 - len(formation.windows) / len(formation.tiles)
+        tiles = {"tiles": {"formed": len(formation.windows), "empty_share": round(empty, 6)}}
+        return (
+            tiles
+            if integration is None
+            else {**tiles, "integration": {"chosen": integration.value, **integration.report}}
+        )
+
+    def compute(self, windows: list[Window], target: Any) -> None:
+        """Compute some tiles as planned."""
+        line = self.formation.plan.setting.line
+        print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
+        if windows:
+            image = self.formation.image
+            compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)
+        if ways := self.formation.ways:
+            went = ", ".join(f"{100 * count / ways.total():.3g} % {way}" for way, count in ways.items())
+            print(f"of pixels × pulses went {went}", flush=True)
+
+
+def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
+    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
+    track = open_refined(campaign, flight)
+    opened, profiles = track.pair(logged), track.profiles(logged, profiles_of(profile, lazy=True))
+    if opened.history is None:
+        raise TypeError("an open echo stage holds a phase history")
+    plan = plan_pair(campaign, opened, scene, threads=threads)
+    plan = replace(plan, decisions=(*plan.decisions, *track.decisions))
+    formation = Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px)
+    # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
+    choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
+    empty = stamped(
+        xr.Dataset(
+            {"image": (("y", "x"), np.broadcast_to(_MISSING, scene.grid.shape))},
+            coords=scene.grid.coordinates,
+            attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
+        ),
+        "image",
+        modules=result_of(campaign, "image", flight, pair).modules,
+        parents=[echo, profile, track.stage, *scene.parents],
+        inputs=pattern_digests(campaign, pair),
+        settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
+    )
+    scheduler = campaign.settings.processing.scheduler
+    folder = campaign.stage("image", flight, pair)
+    return _Work(folder, echo, track, opened, scene, formation, empty, threads, scheduler)

@@ -1,0 +1,170 @@
+"""Rule `layers`: how a pair sees the scene, as GeoTIFFs on the campaign's grid: angles, mask, looks and noise."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio import Affine
+
+from apertura.common.contracts import Window
+from apertura.common.provenance import Provenance
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.inputs import Profiles
+from apertura.core.imaging.noise import PLACES, noise_power
+from apertura.core.imaging.stages import profiles_of
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.lattice import BLOCK_PX
+from apertura.core.scene.looks import Looks
+from apertura.core.scene.terrain import FlatGround, Terrain
+from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.formats.export import write_exports
+from apertura.formats.export.layers import OUTSIDE
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.antennas import pattern_digests
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.steps.stamping import tags_of
+from apertura.pipeline.store import open_stage, record_files
+
+
+def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
+    """Write incidence, bistatic angle, mask, looks and noise of one pair; return their paths."""
+    lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
+    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
+    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
+    looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
+    noise = _noise(profiles, scene, beams)
+    origin = Provenance.of(
+        lineage.modules,
+        [echo, profile, *scene.parents],
+        settings={**campaign.relevant("layers", pair), **scene.spec},
+        inputs=pattern_digests(campaign, pair) | scene.inputs,
+    )
+    rasters = _rasters(scene, looks, noise, threads=threads)
+    written = write_exports(
+        "layers",
+        campaign.result(flight, pair),
+        rasters,
+        titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
+        tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+        transform=Affine(*scene.grid.transform),
+        crs=scene.grid.crs_wkt,
+    )
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
+    """Return the noise of one pulse, measured at random places of the scene."""
+    rows, columns = np.random.default_rng(0).integers(0, scene.grid.shape, (PLACES, 2)).T
+    return noise_power(profiles, scene.terrain.positions_at(scene.grid, rows, columns), beams=beams)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A raster whose blocks are computed when they are read: tiles of them, by some threads.
+
+    Attributes
+    ----------
+    grid
+        Its pixels.
+    dtype
+        Of the values.
+    of
+        Window of the grid → values (row, column).
+    threads
+        Tiles computed at once.
+    """
+
+    grid: SceneGrid
+    dtype: type[np.generic]
+    of: Callable[[Window], NDArray[Any]]
+    threads: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.grid.shape
+
+    def __getitem__(self, block: Window) -> NDArray[Any]:
+        """Return the values of a block of rows and columns."""
+        part = self.grid[block]
+        values = np.empty(part.shape, self.dtype)
+
+        def work(tile: Window) -> None:
+            rows, columns = (slice(at.start + by, at.stop + by) for at, by in zip(tile, part.first, strict=True))
+            values[tile] = self.of((rows, columns))
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, part.tiles(BLOCK_PX)))
+        return values
+
+
+def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, Layer]:
+    """Return the layers; `noise` is that of one pulse."""
+    grid, terrain = scene.grid, scene.terrain
+
+    def incidence(window: Window) -> NDArray[np.float64]:
+        return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
+
+    def bistatic_angle(window: Window) -> NDArray[np.float64]:
+        angle_deg = bistatic_angle_deg(terrain.positions(grid[window]), *looks.centre(window))
+        return _inside(looks, window, angle_deg)
+
+    def nesz(window: Window) -> NDArray[np.float64]:
+        effective = looks.effective(window).astype(np.float64)
+        return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
+
+    return {
+        "incidence": Layer(grid, np.float32, incidence, threads),
+        "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
+        "mask": Layer(grid, np.uint8, _mask(scene, looks), threads),
+        "looks": Layer(grid, np.float32, looks.effective, threads),
+        "nesz": Layer(grid, np.float32, nesz, threads),
+    }
+
+
+def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.where(looks.seen(window), values, np.nan)
+
+
+def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
+    """Return what marks the pixels of a window, each by the pulses that make the lattice's node nearest to it."""
+    level = isinstance(scene.terrain, FlatGround)
+    relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+
+    def mask(window: Window) -> NDArray[np.uint8]:
+        seen = looks.seen(window)
+        marked = np.where(seen, 0, OUTSIDE).astype(np.uint8)
+        if relief is None or not seen.any():
+            return marked
+        for node, part in looks.lattice.nearest(window):
+            here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
+            if seen[here].any():
+                tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
+                marked[here] = np.where(seen[here], visibility(relief, tx, rx, part), OUTSIDE)
+        return marked
+
+    return mask
+
+
+def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions and normals of a window; its neighbours count, so that tiles leave no seams."""
+    around = [
+        np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
+        for part, size in zip(window, grid.shape, strict=True)
+    ]
+    rows, columns = around
+    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
+    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
+    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
+    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
+    return position[inner], surface_normals(position)[inner]

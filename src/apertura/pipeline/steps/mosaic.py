@@ -1,0 +1,54 @@
+"""Rule `mosaic`: each product of all flights as one raster for a GIS, on the campaign's grid."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.formats.export import MOSAICS, exports_in, mosaics
+from apertura.formats.export.mosaic import write_mosaic
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.store import read_manifest, record_files
+
+
+def mosaic(campaign: Campaign) -> list[Path]:
+    """Write results/mosaic/<pair>/<product>.vrt and their styles; return their paths.
+
+    Flights lie upon one another in the order of config/flights.tsv, the last uppermost.
+    """
+    lineage = result_of(campaign, "mosaic").begin(campaign.root)
+    made = _made(campaign.root, lineage.result.sources)
+    styles = {row.file: row for kind in ("pair", "fused", "layers") for row in exports_in(kind) if row.style}
+    written = []
+    for name, files in mosaics({flight.name: flight.pairs for flight in campaign.image_flights}).items():
+        path, sources = campaign.result(MOSAICS, name), [campaign.result(file) for file in files]
+        for source in sources:
+            _check(source, made)
+        flown = f"{len(sources)} flight{'s' * (len(sources) > 1)}"
+        title = f"{campaign.settings.campaign} · {name.removesuffix('.vrt')} of {flown}"
+        write_mosaic(path, sources, title=title)
+        written.append(path)
+        if style := styles.get(path.with_suffix(".qml").name):
+            written.append(path.with_suffix(".qml"))
+            style.write(written[-1])
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+def _made(root: Path, manifests: Iterable[str]) -> dict[Path, tuple[Path, str]]:
+    """Return product → the manifest that describes it, and its hash there."""
+    paths = [root / manifest for manifest in manifests]
+    told = [(path, name, digest) for path in paths for name, digest in read_manifest(path)["files"].items()]
+    return {path.parent / name: (path, digest) for path, name, digest in told}
+
+
+def _check(product: Path, made: Mapping[Path, tuple[Path, str]]) -> None:
+    manifest, digest = made.get(product, (product, ""))
+    if not product.is_file() or sha256_file(product) != digest:
+        raise CampaignError(
+            "not as it was written" if product.is_file() else "no such file",
+            where=product,
+            expected=f"what {manifest.name} describes",
+            remedy=f"Delete {manifest} and run the workflow again.",
+        )

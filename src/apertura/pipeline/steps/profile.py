@@ -1,0 +1,101 @@
+"""Rule `profile`: transfer functions of a pair become range profiles, cropped to what the scene needs."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import merged
+from apertura.core.echo.compression import centre_frequency
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
+from apertura.core.imaging.stages import aperture_of, phase_history_of
+from apertura.core.scene.clearance import check_antennas
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import CONFIG, SampledWaveform
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.antennas import pattern_digests
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.steps.stamping import stamped
+from apertura.pipeline.store import blocks_of_rows, finish, open_stage, write_blocks, writing
+
+
+def profile(campaign: Campaign, flight: str, pair: str) -> Path:
+    """Write results/<flight>/<pair>/profile.zarr, block by block."""
+    lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
+    source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
+    aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
+    check_antennas(scene.grid, scene.terrain, aperture, where=where)
+    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams)
+    _check_held(window.farthest_m, source.path_limit.values, campaign, where=where)
+    _check_unambiguous(window)
+    asked = campaign.settings.processing.window
+    zeros = np.broadcast_to(np.complex64(0), (len(aperture), window.samples))
+    dataset = source[["time", "tx_position", "rx_position"]].assign(
+        profile=(("pulse", "range"), zeros), start=("pulse", window.start_m)
+    )
+    dataset.attrs = {name: source.attrs[name] for name in ("frame", "pair", "flags")} | {
+        "step_m": window.step_m,
+        "centre_frequency_hz": centre_frequency(frequency),
+        "oversampling": window.unambiguous / len(frequency),
+        "window": asked,
+    }
+    settings, parents = {**campaign.relevant("profile", pair), **scene.spec}, [source, *scene.parents]
+    inputs = merged(scene.inputs, pattern_digests(campaign, pair))
+    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
+    stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
+    with writing(folder) as wip:
+        write_blocks(wip, stage, "profile", _compressed(source, asked, window, scene))
+        finish(wip, folder, lineage=lineage)
+    return folder
+
+
+def _compressed(
+    source: xr.Dataset, asked: str, window: RangeWindow, scene: OpenScene
+) -> Iterator[NDArray[np.complex64]]:
+    """Yield the profiles of one chunk of the echo at a time; zeros where none of its pulses adds to the scene."""
+    for part in blocks_of_rows(source, "transfer"):
+        if not window.contributing[part].any():
+            yield np.zeros((part.stop - part.start, window.samples), np.complex64)
+            continue
+        history = phase_history_of(source.isel(pulse=part), asked)
+        here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
+        yield range_compress(history, scene.grid, scene.terrain, window=here).samples
+
+
+def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
+    """Raise CampaignError where echoes arrive too late for captures to hold them whole."""
+    waveform = campaign.settings.waveform
+    key, held_by = "path_limit", "the recorded delays"
+    if isinstance(waveform, SampledWaveform):
+        key, held_by = waveform.delay_key, waveform.held_by
+    beyond = np.flatnonzero(farthest > limit)
+    if beyond.size:
+        pulse = int((farthest - limit).argmax())
+        raise CampaignError(
+            f"at {beyond.size} pulses echoes of the scene arrive after {held_by}, worst at pulse {pulse}: "
+            f"total path {farthest[pulse]:.1f} m",
+            where=where,
+            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
+            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",
+        )
+
+
+def _check_unambiguous(window: RangeWindow) -> None:
+    if window.samples > window.unambiguous:
+        spans_m, most_m = (
+            (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)
+        )
+        raise CampaignError(
+            f"the scene spans {spans_m:.1f} m of total path",
+            where=f"{CONFIG}: scene.bounds_m",
+            expected=f"less than the unambiguous {most_m:.1f} m",
+            remedy="Make the scene smaller.",
+        )

@@ -1,0 +1,173 @@
+"""Rule `stac`: every image of a campaign in a static STAC catalog."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.atomic import write_json
+from apertura.common.documents import undamaged
+from apertura.common.environment import lock_sha256, software
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.formats.catalog import CATALOG
+from apertura.formats.catalog.assets import asset_of, told_by
+from apertura.formats.catalog.fields import Acquisition, projection
+from apertura.formats.catalog.stac import Image, catalog_files, instant
+from apertura.formats.export.coverage import Covered, feature_collection
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.scene import OpenScene, settled_scene
+from apertura.pipeline.steps.coverage import few_looks, place_of, transform_of
+from apertura.pipeline.store import open_listed, open_stage, read_manifest, record_files
+
+_SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
+"""Sum of a flight's pairs → type of product; what begins with the name of the other is not its file."""
+
+
+def stac(campaign: Campaign) -> list[Path]:
+    """Write results/stac/; return the path of catalog.json, where it begins."""
+    lineage = result_of(campaign, "stac").begin(campaign.root)
+    manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
+    described = _Described(campaign, settled_scene(campaign))
+    files = catalog_files(campaign.settings.campaign, described.images())
+    manifest.unlink(missing_ok=True)
+    for name, document in files.items():
+        write_json(campaign.result("stac", name), document)
+    record_files(manifest, [folder / name for name in files], lineage)
+    return [folder / CATALOG]
+
+
+@dataclass(frozen=True)
+class _Described:
+    """A campaign whose images are described."""
+
+    campaign: Campaign
+    scene: OpenScene
+
+    def images(self) -> list[Image]:
+        """Return what the catalog says of each flight: every pair, then every sum."""
+        images = []
+        for flight in self.campaign.image_flights:
+            looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
+            pairs = [self._pair(flight.name, pair, looks[pair]) for pair in flight.pairs]
+            together = np.sum(list(looks.values()), axis=0)
+            images += pairs + [self._sum(flight.name, name, pairs, together) for name in _SUMS]
+        return images
+
+    def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
+        files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
+        told = {
+            "sar:instrument_mode": _mode(pair),
+            "sar:product_type": "SLC",
+            "sar:looks_range": 1,
+            "sar:looks_azimuth": 1,
+        }
+        return Image(
+            flight,
+            pair,
+            f"{self.campaign.settings.campaign} · flight {flight} · {pair}",
+            self._footprint(looks),
+            self._acquisition(flight, pair),
+            {**told, **self._properties(flight, pair)},
+            *self._assets(files),
+        )
+
+    def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
+        others = tuple(f"{other}_" for other in _SUMS if other != name)
+        listed = self._listed(flight, "fused", "export")
+        told = {
+            "sar:instrument_mode": "multistatic" if len(pairs) > 1 else _mode(pairs[0].name),
+            "sar:product_type": _SUMS[name],
+        }
+        return Image(
+            flight,
+            name,
+            f"{self.campaign.settings.campaign} · flight {flight} · {name} sum of {len(pairs)} pairs",
+            self._footprint(looks),
+            Acquisition.together([pair.acquisition for pair in pairs]),
+            {**told, **self._properties(flight, "fused")},
+            *self._assets({path: digest for path, digest in listed.items() if not path.name.startswith(others)}),
+            [pair.name for pair in pairs],
+        )
+
+    def _listed(self, flight: str, name: str, result: str) -> dict[Path, str]:
+        """Return the files of a result with their hashes, as its manifest has them."""
+        manifest = self.campaign.root / self.campaign.manifest(result, flight, name)
+        hashes: Mapping[str, str] = read_manifest(manifest)["files"]
+        return {inside(manifest.parent, file, where=manifest): digest for file, digest in hashes.items()}
+
+    def _assets(self, files: Mapping[Path, str]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the assets of some files by their keys, and file → sha256 of what their rasters were made from."""
+        assets, inputs = {}, dict[str, str]()
+        for path, digest in files.items():
+            if not path.is_file():
+                raise CampaignError("no such file", path, "a finished product", "Run the workflow again.")
+            told, name = told_by(path), quote(self.campaign.relative(path).removeprefix("results/"))
+            key = path.stem if path.suffix == ".tif" else path.name
+            assets[key] = asset_of(path, f"../../../{name}", sha256=digest, told=told)
+            inputs = inputs or dict(told.inputs)
+        return assets, inputs
+
+    def _properties(self, flight: str, name: str) -> dict[str, Any]:
+        """Return where an image lies, how it was made, and what it says of itself."""
+        path = self.campaign.result(flight, name, "image.json")
+        manifest = path.with_name("export.manifest.json")
+        report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
+        code = read_manifest(manifest).get("code", "unknown")
+        with undamaged(path, expected="the report of an image", remedy=remedy):
+            verdict = str(report["focus"]["verdict"])
+            return {
+                **self._shared,
+                **(_resolution(report.get("brightest") or {}) if verdict == "focused" else {}),
+                "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {self._lock}",
+                "apertura:verdict": verdict,
+                "apertura:flags": sorted(report["flags"]),
+                "apertura:numerical_error_db": float(report["numerical_error_db"]),
+            }
+
+    @cached_property
+    def _lock(self) -> str:
+        return lock_sha256()
+
+    @cached_property
+    def _shared(self) -> dict[str, Any]:
+        """What all images share: the grid and the software."""
+        grid = self.scene.grid
+        return {
+            **projection(grid.crs_wkt, grid.shape, grid.transform),
+            "sar:pixel_spacing_range": grid.spacing_m,
+            "sar:pixel_spacing_azimuth": grid.spacing_m,
+            "processing:level": "L1",
+            "processing:software": software(),
+        }
+
+    def _footprint(self, looks: NDArray[np.float32]) -> dict[str, Any] | None:
+        covered, transform = Covered("", "", {}, looks), transform_of(self.scene.grid, looks)
+        found = feature_collection([covered], transform, place_of(self.scene), height_m=self.scene.level.height_m)
+        geometry: dict[str, Any] | None = found["features"][0]["geometry"]
+        return geometry if geometry and geometry["coordinates"] else None
+
+    def _acquisition(self, flight: str, pair: str) -> Acquisition:
+        echo = open_stage(self.campaign.stage("echo", flight, pair), "echo")
+        times, frequency = echo.time.values.astype(np.int64), echo.frequency.values
+        span_hz = float(frequency[-1] - frequency[0])
+        bandwidth_hz = span_hz * frequency.size / max(frequency.size - 1, 1)
+        centre_hz = float(frequency[0] + frequency[-1]) / 2
+        return Acquisition(instant(int(times.min())), instant(int(times.max())), centre_hz, bandwidth_hz)
+
+
+def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
+    """Return the widths at -3 dB of an image's brightest point, as they were measured."""
+    widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
+    return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
+
+
+def _mode(pair: str) -> str:
+    """Return whether a pair's transmitter is its receiver, in the words of the extension sar."""
+    return "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"

@@ -1,0 +1,44 @@
+"""Stages on disk: zarr folders that are complete or absent, each beside a manifest of hashes.
+
+A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a rename, and described by
+``<stage>.manifest.json``, which is written last: where the manifest stands, the folder is complete. Documents and
+products have manifests of the same kind. Each names its files with their hashes and what they were made from.
+"""
+
+from apertura.pipeline.store.blocks import blocks_of_rows, write_blocks
+from apertura.pipeline.store.manifest import (
+    damaged_files,
+    manifest_of,
+    open_document,
+    open_listed,
+    read_manifest,
+    record_files,
+    remake,
+    save_document,
+)
+from apertura.pipeline.store.progress import finish, sharing, writing
+from apertura.pipeline.store.resuming import create, mark_rewritten, missing, open_array, resume
+from apertura.pipeline.store.stages import open_stage, save_stage
+
+__all__ = [
+    "blocks_of_rows",
+    "create",
+    "damaged_files",
+    "finish",
+    "manifest_of",
+    "mark_rewritten",
+    "missing",
+    "open_array",
+    "open_document",
+    "open_listed",
+    "open_stage",
+    "read_manifest",
+    "record_files",
+    "remake",
+    "resume",
+    "save_document",
+    "save_stage",
+    "sharing",
+    "write_blocks",
+    "writing",
+]

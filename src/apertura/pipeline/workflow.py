@@ -1,0 +1,334 @@
+"""The workflow on a campaign folder: checked first, run by one process group, and ended with all its steps."""
+
+import ctypes
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal
+
+from apertura.common.atomic import remove
+from apertura.common.code_imports import PACKAGE
+from apertura.common.errors import CampaignError
+from apertura.common.isolation import given, isolate
+from apertura.common.lock import hold
+from apertura.common.paths import check_shell_name, shipped
+from apertura.common.progress import RUN
+from apertura.common.signals import INTERRUPTED, STATUS_FILE
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import print_problems
+from apertura.pipeline.check.stale import forms_results, stale_lines, stale_results
+from apertura.pipeline.lineage import on_demand
+from apertura.pipeline.runs.expectation import Outlook
+from apertura.pipeline.runs.failure import failures
+from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, Reader, note
+from apertura.pipeline.runs.screen import NOTHING, Screen, listed
+
+Show = Literal["errors", "steps", "snakemake"]
+
+_GRACE_S = 3.0
+_LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
+_LIBC = ctypes.CDLL(None)
+_COUNTERS = Path("/proc/vmstat")
+_ELSEWHERE = ("memory",)
+"""Checks of this machine, of no use where steps run on others."""
+_HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
+"""Options of snakemake that name files which it takes code from; it knows them by their beginnings, too."""
+_HOLDS_NONE = ("--config", "--jobs")
+_PICKLED = "--trust-io-cache"
+"""Option of snakemake: read what it knows of the folder's files from a pickle in that folder."""
+_SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
+"""Short options that take no value, `-s`, which is `--snakefile`, and its value where it is written without a space."""
+_PROFILE = "SNAKEMAKE_PROFILE"
+"""Environment variable: the profile where the command line names none."""
+_DRY_RUN = re.compile(r"-n|-np|--dry-?run")
+_LOG = "snakemake.log"
+
+
+@dataclass(frozen=True)
+class _Files:
+    """What a run keeps of itself."""
+
+    journal: Path
+    status: Path
+    log: Path
+
+    @classmethod
+    def of(cls, campaign: Campaign) -> "_Files":
+        """Return those of a run that forms results; what one before left is removed."""
+        folder, log = campaign.result(RUN), campaign.result("logs", _LOG)
+        remove(folder)
+        folder.mkdir(parents=True)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        return cls(campaign.result(RUN, "journal.jsonl"), campaign.result(RUN, "status"), log)
+
+    @classmethod
+    def apart(cls, folder: str) -> "_Files":
+        """Return those of a run that forms nothing."""
+        return cls(Path(folder, "journal.jsonl"), Path(folder, "status"), Path(folder, _LOG))
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What snakemake and its steps are told; rules call `apertura`, which need not be on the caller's PATH."""
+        isolate()
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
+        return {**os.environ, "PATH": path, STATUS_FILE: str(self.status), JOURNAL: str(self.journal)}
+
+    def status_of(self, status: int) -> int:
+        """Return snakemake's exit status, or 2 where no step has ended with a defect."""
+        told = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
+        return 2 if status == 1 and "1" not in told else status
+
+
+def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False, show: Show = "steps") -> int:
+    """Run the workflow on a campaign folder; return its exit status.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    cores
+        To use.
+    *arguments
+        Further options and targets of snakemake.
+    paranoid
+        Read every source again, also those whose state is known.
+    show
+        Errors alone; a line for each step, with bars on a terminal; or all that snakemake says.
+
+    Returns
+    -------
+    int
+        0; 2 where the campaign or the machine has to be seen to, 130 after a signal, and 1 for a defect.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign is not fit to run, or another run holds it.
+    """
+    elsewhere = _runs_elsewhere(arguments)
+    options = code_from_outside(root, arguments)
+    if _PROFILE in os.environ:
+        os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
+    if elsewhere:
+        check_shell_name(root.absolute())
+    if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
+        return 2
+    root = root.absolute()
+    campaign, forms = Campaign.load(root), forms_results(["", *arguments])
+    if forms:
+        hold(root).close()
+    stale = stale_results(campaign, paranoid=paranoid)
+    if show == "steps":
+        print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
+    overtaken = [manifest for manifest in stale if not on_demand(manifest)]
+    forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
+    command = _command(root, cores, [*options, *forced])
+    if forms:
+        files, at_once = _Files.of(campaign), 0 if elsewhere else cores
+        note(files.journal, "start", cores=at_once)
+        screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
+        return _formed(root, command, files, screen, aloud=show == "snakemake")
+    with tempfile.TemporaryDirectory() as scratch:
+        files = _Files.apart(scratch)
+        dry = any(map(_DRY_RUN.fullmatch, arguments))
+        if show == "errors" or (dry and show == "steps"):
+            return _looked_at(root, command, files, told=dry)
+        return files.status_of(_supervised(command, files.environment))
+
+
+def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen, *, aloud: bool) -> int:
+    """Run snakemake with its output in a file, and show what its journal tells."""
+    reader, killed, status = Reader(files.journal), _killed_for_memory(), INTERRUPTED
+    try:
+        with files.log.open("wb") as output, files.log.open("rb") as said, screen:
+
+            def look() -> None:
+                screen.update(reader.news())
+                if aloud:
+                    print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
+
+            status = files.status_of(_supervised(command, files.environment, output, look))
+            look()
+    finally:
+        note(files.journal, "end", status=status)
+    killed = _killed_for_memory() - killed
+    if status:
+        _say(*failures(root, reader.run, files.log))
+    if status and killed:
+        message = (
+            f"out of memory: meanwhile the kernel has ended {killed} processes of this machine or job for lack of it"
+        )
+        _say(f"error: {message}. Give the run more memory, or fewer --cores; it goes on where it was.")
+    if not status:
+        screen.ended(reader.run)
+    return status
+
+
+def _looked_at(root: Path, command: Sequence[str], files: "_Files", *, told: bool) -> int:
+    """Have snakemake look at the workflow, and say briefly what a run would do where that is to be `told`."""
+    with files.log.open("wb") as output:
+        status = files.status_of(_supervised(command, files.environment, output))
+    run = Reader(files.journal).news()
+    if status:
+        _say(*failures(root, run, files.log))
+    elif told:
+        print(f"{run.total} steps to do: {listed(run.planned)}" if run.planned else NOTHING)
+    return status
+
+
+def _say(*lines: str) -> None:
+    print(*lines, sep="\n", file=sys.stderr, flush=True)
+
+
+def _command(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
+    folder = shipped()
+    own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
+    own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
+    return [sys.executable, "-P", "-m", RECORDER, *own, *arguments]
+
+
+def _killed_for_memory() -> int:
+    """Return how many processes the kernel has ended for lack of memory since it started; 0 where it does not say."""
+    try:
+        counters = dict(line.split() for line in _COUNTERS.read_text(encoding="ascii").splitlines())
+        return int(counters.get("oom_kill", 0))
+    except (OSError, ValueError):
+        return 0
+
+
+def code_from_outside(root: Path, arguments: Sequence[str]) -> list[str]:
+    """Return options of snakemake with the whole paths of files that it takes code from, none of them in the campaign.
+
+    Snakemake is started in another folder than the caller's. A profile, as a config, may hold Python (YTE).
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    arguments
+        Options and targets.
+
+    Raises
+    ------
+    CampaignError
+        If such a file lies in the campaign folder, or is reached through it.
+
+    Examples
+    --------
+    >>> options = code_from_outside(Path("campaign"), ["-n", "--profile=profiles/slurm"])
+    >>> options[:2], Path(options[2]) == shipped() / "profiles" / "slurm"
+    (['-n', '--profile'], True)
+    """
+    found = [word for one in arguments for word in apart(one)]
+    option = ""
+    for at, word in enumerate(found):
+        if word.startswith("-"):
+            option = word
+            _refuse_pickled(option)
+        elif _holds_code(option):
+            found[at] = _whole(root, option, word)
+    return found
+
+
+def apart(argument: str) -> list[str]:
+    """Return an option and its value, where they are written as one word.
+
+    Examples
+    --------
+    >>> apart("--profile=mine"), apart("-np"), apart("-nsmine")
+    (['--profile', 'mine'], ['-np'], ['-ns', 'mine'])
+    """
+    short = _SHORT.fullmatch(argument)
+    if short:
+        return [word for word in short.groups() if word]
+    return argument.split("=", 1) if argument.startswith("--") else [argument]
+
+
+def _holds_code(option: str) -> bool:
+    """Return whether the value of an option, perhaps abbreviated, is a file that snakemake takes code from."""
+    if not option.startswith("--"):
+        return _SHORT.fullmatch(option) is not None
+    return option not in ("--", *_HOLDS_NONE) and any(name.startswith(option) for name in _HOLDS_CODE)
+
+
+def _refuse_pickled(option: str) -> None:
+    if len(option) > len("--t") and _PICKLED.startswith(option):
+        raise CampaignError(
+            f"{option}: Snakemake then reads a pickle of the campaign folder, which may hold code",
+            "apertura run",
+            "options that take data alone from the folder",
+            "Leave it out.",
+        )
+
+
+def _whole(root: Path, option: str, name: str) -> str:
+    """Return a path whole, what is shipped before what lies where the caller is; a name that is neither as it is."""
+    ours, theirs = shipped() / name, given(Path(name))
+    if name.startswith("profiles/") and ours.exists():
+        return str(ours)
+    if not theirs.exists():
+        return name
+    typed = Path(os.path.normpath(theirs))  # through a link in the folder, too: who makes that says where it leads
+    if any(way.resolve().is_relative_to(root.resolve()) for way in (theirs, typed, *typed.parents)):
+        raise CampaignError(
+            f"{option} {name} lies in the campaign folder",
+            "apertura run",
+            "a file of your own: Snakemake runs code that it holds, and a campaign folder brings data",
+            "Read it, and copy it out of the campaign folder if you trust it.",
+        )
+    return str(theirs)
+
+
+def _runs_elsewhere(arguments: Sequence[str]) -> bool:
+    """Return whether steps run on other machines than this one."""
+    named = any(argument.startswith(("--exec", "--prof", "-e")) for argument in arguments)
+    return named or _PROFILE in os.environ
+
+
+def _supervised(
+    command: Sequence[str],
+    environment: Mapping[str, str],
+    output: IO[bytes] | None = None,
+    look: Callable[[], None] = lambda: None,
+) -> int:
+    """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
+    process = subprocess.Popen(
+        command,
+        cwd=PACKAGE,  # never the campaign's: see `apertura.common.isolation`
+        env=environment,
+        stdout=output,
+        stderr=output,
+        start_new_session=True,
+        preexec_fn=_die_with_parent,  # noqa: PLW1509 - this process has no other threads
+    )
+    try:
+        while process.poll() is None:
+            began_s = time.monotonic()
+            look()
+            time.sleep(max(_LOOK_S, _REST * (time.monotonic() - began_s)))
+    except BaseException:
+        _end(process)
+        raise
+    return process.returncode
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel (prctl, PR_SET_PDEATHSIG) to end snakemake with this run, also where that is killed outright."""
+    _LIBC.prctl(1, signal.SIGKILL)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    os.killpg(process.pid, signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_GRACE_S)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)  # steps that outlive snakemake, too: work in progress survives it
+    process.wait()

@@ -1,0 +1,259 @@
+"""The command line: one subcommand per step, and campaigns from end to end.
+
+Commands import what they run when they run: help and mistakes in the command line cost nothing.
+"""
+
+import os
+import sys
+from contextlib import suppress
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from apertura import __version__
+from apertura.common.errors import CampaignError, explained
+from apertura.common.isolation import as_typed, given
+from apertura.common.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
+from apertura.views import product_commands, raw_commands
+from apertura.views.step_commands import Threads
+from apertura.views.step_commands import app as step
+
+if TYPE_CHECKING:
+    from apertura.pipeline.campaign import Campaign
+
+app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
+app.add_typer(step, name="step")
+for _further in entry_points(group="apertura.commands"):  # of other distributions: research/ has `study`
+    app.add_typer(_further.load(), name=_further.name)
+app.command()(raw_commands.inspect)
+app.command()(raw_commands.align)
+app.command()(product_commands.score)
+app.command()(product_commands.verify)
+app.command()(product_commands.reproduce)
+app.command()(product_commands.diff)
+app.command()(product_commands.check_crate)
+app.command()(product_commands.report)
+app.command("map")(product_commands.map_page)
+
+CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
+Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
+Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
+HERE = Path()
+ALL_CORES = os.cpu_count() or 1
+PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Options that are not known go to snakemake."""
+
+
+class _PassesOn(TyperCommand):
+    """A command whose unknown options go to snakemake."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take options and values apart: of `-sFILE`, click would take each letter that is an option of ours."""
+        from apertura.pipeline.workflow import apart
+
+        return super().parse_args(ctx, [word for one in args for word in apart(one)])
+
+
+def _opened(campaign: Path) -> "Campaign":
+    from apertura.pipeline.campaign import Campaign
+
+    return Campaign.load(given(campaign))
+
+
+def main() -> None:
+    """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
+    with ended_by_signals():
+        try:
+            app()
+        except CampaignError as error:
+            from apertura.pipeline.config import located
+
+            _say(located(as_typed(error)))
+            leave_status(2)
+            raise SystemExit(2) from None
+        except Interrupted as signalled:
+            _say(str(signalled.code))
+            raise SystemExit(INTERRUPTED) from None
+        except SystemExit as ended:
+            if isinstance(ended.__context__, BrokenPipeError):  # typer takes it for a failure of ours
+                _say(str(explained(ended.__context__)))
+                raise SystemExit(2) from None
+            raise
+        except Exception as error:
+            message = explained(error)
+            leave_status(2 if message else 1)
+            if message is None:
+                raise
+            _say(message)
+            raise SystemExit(2) from None
+        finally:
+            _flush()
+
+
+def _flush() -> None:
+    """Write what is printed; where its reader has gone or its disk is full, nothing is left to fail at the exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _say(message: str) -> None:
+    """Print an error where the reader of the output may have gone."""
+    with suppress(OSError):
+        print(f"error: {message}", file=sys.stderr, flush=True)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command(cls=_PassesOn, context_settings=PASS_ON)
+def run(
+    context: typer.Context,
+    campaign: CampaignFolder,
+    cores: Cores = ALL_CORES,
+    paranoid: Paranoid = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only errors, and what to open")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
+) -> None:
+    """Run the workflow on a campaign folder; further options go to snakemake."""
+    from apertura.pipeline.check.stale import forms_results
+    from apertura.pipeline.workflow import Show, run_workflow
+
+    show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
+    status = run_workflow(given(campaign), cores, *context.args, paranoid=paranoid, show=show)
+    if status == 0 and forms_results(["", *context.args]):
+        opened = _opened(campaign)
+        from apertura.views.summary import is_finished, print_products, print_summary
+
+        if is_finished(opened):  # not after `--until`
+            print_products(opened) if quiet else print_summary(opened)
+    raise SystemExit(status)
+
+
+@app.command()
+def status(campaign: CampaignFolder = HERE) -> None:
+    """Tell what a run does, from another terminal: steps done, under way and left, time left, the last error."""
+    opened = _opened(campaign)
+    from apertura.pipeline.runs.status import print_status
+
+    print_status(opened)
+
+
+@app.command("list")
+def list_results(campaign: CampaignFolder = HERE) -> None:
+    """List flights and pairs, and which of their results are finished, stale or missing, with their sizes."""
+    opened = _opened(campaign)
+    from apertura.pipeline.runs.inventory import print_list
+
+    print_list(opened)
+
+
+@app.command()
+def clean(
+    campaign: CampaignFolder,
+    wip: Annotated[bool, typer.Option("--wip", help="only work in progress that a killed run has left")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask")] = False,
+) -> None:
+    """Remove what the workflow has made, and nothing else; not while a run holds the campaign."""
+    opened = _opened(campaign)
+    from apertura.pipeline.runs.removal import clean as remove_results
+
+    remove_results(opened, unfinished_only=wip, agreed=yes)
+
+
+@app.command()
+def check(
+    campaign: CampaignFolder,
+    products: Annotated[bool, typer.Option("--products", help="read every byte of the results")] = False,
+    paranoid: Paranoid = False,
+) -> None:
+    """Print all that is wrong with a campaign folder, a line each, and which results are overtaken; run nothing."""
+    from apertura.pipeline.check import print_findings
+
+    raise SystemExit(2 if print_findings(given(campaign), products=products, paranoid=paranoid) else 0)
+
+
+@app.command()
+def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
+    """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
+    opened = _opened(campaign)
+    from apertura.views.plan import print_plan
+
+    print_plan(opened, threads=threads)
+
+
+@app.command(context_settings=PASS_ON)
+def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
+    """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
+    from apertura.pipeline.workflow import run_workflow
+
+    status = run_workflow(given(campaign), cores, *context.args, "speed_accuracy")
+    if status == 0:
+        print(*(campaign / f"results/study/speed_accuracy.{suffix}" for suffix in ("png", "html", "csv")), sep="\n")
+    raise SystemExit(status)
+
+
+@app.command()
+def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = HERE) -> None:
+    """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
+    opened = _opened(campaign)
+    from apertura.views.summary import print_summary
+
+    print_summary(opened)
+
+
+@app.command()
+def init(
+    directory: Annotated[Path, typer.Argument(help="folder to make")],
+    kind: Annotated[str, typer.Option(help="of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
+) -> None:
+    """Write the commented config of a new campaign folder."""
+    from apertura.pipeline.config.template import config_template, flights_template
+
+    folder = given(directory) / "config"
+    for path, text in ((folder / "config.yaml", config_template(kind)), (folder / "flights.tsv", flights_template())):
+        if path.exists():
+            raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        print(as_typed(path))
+
+
+@app.command()
+def simulate(
+    paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="demo (the default), paper, swarm, continuous, paper-lab, paper-static, paper-uav"),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
+    print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
+) -> None:
+    """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""
+    from apertura import simulation
+
+    if print_spec is not None:
+        print(simulation.specification_text(simulation.preset(print_spec)), end="")
+        return
+    paths = paths or []
+    if len(paths) + (preset is not None) not in {1, 2} or not paths:
+        typed = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
+        raise CampaignError(typed, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+    chosen = given(paths[0]) if len(paths) > 1 else simulation.preset(preset or "demo")
+    print(as_typed(simulation.simulate(given(paths[-1]), chosen, seed=seed)))

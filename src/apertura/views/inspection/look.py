@@ -1,0 +1,169 @@
+"""What a path is: of the readers in the tables that its name fits, the first that reads it tells."""
+
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from apertura.common.errors import CampaignError, explained, quoted, shown
+from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
+from apertura.views.inspection.report import Report
+from apertura.views.inspection.surroundings import Surroundings, retries, surroundings
+
+MOST_FILES = 100
+"""Of a folder that are looked into."""
+
+_HEAD_BYTES = 16
+
+Reader = Callable[[], Report]
+
+
+def look(path: Path, settings: Sequence[str] = ()) -> Report:
+    """Return what a file or folder is and holds.
+
+    Parameters
+    ----------
+    path
+        Absolute.
+    settings
+        KEY=VALUE: what a flight log cannot say of itself.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, or a setting is none; whatever a file holds is told by the report.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        found = shown(error.strerror or "not there")
+        raise CampaignError(found, path, "a file or folder", "Correct the path.") from None
+    if stat.S_ISDIR(mode):
+        return _folder(path, settings)
+    if not stat.S_ISREG(mode):
+        raise CampaignError("neither a file nor a folder", path, "a file or folder", "Copy its content to a file.")
+    return _file(path, surroundings(path, settings))
+
+
+def _folder(path: Path, settings: Sequence[str]) -> Report:
+    if any(path.name.endswith(row.suffix) for row in PHASE_HISTORIES.values()):
+        return _file(path, surroundings(path, settings))
+    if (path / "config").is_dir() or (path / "raw").is_dir():
+        from apertura.views.inspection.whole import campaign_report
+
+        return campaign_report(path)
+    names = sorted(one for one in path.iterdir() if one.is_file() and not one.name.startswith("."))
+    parts: dict[Path, Report] = {}
+    for name in names[:MOST_FILES]:
+        part = _file(name, surroundings(name, settings))
+        parts.setdefault(part.path, part)  # the files of a recording are one part
+    more = (f"{len(names) - MOST_FILES} more files: name one",) if len(names) > MOST_FILES else ()
+    columns = ("first_utc", "duration_s", "rate_hz", "gaps")
+    return Report(path, "folder", "", {"files": len(names)}, more, parts=tuple(parts.values()), columns=columns)
+
+
+def _file(path: Path, beside: Surroundings) -> Report:
+    """Return the report of the first reader that reads a file; else of the first that its name fits."""
+    refused: list[Report] = []
+    for kind, name, read in _readers(path, beside):
+        try:
+            return _with_config(read(), beside)
+        except Exception as error:  # whatever a file makes a reader do is told of the file
+            refused.append(Report(path, kind, name, _size(path), problem=_told(error, path)))
+    if not refused:
+        return _unknown(path)
+    first = refused[0]
+    others = [f"nor is it read as {other.title}: {other.problem.found}" for other in refused[1:] if other.problem]
+    helps = retries(first.problem) if first.problem else []
+    return _with_config(replace(first, missing=(*helps, *others)), beside)
+
+
+def _with_config(report: Report, beside: Surroundings) -> Report:
+    if beside.problem is None:
+        return report
+    return replace(report, missing=(*report.missing, f"a config that can be read: {beside.problem}"))
+
+
+def _told(error: Exception, path: Path) -> CampaignError:
+    if isinstance(error, CampaignError):
+        return error
+    known = explained(error)
+    found = known or f"its reader failed: {type(error).__name__}: {error}"
+    return CampaignError(found, path, "a file that is whole", "Is it damaged? If not, this is a defect of apertura.")
+
+
+def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
+    """Yield kind, format and reader for every row of the tables that a name fits; of a format stated that alone."""
+    stated = "" if "format" in beside.asked or ".track." in path.name else str(beside.waveform.get("format", ""))
+    if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
+        yield "phase history", stated, partial(_history, path, stated, beside)
+        return  # it is what the campaign will read: that another reader knows the file would be no comfort
+    if "format" not in beside.asked:
+        yield from _of_recorders(path, beside)
+    if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.asked):
+        with suppress(CampaignError):  # none that is known
+            yield "flight log", log_format(path, beside.options), partial(_log, path, beside)
+    yield from _others(path)
+
+
+def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
+    for row in RECORDERS:
+        suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
+        if suffix is not None:
+            yield "recording", row[0].lstrip("."), partial(_recording, path, path.name.removesuffix(suffix), beside)
+    for name, history in PHASE_HISTORIES.items():
+        if path.name.endswith(history.suffix):
+            yield "phase history", name, partial(_history, path, name, beside)
+
+
+def _recording(path: Path, node: str, beside: Surroundings) -> Report:
+    from apertura.views.inspection.recording import recording_report
+
+    return recording_report(recording_files(path.parent, node), beside)
+
+
+def _history(path: Path, name: str, beside: Surroundings) -> Report:
+    from apertura.views.inspection.history import history_report
+
+    files = PHASE_HISTORIES[name].files_of(path)
+    return history_report(path if path.is_dir() else files[0], files, name, beside)
+
+
+def _log(path: Path, beside: Surroundings) -> Report:
+    from apertura.views.inspection.log import log_report
+
+    return log_report(path, beside)
+
+
+def _others(path: Path) -> Iterator[tuple[str, str, Reader]]:
+    from apertura.views.inspection.array import SUFFIX, array_report
+    from apertura.views.inspection.elevation import SUFFIXES, elevation_report
+
+    if path.suffix.lower() in SUFFIXES:
+        yield "elevation model", "", partial(elevation_report, path)
+    if path.suffix == SUFFIX:
+        yield "array", "", partial(array_report, path)
+
+
+def _size(path: Path) -> dict[str, int]:
+    return {"bytes": path.stat().st_size} if path.is_file() else {}
+
+
+def _unknown(path: Path) -> Report:
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    recorders = sorted({suffix for row in RECORDERS for suffix in row})
+    histories = sorted({row.suffix for row in PHASE_HISTORIES.values()})
+    logs = sorted(f".{suffix}" for suffix in log_suffixes())
+    problem = CampaignError(
+        f"no format that is known by a name in {quoted(path.suffix)}",
+        path,
+        f"a recording ({', '.join(recorders)}), phase history ({', '.join(histories)}), a flight log "
+        f"({', '.join(logs)}), an elevation model (.tif) or a campaign folder",
+        "Give it the suffix of its format, or convert it.",
+    )
+    facts = {**_size(path), "begins_with": quoted(head)}
+    helps = (f"if it is a flight log, name its format: --set format=<{'|'.join(TRACKS)}>",)
+    return Report(path, "unknown", "", facts, helps, problem)

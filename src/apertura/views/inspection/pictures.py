@@ -1,0 +1,214 @@
+"""Previews of tracks, recordings, phase history, heights, and of the times of a campaign."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import shown
+from apertura.core.geometry.track_checks import LONG_GAP
+from apertura.formats.tracks.track import FIXES
+from apertura.views.inspection.log import east_north_up
+from apertura.views.inspection.recording import LOST
+from apertura.views.inspection.timing import gaps, interval_s, seconds, utc
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+    from apertura.formats.recordings.recording import Recording
+
+_COLOURS = {
+    "not stated": "0.4",
+    "fix": "tab:green",
+    "float": "tab:olive",
+    "sbas": "tab:orange",
+    "dgps": "tab:orange",
+    "single": "tab:red",
+    "ppp": "tab:blue",
+}
+_ROWS = 256  # pulses and captures that are drawn
+_COLUMNS = 1024
+_FLOOR_DB = -60.0
+
+Span = tuple[np.datetime64, np.datetime64]
+"""First and last."""
+
+Floats = NDArray[np.floating[Any]]
+
+
+def draw_log(track: "xr.Dataset", name: str) -> Figure:
+    """Return a track in plan, its height and its intervals over time; colours are kinds of fix, red lines gaps."""
+    figure = _figure(name, (11, 6))
+    grid = figure.add_gridspec(2, 2)
+    plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    steps = figure.add_subplot(grid[1, 1], sharex=height)
+    position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
+    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
+    for label, own in _by_fix(track).items():
+        told, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
+        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=told, markersize=2.5)
+        height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
+    for number, epoch in enumerate(gaps(times, LONG_GAP)):
+        ends = slice(epoch - 1, epoch + 1)
+        plan.plot(*place[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
+        height.axvspan(*at_s[ends], color="red", alpha=0.2)
+    plan.plot(*place[0, :2], "k^", label="first epoch")
+    earth = frame == "ecef"
+    _named(plan, "east of the median, m" if earth else "east, m", "north of the median, m" if earth else "north, m")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.legend(loc="best", fontsize="small")
+    _named(height, "", "height above the ellipsoid, m" if earth else "up, m")
+    _intervals(steps, at_s[1:], times)
+    _named(steps, f"seconds since {utc(times[0])}", "since the epoch before, s")
+    return figure
+
+
+def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]) -> None:
+    """Draw the times between neighbours, seconds: from zero, or by decades where they differ by more than that."""
+    steps = np.diff(times) / np.timedelta64(1, "s")
+    axes.plot(across, steps, "k.", markersize=2.5)
+    if steps.max() > 10 * steps.min():
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0, 1.2 * float(steps.max()))
+
+
+def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
+    """Return kind of solution → (epoch,) bool."""
+    kinds = track.fix.values if "fix" in track else np.zeros(track.sizes["epoch"], np.int8)
+    known = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
+    known["not stated"] = ~np.isin(kinds, list(FIXES.values()))
+    return {name: own for name, own in known.items() if own.any()}
+
+
+def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name: str) -> Figure:
+    """Return the times between captures, and the amplitude of the first captures in each channel."""
+    several = len(recording.captures.time) > 1
+    count = len(recording.channels) + several
+    figure = _figure(name, (11, 0.5 + 2.7 * count))
+    axes = list(np.ravel(figure.subplots(count, 1)))
+    if several:
+        _captures(axes.pop(0), recording.captures.time)
+    length_us = samples.shape[1] / recording.sample_rate_hz * 1e6
+    for channel, own, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
+        level_db, label = _decibels(values), f"dB under the largest, {shown(channel)}"
+        if several:
+            _image(own, level_db, (0.0, length_us), label)
+            _named(own, "time in the capture, µs", "capture")
+        else:
+            own.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
+            _named(own, f"time since {utc(recording.captures.time[0])}, µs", label)
+    return figure
+
+
+def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
+    """Draw the times between captures; red where some are missing."""
+    _intervals(axes, np.arange(1, len(times)), times)
+    for capture in gaps(times, LOST)[:_ROWS]:
+        axes.axvline(capture, color="red", linewidth=0.6)
+    typical_s = interval_s(times)
+    axes.axhline(typical_s, color="tab:blue", linewidth=0.8, label=f"typical: {typical_s:.6g} s")
+    axes.legend(loc="lower right", fontsize="small")
+    _named(axes, f"capture; the first at {utc(times[0])}; red: some are missing before", "since the one before, s")
+
+
+def draw_history(echo: "xr.Dataset", name: str) -> Figure:
+    """Return range profiles of pulses spread over the flight, and where the antennas were in plan."""
+    placed = "tx_position" in echo
+    figure = _figure(name, (11, 5))
+    grid = figure.add_gridspec(1, 1 + placed, width_ratios=(1.6, 1)[: 1 + placed])
+    profiles = figure.add_subplot(grid[0])
+    pulses = np.unique(np.linspace(0, echo.sizes["pulse"] - 1, _ROWS).astype(int))
+    transfer, frequency = np.asarray(echo.transfer[pulses].values), echo.frequency.values
+    window = np.hanning(frequency.size + 2)[1:-1]
+    profile = np.fft.fftshift(np.fft.ifft(transfer * window, axis=1), axes=1)
+    reach_m = SPEED_OF_LIGHT_M_S * (frequency.size - 1) / max(float(np.ptp(frequency)), 1.0) / 2
+    count = echo.sizes["pulse"]
+    _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest", rows=count)
+    _named(profiles, "path beyond the reference, m", f"pulse, {len(pulses)} of {count} are drawn")
+    if placed:
+        _antennas(figure.add_subplot(grid[1]), echo)
+    return figure
+
+
+def _antennas(plan: "Axes", echo: "xr.Dataset") -> None:
+    """Draw where both antennas were, about the middle of the transmitting one."""
+    frame, middle = echo.attrs["frame"], np.median(echo.tx_position.values, axis=0)
+    for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
+        place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
+        plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
+    about = " of the middle" if frame == "ecef" else ""
+    _named(plan, f"east{about}, m", f"north{about}, m")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.legend(loc="best", fontsize="small")
+
+
+def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str) -> Figure:
+    """Return heights of a raster as a map; `extent` is left, bottom, right, top in its CRS."""
+    figure = _figure(name, (7, 6))
+    axes = figure.subplots()
+    left, bottom, right, top = extent
+    drawn = axes.imshow(
+        heights, extent=(left, right, bottom, top), cmap="terrain", aspect="auto", interpolation="nearest"
+    )
+    figure.colorbar(drawn, ax=axes, label="height, as the raster counts it, m")
+    _named(axes, "x of its CRS", "y of its CRS")
+    return figure
+
+
+def draw_campaign(spans: Mapping[tuple[str, str], Mapping[str, Span]], name: str) -> Figure:
+    """Return when each node of each flight recorded and logged, in seconds from the first of the flight."""
+    flights = list(dict.fromkeys(flight for flight, _ in spans)) or [""]
+    figure = _figure(name, (10, 1.5 + 1.2 * len(spans)))
+    for axes, flight in zip(np.ravel(figure.subplots(len(flights), 1)), flights, strict=True):
+        own = {node: known for (of, node), known in spans.items() if of == flight}
+        begun = min(
+            (first for known in own.values() for first, _ in known.values()), default=np.datetime64("NaT", "ns")
+        )
+        for row, known in enumerate(own.values()):
+            for kind, (first, last) in known.items():
+                start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - begun, last - first))
+                colour, lift = ("tab:blue", 0.05) if kind == "recorded" else ("tab:green", -0.35)
+                axes.barh(row + lift, length_s, left=start_s, height=0.3, align="edge", color=colour)
+        axes.set_yticks(range(len(own)), [shown(node) for node in own])
+        begins = "" if np.isnat(begun) else f", seconds since {utc(begun)}"
+        _named(axes, f"{shown(flight)}{begins}; blue: recorded, green: logged", "")
+    return figure
+
+
+def _figure(name: str, size: tuple[float, float]) -> Figure:
+    figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle(shown(name, 100), parse_math=False)
+    return figure
+
+
+def _named(axes: "Axes", across: str, up: str) -> None:
+    axes.set_xlabel(across, parse_math=False)
+    axes.set_ylabel(up, parse_math=False)
+    axes.grid(visible=True, linewidth=0.3)
+    for axis in (axes.xaxis, axes.yaxis):
+        digits = axis.get_major_formatter()
+        if isinstance(digits, ScalarFormatter):
+            digits.set_useOffset(False)
+
+
+def _decibels(values: NDArray[np.complexfloating]) -> Floats:
+    """Return amplitudes in dB under the largest; of more columns than a picture has the largest of each few."""
+    amplitude = np.abs(values)
+    fold = -(-amplitude.shape[1] // _COLUMNS)
+    padded = np.pad(amplitude, ((0, 0), (0, -amplitude.shape[1] % fold)))
+    coarse = padded.reshape(len(amplitude), -1, fold).max(axis=2)
+    largest = float(coarse.max()) or 1.0
+    return np.asarray(20 * np.log10(np.maximum(coarse / largest, 10 ** (_FLOOR_DB / 20))))
+
+
+def _image(axes: "Axes", level_db: Floats, across: tuple[float, float], label: str, *, rows: int | None = None) -> None:
+    """Draw levels; of more rows than are drawn the axis counts all."""
+    extent = (*across, rows or len(level_db), 0)
+    drawn = axes.imshow(level_db, extent=extent, aspect="auto", cmap="viridis", vmin=_FLOOR_DB, vmax=0)
+    axes.figure.colorbar(drawn, ax=axes, label=label)

@@ -1,0 +1,171 @@
+"""What is told of a file or folder: facts by name, for people and for machines."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apertura.common.errors import CampaignError, shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_UNITS = {"hz": "Hz", "m": "m", "m_s": "m/s", "s": "s", "deg": "deg", "db": "dB", "utc": "UTC", "share": "share"}
+"""What the name of a fact ends in → unit."""
+
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
+_LONGEST = 600
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is told of a file or folder.
+
+    Attributes
+    ----------
+    path
+        The file or folder.
+    kind
+        flight log, recording, phase history, elevation model, array, campaign folder, folder or unknown.
+    format
+        A key of the table of its readers; empty where there is one alone.
+    facts
+        Name, which ends in its unit → what JSON knows; a list of two numbers is a range.
+    missing
+        What is missing for an image, a sentence each.
+    problem
+        Why it was refused.
+    parts
+        What a folder holds.
+    columns
+        Facts of the parts that a table of them shows.
+    spelt
+        Facts of the parts that are too long for a table, a line each.
+    picture
+        Draws a preview.
+    """
+
+    path: Path
+    kind: str
+    format: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    problem: CampaignError | None = None
+    parts: tuple["Report", ...] = ()
+    columns: tuple[str, ...] = ()
+    spelt: tuple[str, ...] = ()
+    picture: "Callable[[], Figure] | None" = None
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return f"{self.kind} ({self.format})" if self.format else self.kind
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what JSON can hold of it.
+
+        Examples
+        --------
+        >>> Report(Path("a.csv"), "flight log", "csv", {"epochs": 2}).as_json()["facts"]
+        {'epochs': 2}
+        """
+        problem = self.problem
+        return {
+            "path": str(self.path),
+            "kind": self.kind,
+            "format": self.format,
+            "facts": dict(self.facts),
+            "missing": list(self.missing),
+            "problem": problem and {name: getattr(problem, name) for name in ("found", "where", "expected", "remedy")},
+            "parts": [part.as_json() for part in self.parts],
+        }
+
+    def lines(self) -> Iterator[tuple[str, str]]:
+        """Yield name and value of each fact as people read them, with units and without control characters."""
+        for name, value in self.facts.items():
+            yield worded(name, value)
+
+
+def worded(name: str, value: object) -> tuple[str, str]:
+    """Return a fact in words: its name without the unit, its value with it.
+
+    Examples
+    --------
+    >>> worded("rate_hz", 1.25e6), worded("height_m", [1.0, 20.5]), worded("fix", {"fix": 3, "float": 1})
+    (('rate', '1.25 MHz'), ('height', '1.00 to 20.50 m'), ('fix', 'fix 3, float 1'))
+    """
+    ends = next((end for end in sorted(_UNITS, key=len, reverse=True) if name.endswith(f"_{end}")), "")
+    return name.removesuffix(f"_{ends}").replace("_", " "), shown(_told(value, _UNITS.get(ends, "")), _LONGEST)
+
+
+def _told(value: object, unit: str) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(" ".join(worded(str(name), part)) for name, part in value.items()) or "none"
+    if isinstance(value, list):
+        return _listed(value, unit)
+    if isinstance(value, float):
+        return _number(value, unit)
+    if value is None or isinstance(value, bool):
+        return {None: "not known", True: "yes", False: "no"}[value]
+    return f"{value} {unit}" if unit and not isinstance(value, str) else str(value)
+
+
+def _listed(values: list[Any], unit: str) -> str:
+    told = [_told(value, unit) for value in values]
+    if unit and len(values) == 2 and not isinstance(values[0], str):
+        return f"{told[0].removesuffix(f' {unit}')} to {told[1]}"
+    return ("; " if any(isinstance(value, Mapping) for value in values) else ", ").join(told) or "none"
+
+
+def _number(value: float, unit: str) -> str:
+    if unit == "Hz":
+        scale, prefix = next(((scale, prefix) for scale, prefix in _PREFIXES if abs(value) >= scale), (1.0, ""))
+        return f"{value / scale:.9g} {prefix}Hz"
+    if unit == "share":
+        return f"{100 * value:.4g} %"
+    digits = {"deg": ".6f", "dB": ".1f", "m": ".2f" if abs(value) >= 1 else ".3g"}.get(unit, ".6g")
+    return f"{value:{digits}} {unit}".rstrip()
+
+
+def print_report(report: Report, name: Path | None = None) -> None:
+    """Print what is told of a file or folder, for people; `name` is what they call it."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    console.print(Text.assemble((shown(name or report.path, 400), "bold"), f": {report.title}"))
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    for fact, value in report.lines():
+        grid.add_row(Text(f"  {fact}", style="dim"), Text(value))
+    if report.facts:
+        console.print(grid)
+    if report.parts:
+        console.print(_table(report))
+    for part in report.parts:
+        for fact, value in (worded(name, part.facts[name]) for name in report.spelt if name in part.facts):
+            console.print(Text(f"  {shown(part.path.name)}, {part.title}, {fact}: {value}"))
+    if report.problem:
+        problem = report.problem
+        told = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
+        console.print(Text.assemble(("refused: ", "red"), told))
+    if report.missing:
+        console.print(Text("missing for an image:" if not report.problem else "what helps:", style="yellow"))
+    for sentence in report.missing:
+        console.print(Text(f"  - {shown(sentence, _LONGEST)}"))
+
+
+def _table(report: Report) -> Any:
+    """Return a row for each part: what it is, and those facts of it that the columns name."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in ("", "is", *(worded(name, None)[0] for name in report.columns)):
+        table.add_column(heading, overflow="fold")  # a narrow terminal wraps what is told, and cuts nothing
+    for part in report.parts:
+        cells = [worded(name, part.facts[name])[1] if name in part.facts else "" for name in report.columns]
+        title = f"{part.title}, refused: {part.problem.found}" if part.problem else part.title
+        table.add_row(*(Text(shown(cell, 200)) for cell in (part.path.name, title, *cells)))
+    return table

@@ -1,0 +1,100 @@
+"""`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
+
+import shutil
+from dataclasses import replace
+from math import isfinite
+from typing import TYPE_CHECKING
+
+from apertura.common.errors import CampaignError
+from apertura.core.planning.plan import Plan
+from apertura.core.quality.budget import BudgetLine, expected
+from apertura.core.quality.path_errors import Effect
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.budget import budget_of
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import plan_pair
+from apertura.pipeline.opening.refined import expected_track
+from apertura.pipeline.opening.scene import Flown, expected_scene
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
+    """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran."""
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
+    return plan_pair(campaign, open_pair(campaign, flight, pair), scene, threads=threads)
+
+
+def first_flight(campaign: Campaign) -> Flown:
+    """Return what all pairs of the first image flight fly, from which the one grid of all images is settled."""
+    flight = campaign.image_flights[0]
+    return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
+
+
+def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
+    """Print every pair's decisions, reasons, predicted error, seconds and bytes; nothing is run or written."""
+    from rich.console import Console
+    from rich.filesize import decimal
+
+    console = Console(width=max(140, Console().width))
+    seconds, disk = 0.0, 0
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
+    for flight in campaign.image_flights:
+        logged = [open_pair(campaign, flight.name, pair) for pair in flight.pairs]
+        pairs, autofocus = expected_track(campaign, logged, scene)
+        for opened in pairs:
+            plan = plan_pair(campaign, opened, scene, threads=threads)
+            plan = replace(plan, decisions=(*plan.decisions, *autofocus))
+            budget = _budget_table(budget_of(campaign, opened, scene))
+            console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
+            for name, line in plan.flags.items():
+                console.print(f"[yellow]{name}[/yellow]: {line}")
+            seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
+    console.print(
+        f"in all about {seconds:.2g} s of imaging on {threads} threads, {decimal(disk)} on disk before compression"
+    )
+    free = shutil.disk_usage(campaign.root).free
+    if disk > free and not campaign.results.is_dir():
+        raise CampaignError(
+            f"the results of all pairs need {decimal(disk)} on disk",
+            where=campaign.root,
+            expected=f"at most the {decimal(free)} that are free",
+            remedy="Free some space, or make the scene smaller.",
+        )
+
+
+def _table(plan: Plan, title: str) -> "Table":
+    from rich.filesize import decimal
+    from rich.table import Table
+
+    table = Table(title=f"{title}: {plan.setting.line}", title_justify="left")
+    for heading in ("choice", "value", "reason", "error"):
+        table.add_column(heading, overflow="fold")
+    for decision in plan.decisions:
+        error = "" if decision.error_db is None else f"{decision.error_db:.1f} dB"
+        table.add_row(decision.name, str(decision.value), decision.reason, error)
+    table.add_section()
+    memory, disk = decimal(plan.memory_bytes), decimal(plan.disk_bytes)
+    line = f"about {plan.predicted_seconds:.2g} s, {memory} of memory, {disk} on disk"
+    table.add_row("predicted", f"{plan.accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
+    return table
+
+
+def _budget_table(lines: list[BudgetLine]) -> "Table":
+    from rich.table import Table
+
+    table = Table(title="error budget", title_justify="left")
+    for heading in ("cause", "stated", "loss of peak", "shift", "phase"):
+        table.add_column(heading, overflow="fold")
+    for line in lines:
+        report = line.report
+        table.add_row(report["cause"], report["stated"], *_effect(line.effect))
+    table.add_section()
+    table.add_row("all that is stated", "", *_effect(expected(lines)))
+    return table
+
+
+def _effect(effect: Effect) -> tuple[str, str, str]:
+    phase = f"{effect.phase_rad:.2g} rad" if isfinite(effect.phase_rad) else "not predicted"
+    return f"{effect.loss_db:.2f} dB".replace("-0.00", "0.00"), f"{100 * effect.shift_m:.2g} cm", phase

@@ -1,0 +1,214 @@
+"""Rule `pictures`: what the report shows of a pair, drawn from its stages."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from rasterio import Affine
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.progress import progress
+from apertura.common.provenance import Provenance
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.geometry.geodesy import map_from_frame
+from apertura.core.imaging.certify import CUT_REACH_M
+from apertura.core.imaging.stages import aperture_of, profiles_of
+from apertura.core.quality.point_targets import cut_through, find_peak, line_through
+from apertura.formats.export.coverage import footprint
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.refined import open_refined
+from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.steps.coverage import crs_name, few_looks
+from apertura.pipeline.steps.stamping import tags_of
+from apertura.pipeline.store import blocks_of_rows, open_stage, record_files
+from apertura.views.report import PICTURES
+from apertura.views.report.budget import Measured, draw_budget
+from apertura.views.report.cuts import DrawnCut, draw_cuts
+from apertura.views.report.geometry import FlownGeometry, draw_geometry
+from apertura.views.report.phase import draw_phase, sidelink_error_rad
+from apertura.views.report.pulses import PulseRecord, draw_pulses
+from apertura.views.report.sheet import thinned
+from apertura.views.report.waterfall import Waterfall, draw_waterfall
+
+Floats = NDArray[np.float64]
+
+
+def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
+    """Write the pictures of one pair; return their paths."""
+    lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root)
+    shown = Shown(campaign, flight, pair)
+    written = [campaign.result(flight, pair, "pictures", f"{name}.png") for name in PICTURES]
+    geometry, pulses, phase, cuts, profiles, budget = written
+    origin = Provenance.of(lineage.modules, [shown.echo, shown.profile, shown.image], settings=shown.scene.spec)
+    drawn: dict[str, Any] = {"title": f"flight {flight}, {pair}", "tags": tags_of(origin, lineage)}
+    quality = shown.image.attrs["quality"]
+    draw_geometry(geometry, shown.geometry(), **drawn)
+    draw_pulses(pulses, shown.record(), **drawn)
+    draw_phase(phase, shown.time_s, shown.phasors(), **drawn)
+    draw_cuts(cuts, shown.cuts(), **drawn)
+    draw_waterfall(profiles, shown.waterfall(), shown.time_s, shown.target_path_m, **drawn)
+    measured = Measured(*(quality["focus"].get(name) for name in ("loss_db", "std_db", "expected_db")))
+    draw_budget(budget, quality["budget"], measured, **drawn)
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A pair as its pictures are drawn from it.
+
+    Attributes
+    ----------
+    campaign, flight, pair
+        Which.
+    """
+
+    campaign: Campaign
+    flight: str
+    pair: str
+
+    @cached_property
+    def echo(self) -> xr.Dataset:
+        """Stage `echo`."""
+        return self._stage("echo")
+
+    @cached_property
+    def profile(self) -> xr.Dataset:
+        """Stage `profile`."""
+        return self._stage("profile")
+
+    @cached_property
+    def image(self) -> xr.Dataset:
+        """Stage `image`."""
+        return self._stage("image")
+
+    def _stage(self, name: str) -> xr.Dataset:
+        return open_stage(self.campaign.stage(name, self.flight, self.pair), name)
+
+    @cached_property
+    def scene(self) -> OpenScene:
+        """Grid and ground."""
+        return open_scene(self.campaign)
+
+    @cached_property
+    def time_s(self) -> Floats:
+        """(pulse,) seconds from the first pulse that makes the image."""
+        return _seconds(self.echo.time.values, self.echo.time.values[0])
+
+    @cached_property
+    def _target(self) -> tuple[float, float]:
+        """Row and column of the brightest target."""
+        brightest = self.image.attrs["quality"]["brightest"]
+        row, column = self.scene.grid.pixel_of(brightest["x_m"], brightest["y_m"])
+        return float(row), float(column)
+
+    @cached_property
+    def _target_m(self) -> Floats:
+        """(1, 3) the brightest target in the frame of the antennas."""
+        row, column = (np.array([at]) for at in self._target)
+        return np.asarray(self.scene.terrain.positions_at(self.scene.grid, row, column)).reshape(1, 3)
+
+    @cached_property
+    def target_path_m(self) -> Floats:
+        """(pulse,) total path to the brightest target."""
+        return aperture_of(self.profile).path(self._target_m)[:, 0]
+
+    def geometry(self) -> FlownGeometry:
+        """Return tracks, scene and footprint on the map."""
+        grid, aperture = self.scene.grid, aperture_of(self.echo)
+        some = thinned(len(aperture), 400)
+        legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
+        if len(set(self.pair.split("-"))) == 1:
+            del legs["receiver"]  # the same node: one track
+        step, _, west, _, _, north = grid.transform
+        looks = few_looks(self.campaign, self.flight, self.pair)
+        down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
+        rings = footprint(looks, Affine(right, 0, west, 0, -down, north))
+        return FlownGeometry(
+            self.time_s[some],
+            {name: map_from_frame(grid.crs, leg) for name, leg in legs.items()},
+            grid.bounds_m,
+            float(np.array(map_from_frame(grid.crs, self.scene.middle_m))[2]),
+            np.array(map_from_frame(grid.crs, self._target_m[0])),
+            [ring for polygon in rings for ring in polygon],
+            crs_name(grid),
+        )
+
+    def record(self) -> PulseRecord:
+        """Return which pulses make the image, and what the sidelink told of them."""
+        echo, sent = self.echo, self._sent()
+        counted = echo.attrs.get("pulses") or {}
+        snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
+        beyond_m = None
+        if "sidelink_delay" in echo and "sidelink_vector" in echo:
+            beyond_m = echo.sidelink_delay.values - np.linalg.norm(echo.sidelink_vector.values, axis=1)
+            beyond_m = beyond_m - np.nanmedian(beyond_m)
+        return PulseRecord(
+            _seconds(sent, sent[0]),
+            np.isin(sent, echo.time.values),
+            counted.get("reasons") or {},
+            _seconds(echo.time.values, sent[0]),
+            snr_db,
+            beyond_m,
+        )
+
+    def _sent(self) -> NDArray[np.datetime64]:
+        """Return when the transmitter says that it sent each pulse; of phase history only what it holds is known."""
+        if not isinstance(self.campaign.settings.waveform, SampledWaveform):
+            return np.asarray(self.echo.time.values)
+        node = self.pair.split("-")[0]
+        raw = open_stage(self.campaign.stage("raw", self.flight, node), "raw")
+        return np.asarray(self.campaign.clock(self.flight, node).utc(raw.time.values)).astype("datetime64[ns]")
+
+    def phasors(self) -> dict[str, NDArray[np.complex128]]:
+        """Return what each pulse adds at the brightest target: without sidelink, with it, with tracks refined."""
+        logged, echo = profiles_of(self.profile, lazy=True), self.echo
+        every = np.arange(len(logged) + 1)
+        heard = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
+        found = {}
+        if "sidelink_phase" in echo and "sidelink_vector" in echo:
+            turns = 2 * np.pi * float(echo.frequency.values.mean()) / SPEED_OF_LIGHT_M_S
+            length_m = np.linalg.norm(echo.sidelink_vector.values, axis=1)
+            error = sidelink_error_rad(echo.sidelink_phase.values, length_m, wavenumber_rad_m=turns)
+            found["before: without the sidelink"] = np.nan_to_num(heard * np.exp(1j * error))
+            found["corrected by the sidelink"] = heard
+        else:
+            found["as recorded, on the tracks of the logs"] = heard
+        refined = open_refined(self.campaign, self.flight)
+        if refined.correction is not None:
+            moved = refined.profiles(open_pair(self.campaign, self.flight, self.pair, echo=echo), logged)
+            found["tracks refined"] = block_contributions(moved, self._target_m, edges=every)[0].astype(np.complex128)
+        return found
+
+    def cuts(self) -> list[DrawnCut]:
+        """Return the cuts whose widths image.json states."""
+        east, north = self.image.attrs["quality"]["brightest"]["cross_range_direction"]
+        image, spacing_m = self.image.image, self.scene.grid.spacing_m
+        peak = find_peak(image, *(round(at) for at in self._target))
+        cuts = []
+        for name, direction in (("cross-range", (east, north)), ("ground range", (north, -east))):
+            way: dict[str, Any] = {"direction": direction, "spacing_m": spacing_m, "reach_m": CUT_REACH_M}
+            cut = cut_through(image, peak, **way)
+            cuts.append(DrawnCut(name, *line_through(image, peak, **way), cut.width_m, cut.pslr_db, cut.islr_db))
+        return cuts
+
+    def waterfall(self) -> Waterfall:
+        """Return the mean power of the range profiles, read some at a time."""
+        profile = self.profile
+        falling = Waterfall(profile.start.values, profile.attrs["step_m"], profile.sizes["range"])
+        with progress("pulses", profile.sizes["pulse"]) as done:
+            for part in blocks_of_rows(profile, "profile"):
+                falling.add(part.start, profile.profile[part].values)
+                done(part.stop - part.start)
+        return falling
+
+
+def _seconds(times: NDArray[np.datetime64], since: np.datetime64) -> Floats:
+    return np.asarray((times - since) / np.timedelta64(1, "s"), np.float64)

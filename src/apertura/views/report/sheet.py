@@ -1,0 +1,93 @@
+"""A sheet of drawings as wide as the text of an A4 page: its letters and colours, the same to the byte every time."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
+from numpy.typing import NDArray
+
+from apertura.common.atomic import replacement
+
+WIDTH = 6.7
+"""Inches: A4 between margins of 2 cm."""
+
+DPI = 220
+MOST_DOTS = 4000
+"""Points of a series that are drawn; more would cover each other."""
+
+BLUE, ORANGE, GREEN, RED, SKY, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#666666"
+"""Told apart also by who does not see red and green (Okabe and Ito)."""
+
+_STYLE: Any = {
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.fontsize": 7,
+    "legend.framealpha": 0.9,
+    "text.parse_math": False,
+}
+
+
+@contextmanager
+def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> Iterator[Figure]:
+    """Yield an empty figure that becomes a PNG when the body ends.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    height
+        Inches.
+    title
+        What it is called; lies in the file.
+    tags
+        Provenance, name → text; lies in the file.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     with sheet(Path(folder) / "one.png", 2.0, title="a line", tags={}) as figure:
+    ...         _ = figure.add_subplot().plot([0, 1])
+    ...     (Path(folder) / "one.png").read_bytes()[1:4]
+    b'PNG'
+    """
+    with matplotlib.style.context("default"), matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        with replacement(path) as temporary:
+            figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+
+
+def column_of(figure: Figure, rows: int) -> list[Axes]:
+    """Return drawings one below the other that share their horizontal axis; only the lowest is labelled there."""
+    grid = GridSpec(rows, 1, figure=figure)
+    first = figure.add_subplot(grid[0])
+    drawn = [first, *(figure.add_subplot(grid[row], sharex=first) for row in range(1, rows))]
+    for axes in drawn[:-1]:
+        axes.tick_params(labelbottom=False)
+    return drawn
+
+
+def thinned(count: int, most: int = MOST_DOTS) -> NDArray[np.int64]:
+    """Return which of a series are drawn, (point,) int64, evenly spread.
+
+    Examples
+    --------
+    >>> thinned(3).tolist(), thinned(9, 3).tolist()
+    ([0, 1, 2], [0, 4, 8])
+    """
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

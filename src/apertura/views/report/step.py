@@ -1,0 +1,199 @@
+"""Rule `page`: what the report says of a flight, as the results section of a paper would: one file that prints."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from apertura.common.atomic import replacement, write_text
+from apertura.common.documents import undamaged
+from apertura.common.errors import CampaignError, shown
+from apertura.common.paths import shipped
+from apertura.common.provenance import Provenance, sha256_file
+from apertura.common.raster import opened_raster
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import Lineage
+from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.layer import averaged
+from apertura.pipeline.opening.scene import OpenScene, settled_scene
+from apertura.pipeline.steps.stamping import tags_of
+from apertura.pipeline.store import open_listed, open_stage, read_manifest, record_files
+from apertura.views.report import PAGE, PANELS, PICTURES
+from apertura.views.report.landing import rst_table, rst_text
+from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table
+from apertura.views.report.page import page as page_of
+from apertura.views.report.panels import draw_panels
+from apertura.views.report.words import (
+    ASKED,
+    BUDGET,
+    DECISIONS,
+    FLAGGED,
+    VERDICTS,
+    budget_rows,
+    decision_rows,
+    flag_rows,
+    said,
+    sentences,
+    shared_rows,
+    told,
+    verdict_row,
+)
+
+_DOTS = 480  # of the longer side of a panel
+_MOST_PANELS = 2  # pairs beside their sums
+
+
+def page(campaign: Campaign, flight: str) -> list[Path]:
+    """Write results/<flight>/report.html and the panels of its images; return their paths."""
+    lineage = result_of(campaign, "page", flight).begin(campaign.root)
+    reports = reports_of(campaign, flight)
+    panels, text = campaign.result(flight, "fused", PANELS), campaign.result(flight, PAGE)
+    _write_panels(panels, campaign, flight, reports["fused"], lineage)
+    title = f"{campaign.settings.campaign}, flight {flight}"
+    write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
+    written = [text, panels]
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+def reports_of(campaign: Campaign, flight: str) -> dict[str, dict[str, Any]]:
+    """Return image.json of each pair of a flight and of 'fused'.
+
+    Raises
+    ------
+    CampaignError
+        If one is not as it was written.
+    """
+    found = {}
+    for name in (*campaign.flight(flight).pairs, "fused"):
+        path = campaign.result(flight, name, "image.json")
+        report = open_listed(path, path.with_name("export.manifest.json"))
+        with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
+            flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
+            verdict_row(name, report)  # what every sentence stands on is there
+        found[name] = {**report, "flags": flags}
+    return found
+
+
+def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> Iterator[Block]:
+    yield Table(
+        "What was asked, and the grid that it gave; all else is auto and decided below.", ASKED, asked_rows(campaign)
+    )
+    yield Table("What each image says of itself.", VERDICTS, [verdict_row(*one) for one in reports.items()])
+    yield Heading(2, "Pairs and their sums")
+    yield Paragraph(" ".join(sentences("Sum of the pairs", reports["fused"])))
+    yield Picture(
+        campaign.result(flight, "fused", PANELS).read_bytes(),
+        _caption("panels"),
+    )
+    for pair in campaign.flight(flight).pairs:
+        yield from _pair_blocks(campaign, flight, pair, reports[pair])
+    raised = flag_rows(reports)
+    yield Heading(2, "Flags")
+    if raised:
+        yield Table("What crossed a limit of a method, what it means and what to do.", FLAGGED, raised)
+    else:
+        yield Paragraph("No image of this flight carries a flag: nothing known was crossed.")
+
+
+def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> Iterator[Block]:
+    folder = campaign.result(flight, pair)
+    listed = {f"pictures/{name}.png": "pictures" for name in PICTURES}
+    yield Heading(2, f"Pair {pair}")
+    yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
+    for name, of in ({"quicklook.png": "export"} | listed).items():
+        yield Picture(_checked(folder / name, f"{of}.manifest.json", folder), _caption(Path(name).stem))
+    yield Table(
+        "Error budget; in brackets what a size assumed would do where nobody stated one.",
+        BUDGET,
+        budget_rows(report["budget"]),
+    )
+    yield Table("What the planner decided, and why.", DECISIONS, decision_rows(report))
+
+
+def _caption(name: str) -> str:
+    """Return what the workflow's report says below a picture."""
+    return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
+
+
+def _checked(path: Path, manifest: str, folder: Path) -> bytes:
+    """Return a picture as it was written."""
+    listed = read_manifest(folder / manifest)["files"]
+    name = path.relative_to(folder).as_posix()
+    if not path.is_file() or listed.get(name) != sha256_file(path):
+        remedy = f"Delete {folder / manifest} and run the workflow again."
+        raise CampaignError("not as it was written", path, f"what {manifest} describes", remedy)
+    return path.read_bytes()
+
+
+def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
+    scene, pairs = settled_scene(campaign), campaign.flight(flight).pairs[:_MOST_PANELS]
+    files = {pair: campaign.result(flight, pair, "power.tif") for pair in pairs}
+    for kind in ("coherent", "noncoherent"):
+        files[f"{kind} sum"] = campaign.result(flight, "fused", f"{kind}_power.tif")
+    powers = {}
+    for name, file in files.items():
+        with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
+            powers[name] = averaged(raster, _DOTS).astype("f8")
+    west, south, east, north = scene.grid.bounds_m
+    brightest = fused["brightest"]["x_m"] - west, fused["brightest"]["y_m"] - south
+    images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
+    tags = tags_of(Provenance.of(lineage.modules, images), lineage)
+    draw_panels(
+        path, powers, size_m=(east - west, north - south), target_m=brightest, title=f"flight {flight}", tags=tags
+    )
+
+
+def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
+    """Return what was asked of a campaign, key of the config → value; grid as settled, and why."""
+    values: dict[str, Any] = campaign.values
+    scene = settled_scene(campaign)
+    west, south, east, north = scene.grid.bounds_m
+    rows, columns = scene.grid.shape
+    waveform = [(f"waveform: {name}", said(value)) for name, value in values["waveform"].items() if told(value)]
+    grid = [
+        ("scene: CRS", scene.grid.crs + _why(scene, "crs")),
+        ("scene: west, south, east, north, m", ", ".join(map(said, scene.grid.bounds_m)) + _why(scene, "bounds_m")),
+        ("scene: size", f"{said(east - west)} m × {said(north - south)} m, {columns} × {rows} pixels"),
+        ("scene: pixels", f"{said(scene.grid.spacing_m)} m" + _why(scene, "spacing_m")),
+        ("scene: ground", values["scene"]["dem"] or f"level, {said(scene.level.height_m)} m"),
+    ]
+    chosen = [(f"processing: {name}", said(value)) for name, value in values["processing"].items() if told(value)]
+    return [*waveform, *grid, *chosen]
+
+
+def _why(scene: OpenScene, name: str) -> str:
+    return f" ({scene.chosen[name]})" if name in scene.chosen else ""
+
+
+def landing(campaign: Campaign) -> dict[str, Any]:
+    """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
+    flights = {one.name: one.pairs for one in campaign.image_flights}
+    reports = {f"{one} {name}": report for one in flights for name, report in reports_of(campaign, one).items()}
+    first, pairs = next(iter(flights.items()))
+    decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)
+    return {
+        "title": rst_text(campaign.settings.campaign),
+        "flights": rst_text(", ".join(f"{one} ({', '.join(names)})" for one, names in flights.items())),
+        "asked": rst_table(ASKED, asked_rows(campaign)),
+        "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
+        "sentences": [
+            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} fused"]))) for one in flights
+        ],
+        "first": rst_text(first),
+        "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
+        "flags": rst_table(FLAGGED, raised) if raised else "",
+    }
+
+
+@contextmanager
+def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
+    """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
+
+    What it is made from is looked at when it is written: snakemake settles the times of files before.
+    """
+    path = campaign.result(PAGE)
+    with replacement(path) as temporary:
+        yield temporary, shipped() / "workflow" / "report" / "report.css"
+        lineage = result_of(campaign, "report").begin(campaign.root)
+    record_files(campaign.root / lineage.result.manifest, [path], lineage)

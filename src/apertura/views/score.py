@@ -1,0 +1,127 @@
+"""Found against put: every point target of truth.json, in the GeoTIFFs a user would open."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from apertura.common.documents import read_json, undamaged
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.common.raster import opened_raster
+from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.scene.grid import SceneGrid
+from apertura.formats.export import product_files
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Flight
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.store import open_stage
+from apertura.views.summary import print_summary
+
+REACH_M = 1.0
+"""How far from its true place a target is looked for and its cuts go, metres."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One target in one image; lengths in metres."""
+
+    flight: str
+    image: str
+    target: int
+    error_east_m: float
+    error_north_m: float
+    cross_range_m: float
+    ground_range_m: float
+
+    @property
+    def error_m(self) -> float:
+        """Distance between where the target was found and where it was put."""
+        return float(np.hypot(self.error_east_m, self.error_north_m))
+
+
+def score(campaign: Campaign) -> list[Finding]:
+    """Return where each target of truth.json is found in each SLC of the campaign, and its −3 dB widths.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign has no truth.json or no results.
+    """
+    path = inside(campaign.root, "truth.json", where=campaign.root)
+    expected, remedy = "true target places", "Only simulated campaigns have them."
+    document = read_json(path, expected=expected, remedy=remedy)
+    with undamaged(path, expected=expected, remedy=remedy):
+        targets = [{name: float(target[name]) for name in ("x", "y")} for target in document["targets"]]
+    return [finding for flight in campaign.image_flights for finding in _flight(campaign, flight, targets)]
+
+
+def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
+    grid = settled_scene(campaign).grid
+    along = _along_track(campaign, flight, grid)
+    files = {pair: campaign.results / flight.name / pair / "slc.tif" for pair in flight.pairs}
+    files["fused"] = campaign.results / flight.name / "fused" / "coherent_slc.tif"
+    for name, file in files.items():
+        if not file.is_file():
+            raise CampaignError(
+                "no such file", where=file, expected="a finished campaign", remedy="Run the workflow first."
+            )
+        with opened_raster(file, expected="a finished campaign", remedy="Run the workflow again.") as raster:
+            image, spacing = raster.read(1), grid.spacing_m
+        for number, target in enumerate(targets):
+            row, column = map(float, grid.pixel_of(target["x"], target["y"]))
+            if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
+                continue
+            peak = find_peak(image, *_brightest_near(image, row, column, REACH_M / 4 / spacing))
+            across = (along[1], -along[0])
+            cuts = [
+                cut_through(image, peak, direction=direction, spacing_m=spacing, reach_m=REACH_M)
+                for direction in (along, across)
+            ]
+            yield Finding(
+                flight.name,
+                name,
+                number,
+                error_east_m=(peak.column - column) * spacing,
+                error_north_m=(row - peak.row) * spacing,
+                cross_range_m=cuts[0].width_m,
+                ground_range_m=cuts[1].width_m,
+            )
+
+
+def _brightest_near(image: NDArray[np.complex64], row: float, column: float, reach: float) -> tuple[int, int]:
+    first = [max(0, int(np.floor(at - reach))) for at in (row, column)]
+    window = np.abs(image[first[0] : int(row + reach) + 2, first[1] : int(column + reach) + 2])
+    down, right = np.unravel_index(int(np.nanargmax(window)), window.shape)
+    return first[0] + int(down), first[1] + int(right)
+
+
+def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[float, float]:
+    """Return the transmitter's direction over ground as (east, north)."""
+    echo = open_stage(campaign.stage("echo", flight.name, flight.pairs[0]), "echo")
+    ends = echo.tx_position.values[[0, -1]]
+    down, right, _ = np.diff(grid.pixel_below(ends), axis=0)[0]
+    return float(right), float(-down)
+
+
+def print_findings(campaign: Campaign, *, paths: bool) -> None:
+    """Print a short table of what `score` finds, and where the products lie."""
+    console = Console(width=120)
+    table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
+    for heading in ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range"):
+        table.add_column(heading, justify="right" if heading not in {"flight", "image"} else "left")
+    for finding in score(campaign):
+        numbers = (finding.error_east_m, finding.error_north_m, finding.error_m)
+        widths = (finding.cross_range_m, finding.ground_range_m)
+        row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]
+        table.add_row(
+            finding.flight, finding.image, str(finding.target), *row, *(f"{100 * width:.1f} cm" for width in widths)
+        )
+    console.print(table)
+    print_summary(campaign)
+    if paths:
+        for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
+            print(campaign.results / file)

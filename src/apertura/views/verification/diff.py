@@ -1,0 +1,215 @@
+"""`apertura diff`: two products told apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apertura.common.errors import CampaignError, shown
+from apertura.common.raster import opened_raster
+from apertura.formats.export.writing import blocks_of
+from apertura.pipeline.store import open_stage
+from apertura.views.verification.contents import EXPECTED, REMEDY, SECTIONS, sections_of
+from apertura.views.verification.links import shortened
+from apertura.views.verification.pixels import Pixels, Tally, rows_of
+from apertura.views.verification.products import unlinked
+from apertura.views.verification.tags import picture
+
+_LINES = 20
+_VALUE = 60
+_READ_BYTES = 1 << 20
+_HASH = re.compile("[0-9a-f]{64}")
+
+
+def differences(first: Path, second: Path) -> dict[str, list[str]]:
+    """Return section → what differs between two products, a line each; sections that both have and agree are empty.
+
+    Parameters
+    ----------
+    first, second
+        Rasters, pictures, stages or other files, of one kind; of one campaign or of two.
+
+    Raises
+    ------
+    CampaignError
+        If one is not there or not readable, or they are of two kinds.
+    """
+    for path in map(unlinked, (first, second)):
+        if not path.exists():
+            raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
+    if first.is_dir() != second.is_dir() or first.suffix != second.suffix:
+        raise CampaignError(f"of another kind than {first.name}", second, "two products of one kind", REMEDY)
+    told = sections_of(first), sections_of(second)
+    found = {section: _lines(*(one.get(section, {}) for one in told)) for section in SECTIONS if section in told[0]}
+    if first.is_dir():
+        return found | {"values": list(_stages(first, second))}
+    if first.suffix in _PIXELS:
+        found["pixels"] = list(_PIXELS[first.suffix](first, second))
+    if not any(found.values()):
+        at = first_difference(first, second)
+        found["bytes"] = [] if at is None else [f"first differ at byte {at}"]
+    return found
+
+
+def _lines(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
+    if bool(one) != bool(other):
+        return [f"{len(one or other)} entries → absent" if one else f"absent → {len(other)} entries"]
+    keys = [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
+    return [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys]
+
+
+def _cut(text: str | None) -> str:
+    if text is None:
+        return "absent"
+    return shown(shortened(text) if _HASH.fullmatch(text) else text, _VALUE)
+
+
+def first_difference(first: Path, second: Path) -> int | None:
+    """Return the first byte in which two files differ, from 0; None if they are the same.
+
+    Examples
+    --------
+    >>> first_difference(Path(__file__), Path(__file__)) is None
+    True
+    """
+    at = 0
+    with first.open("rb") as one, second.open("rb") as other:
+        while True:
+            left, right = one.read(_READ_BYTES), other.read(_READ_BYTES)
+            if left != right:
+                pairs = zip(left, right, strict=False)
+                return at + next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(left), len(right)))
+            if not left:
+                return None
+            at += len(left)
+
+
+def _rasters(first: Path, second: Path) -> Iterator[str]:
+    """Yield what tells the pixels of two rasters apart, where their grids lie on each other."""
+    with ExitStack() as stack:
+        one, other = (
+            stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in (first, second)
+        )
+        shift = _shift(one, other)
+        if shift is None:
+            yield "not compared: the grids do not lie on each other, in CRS, spacing or by whole pixels"
+            return
+        down, right = shift
+        rows = range(max(0, down), min(one.height, other.height + down))
+        columns = range(max(0, right), min(one.width, other.width + right))
+        if not rows or not columns:
+            yield "not compared: the grids do not overlap"
+            return
+        if (len(rows), len(columns)) != one.shape or one.shape != other.shape:
+            yield f"compared where both are: {len(columns)} × {len(rows)} of them"
+        tally = Tally.of(_blocks(one, other, (rows[0], columns[0]), shift, (len(rows), len(columns))))
+        yield from told(tally, unit=one.units[0] or "1", power="power" in (one.descriptions[0] or ""))
+
+
+def _shift(one: Any, other: Any) -> tuple[int, int] | None:
+    """Return row and column of the first raster where the second begins; None unless both are whole and grids agree."""
+    here, there = one.transform, other.transform
+    if one.crs != other.crs or not np.allclose(here[:2] + here[3:5], there[:2] + there[3:5], rtol=1e-9, atol=0):
+        return None
+    if here.b or here.d or not here.a or not here.e:
+        return None
+    right, down = (there.c - here.c) / here.a, (there.f - here.f) / here.e
+    if not max(abs(right - round(right)), abs(down - round(down))) < 1e-3:
+        return None
+    return round(down), round(right)
+
+
+def _blocks(
+    one: Any, other: Any, begin: tuple[int, int], shift: tuple[int, int], shape: tuple[int, int]
+) -> Iterator[tuple[Pixels, Pixels]]:
+    """Yield the overlap of two rasters, block by block."""
+    from rasterio.windows import Window
+
+    for rows, columns in blocks_of(shape):
+        top, left = rows.start + begin[0], columns.start + begin[1]
+        size = columns.stop - columns.start, rows.stop - rows.start
+        window, moved = Window(left, top, *size), Window(left - shift[1], top - shift[0], *size)
+        yield one.read(1, window=window), other.read(1, window=moved)
+
+
+def _pictures(first: Path, second: Path) -> Iterator[str]:
+    """Yield what tells two pictures of one size apart."""
+    one, other = (np.asarray(picture(path)) for path in (first, second))
+    if one.shape == other.shape:  # else geometry says so
+        yield from told(Tally.of([(one.astype(np.float32), other.astype(np.float32))]), unit="of 255")
+
+
+_PIXELS = {".tif": _rasters, ".png": _pictures}
+
+
+def _stages(first: Path, second: Path) -> Iterator[str]:
+    """Yield what tells the arrays of two stages apart, each with its name."""
+    one, other = (open_stage(folder, folder.stem) for folder in (first, second))
+    for name in one.variables:
+        if name not in other.variables or one[name].shape != other[name].shape or one[name].dtype.kind not in "fciubM":
+            continue  # geometry says so
+        tally = Tally.of(_rows(one[name], other[name]))
+        yield from (f"{name}: {line}" for line in told(tally, unit=str(one[name].attrs.get("units", "1"))))
+
+
+def _rows(one: Any, other: Any) -> Iterator[tuple[Pixels, Pixels]]:
+    if not one.ndim:
+        yield tuple(np.atleast_1d(_numbers(array.values)) for array in (one, other))  # type: ignore[misc]
+        return
+    for rows in rows_of(one.shape, one.dtype.itemsize):
+        yield _numbers(one[rows].values), _numbers(other[rows].values)
+
+
+def _numbers(values: Pixels) -> Pixels:
+    """Return times as seconds."""
+    return values.astype("M8[ns]").astype(np.int64) / 1e9 if values.dtype.kind == "M" else values
+
+
+def told(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
+    """Yield what tells two arrays apart, in words; nothing where they are the same.
+
+    Parameters
+    ----------
+    tally
+        Of both.
+    unit
+        Of their values; of those without one differences are told in dB of the peak.
+    power
+        Whether they are powers, and not amplitudes.
+
+    Examples
+    --------
+    >>> list(told(Tally.of([(np.array([1.0, 2.0]), np.array([1.0, 2.002]))])))
+    ['1 of 2 differ, by -60.0 dB of the peak at most, -63.0 dB rms; correlation 1.000000']
+    """
+    if not tally.differing:
+        return
+    if tally.compared and tally.largest:
+        largest, rms = (_level(one, tally, unit, power=power) for one in (tally.largest, tally.rms))
+        of = " of the peak" if unit == "1" else ""
+        kind = "coherence" if tally.phased else "correlation"
+        count = tally.compared + sum(tally.only)
+        yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"
+    if any(tally.only):
+        yield f"{tally.only[0]} values are held by the first alone, {tally.only[1]} by the second alone"
+
+
+def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:
+    if unit != "1":
+        return f"{value:.3g} {unit}"
+    return f"{(10 if power else 20) * np.log10(value / tally.peak):.1f} dB"
+
+
+def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
+    """Print what tells two products apart, a line each; return 0 if nothing does, else 1; raises as `differences`."""
+    found = differences(first, second)
+    for section, lines in found.items():
+        most = len(lines) if whole else _LINES
+        for line in lines[:most] or ["same"]:
+            print(shown(f"{section:<9}{line}", 400))
+        if len(lines) > most:
+            print(f"{section:<9}and {len(lines) - most} more: --all")
+    return 1 if any(found.values()) else 0
