@@ -44,13 +44,13 @@ def changes(copied, file, *modules):
         ("formats/export/__init__.py", "cube", False),
         ("formats/tracks/rtklib.py", "ingest", False),
         ("simulation/presets.py", "image", False),
-        ("constants.py", "image", True),
+        ("common/constants.py", "image", True),
         ("pipeline/config/nodes.py", "ingest", True),
         ("pipeline/store/progress.py", "ingest", True),
-        ("errors.py", "image", False),
+        ("common/errors.py", "image", False),
         ("formats/names.py", "ingest", True),
         ("formats/tracks/px4_ulog.py", "ingest", False),
-        ("cli.py", "ingest", False),
+        ("views/cli.py", "ingest", False),
     ],
 )
 def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, edited, step, reruns):
@@ -59,7 +59,7 @@ def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, ed
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
 def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
-    digests = copied / "focus/engines/_backprojection.sha256"
+    digests = copied / "core/focus/engines/_backprojection.sha256"
     digests.write_text("of other sources")
     assert changes(copied, digests, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
 

@@ -13,6 +13,7 @@ import apertura as ap
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.reading import read_log
 
 WAVEFORM = {
     "kind": "ofdm",
@@ -42,7 +43,7 @@ def write(folder, node=NODE, *, config=CONFIG, codes=CODES, **flight):
 
 def opened(folder):
     campaign = Campaign.load(folder)
-    return open_recording(campaign.recording_files("f01", "uav1")), campaign.read_log("f01", "uav1")
+    return open_recording(campaign.recording_files("f01", "uav1")), read_log(campaign, "f01", "uav1")
 
 
 @pytest.mark.parametrize("dtype", ["int8", "int16", "int32", "float32", ">i2"])

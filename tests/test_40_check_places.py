@@ -15,6 +15,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems, resources
 from apertura.pipeline.check.clocks import likely_cause
 from apertura.pipeline.check.dem import needles
+from apertura.pipeline.opening.reading import read_log
 from apertura.simulation.presets import DEMO_ORIGIN
 
 Usage = namedtuple("Usage", "total used free")
@@ -118,7 +119,7 @@ def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
 def test_an_epoch_at_no_place_is_left_out_of_the_log(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:30], zero(lines[30]), *lines[31:]])
     assert told(tiny) == []
-    track = Campaign.load(tiny).read_log("f01", "uav1")
+    track = read_log(Campaign.load(tiny), "f01", "uav1")
     assert track.sizes["epoch"] == 60
     assert track.attrs["dropped"] == {"no fix": 1}
 

@@ -113,14 +113,14 @@ CHANGES = [
     ("formats/recordings/sigmf.py", "code", READ - {"track"}),
     ("views/webmap/page.py", "code", set()),  # what a browser is shown, of results that are there
     ("common/flags/images.py", "code", {"page", "report", "map"}),
-    ("errors.py", "code", set()),
+    ("common/errors.py", "code", set()),
     ("pipeline/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
     ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
     ("pipeline/lineage/products.py", "code", set()),  # sources and settings are compared for themselves
     ("core/focus/engines/numba.py", "comment", set()),
     ("core/focus/engines/numba.py", "code", FOCUSED),
-    ("constants.py", "code", EVERY),
+    ("common/constants.py", "code", EVERY),
 ]
 EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edited."""\n'}
 

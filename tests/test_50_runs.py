@@ -431,7 +431,14 @@ def test_who_holds_a_campaign_may_be_asked_while_a_run_begins(tmp_path):
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
 def test_make_demo_leaves_a_folder_of_somebody_else_alone(tmp_path):
     shutil.copy(ROOT / "Makefile", tmp_path)
-    for name in ("requirements/uv.txt", "requirements/all.txt", "pyproject.toml", ".venv/.installed", "demo/notes.txt"):
+    for name in (
+        "requirements/uv.txt",
+        "requirements/all.txt",
+        "pyproject.toml",
+        "research/pyproject.toml",
+        ".venv/.installed",
+        "demo/notes.txt",
+    ):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")

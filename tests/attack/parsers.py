@@ -13,13 +13,20 @@ from apertura.core.scene.geoid_grid import undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.names import recording_files
-from apertura.formats.phase_histories import cphd, hdf5_history, history_layout, phase_history, zarr_history
+from apertura.formats.phase_histories import (
+    cphd,
+    cphd_fields,
+    hdf5_history,
+    history_layout,
+    phase_history,
+    zarr_history,
+)
 from apertura.formats.phase_histories.afrl import joined
 from apertura.formats.phase_histories.mat_fields import read_fields
 from apertura.formats.phase_histories.pulson import read_pulson
-from apertura.formats.reading import cphd_fields, dataflash_fields, open_recording, read_track, ulog_fields
+from apertura.formats.reading import open_recording, read_track
 from apertura.formats.recordings.sigmf_collection import check_listed
-from apertura.formats.tracks import ardupilot, px4_ulog
+from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
