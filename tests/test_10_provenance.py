@@ -70,6 +70,7 @@ print(json.dumps([name for name, module in ours.items() if not hasattr(module, "
 """
 
 
+@pytest.mark.slow
 def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))

@@ -22,6 +22,7 @@ from typer.main import get_command
 
 from apertura.cli import app
 from apertura.errors import CampaignError
+from apertura.isolation import SAFE_PATH
 from apertura.settings.template import config_schema
 from apertura.store.chunks import array_of
 
@@ -177,8 +178,9 @@ def finished(_finished, tmp_path):
     return copy_writable(_finished, tmp_path / "campaign")
 
 
-def test_a_marker_that_is_run_or_opened_is_seen(unfinished, tmp_path):
+def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
     """What the other tests rest on: Python started in the folder, and a file outside that is read."""
+    monkeypatch.delenv(SAFE_PATH, raising=False)  # whatever ran in this process before
     planted = plant(unfinished)
     with planted.fires() as fired:
         subprocess.run([sys.executable, "-c", "import yaml"], cwd=unfinished, check=False)
