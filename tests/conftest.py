@@ -1,17 +1,13 @@
-"""Shared campaigns: the real ones beside the repository, and small simulated ones made once a run. What is slow."""
+"""Shared campaigns: the real ones beside the repository, and small simulated ones made once a run. What is slow.
+
+Nothing of apertura is imported before a test needs it: the process that only hands out tests reads this file, too.
+"""
 
 import fcntl
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
 import pytest
-from folders import SHARED, copy_writable, run_steps
-from in_this_process import Processes
-
-from apertura.core.focus.engines import ENGINES, native, native_binding
-from apertura.formats import isolated
-from apertura.pipeline.campaign import Campaign
-from apertura.simulation import ImageGrid, preset, simulate
 
 # They run in other environments: of roc-validator, of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
@@ -55,6 +51,8 @@ def made_once(tmp_path_factory, worker_id):
 @pytest.fixture(scope="session")
 def shared():
     """../shared/data, where it exists."""
+    from folders import SHARED
+
     if not SHARED.is_dir():
         pytest.skip("real recordings are not here: no ../shared/data beside the repository")
     return SHARED
@@ -62,6 +60,8 @@ def shared():
 
 @pytest.fixture(scope="session")
 def _tiny(made_once):
+    from apertura.simulation import ImageGrid, preset, simulate
+
     plan = replace(preset("demo", pulses=40), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     return made_once("tiny", lambda root: simulate(root, plan, seed=7))
 
@@ -69,29 +69,51 @@ def _tiny(made_once):
 @pytest.fixture
 def tiny(_tiny, tmp_path):
     """A campaign folder of 40 pulses and 60 × 60 pixels, to be spoilt at will."""
+    from folders import copy_writable
+
     return copy_writable(_tiny, tmp_path / "campaign")
 
 
 @pytest.fixture(scope="session")
-def finished_tiny(_tiny, made_once):
-    """The tiny campaign with all its results; read only."""
-    return Campaign.load(made_once("finished", lambda root: run_steps(copy_writable(_tiny, root))))
+def all_steps(made_once):
+    """A copy of a campaign folder with all its results, by the name of what is made; read only."""
+    from folders import copy_writable, run_steps
+
+    from apertura.pipeline.campaign import Campaign
+
+    def made(name, source):
+        return Campaign.load(made_once(name, lambda root: run_steps(copy_writable(source, root))))
+
+    return made
 
 
 @pytest.fixture(scope="session")
-def finished_sample(shared, made_once):
+def finished_tiny(_tiny, all_steps):
+    """The tiny campaign with all its results; read only."""
+    return all_steps("finished", _tiny)
+
+
+@pytest.fixture(scope="session")
+def finished_sample(shared, all_steps):
     """The independently made campaign-sample with all its results; read only."""
-    return Campaign.load(made_once("sample", lambda root: run_steps(copy_writable(shared / "campaign-sample", root))))
+    return all_steps("sample", shared / "campaign-sample")
 
 
-WIDEST = next(filter(native_binding.runs, native.INSTRUCTION_SETS), None)
+def pytest_generate_tests(metafunc):
+    """Tests with `isa` run on every instruction set of the compiled engine; the one that is taken here is quick."""
+    if "isa" in metafunc.fixturenames:
+        from apertura.core.focus.engines import native, native_binding
+
+        taken = next(filter(native_binding.runs, native.INSTRUCTION_SETS), None)
+        others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != taken]
+        metafunc.parametrize("isa", [taken, *others] if taken else others, indirect=True)
 
 
-@pytest.fixture(
-    params=[pytest.param(isa, marks=[] if isa == WIDEST else [pytest.mark.slow]) for isa in native.INSTRUCTION_SETS]
-)
+@pytest.fixture
 def isa(request, monkeypatch):
-    """Each instruction set of the compiled engine that this machine runs, in turn; the one that is taken is quick."""
+    """An instruction set that the compiled engine runs on."""
+    from apertura.core.focus.engines import native_binding
+
     if not native_binding.runs(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
@@ -101,6 +123,8 @@ def isa(request, monkeypatch):
 @pytest.fixture
 def toy(monkeypatch):
     """The engine of `toy_engine.py`, known by its one row."""
+    from apertura.core.focus.engines import ENGINES
+
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
 
 
@@ -108,4 +132,8 @@ def toy(monkeypatch):
 def reader(request, monkeypatch):
     """What reads files that may crash their reader: this process, at once; by `make test-slow` one of its own, too."""
     if request.param == "here":
+        from in_this_process import Processes
+
+        from apertura.formats.reading import isolated
+
         monkeypatch.setattr(isolated, "subprocess", Processes)

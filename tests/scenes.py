@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam
 from apertura.core.antenna.pattern import antenna_axes, gaussian_cut
-from apertura.core.focus.engines import native
+from apertura.core.focus.engines import native, native_binding
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
@@ -23,6 +24,12 @@ from apertura.core.scene.terrain import FlatGround, GridHeights
 
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 WAVELENGTH = C / 1.2e9
+
+
+def without_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make this process one of an installation without a compiler."""
+    monkeypatch.setattr(native_binding, "library_path", lambda: Path("nowhere/_backprojection.so"))
+
 
 # A straight flight along east, flat ground north of it
 

@@ -76,6 +76,7 @@ print(json.dumps([name for name, module in ours.items() if name not in before an
 """
 
 
+@pytest.mark.slow
 def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))

@@ -84,6 +84,7 @@ def test_pulses_outside_a_beam_cost_less_than_without_beams_and_those_inside_mor
     assert 2 * dark < pixel_seconds(shared, 2, NO_BEAMS) < lit / 2.5
 
 
+@pytest.mark.slow
 @compiled
 def test_a_plan_counts_what_its_beams_cost():
     native = {"engine": "native"}

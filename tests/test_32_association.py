@@ -217,6 +217,7 @@ def test_one_wild_sidelink_measurement_is_no_wrong_association():
     assert detect_wrong_association(baseline_residual(measured, predicted)) is None
 
 
+@pytest.mark.slow
 def test_no_right_association_of_500_with_jittery_tags_is_suspected():
     """Jitter of the trigger from 1 mm to 3 m, Gaussian and uniform, over 30 to 800 pulses: at most one false alarm."""
     alarms = 0

@@ -66,6 +66,7 @@ def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordin
     np.testing.assert_allclose(whole, (row + window[0].start, column + window[1].start), atol=tolerance_px)
 
 
+@pytest.mark.quick("0.002-*", "300.0-EPSG:2056")
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "EPSG:3413", "EPSG:3857"])
 @pytest.mark.parametrize("spacing_m", [0.002, 1.0, 30.0, 300.0])
 def test_pixels_are_where_proj_puts_them_on_any_ground(crs, spacing_m):

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import compiled, decibels, ecef, fly, pixel_grid, scatter, without_library
 
 from apertura.core.focus.band_limited import band_limited_image
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.echoes import DEGREE, TAPS, tap_polynomials
-from apertura.core.focus.engines import native, native_binding
-from tests.scenes import compiled, decibels, ecef, fly, pixel_grid, scatter
+from apertura.core.focus.engines import native
 
 LOCAL = pixel_grid(40, 40)
 PLACES = ecef(LOCAL).reshape(-1, 3)[::7]
@@ -24,7 +24,7 @@ WAYS = [pytest.param(True, marks=compiled, id="compiled"), pytest.param(False, i
 def way(request, monkeypatch):
     """Both ways in which contributions are computed, one after the other."""
     if not request.param:
-        monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+        without_library(monkeypatch)
 
 
 def exact(block: slice) -> np.ndarray:
@@ -56,14 +56,11 @@ def test_the_compiled_engine_forms_the_same_image():
 
 
 @compiled
-@pytest.mark.parametrize("isa", native.INSTRUCTION_SETS)
-def test_every_instruction_set_adds_what_numpy_adds(isa, monkeypatch):
-    if not native_binding.runs(isa):
-        pytest.skip(f"no {isa} here")
-    monkeypatch.setenv("APERTURA_ISA", isa)
+@pytest.mark.usefixtures("isa")
+def test_every_instruction_set_adds_what_numpy_adds(monkeypatch):
     weights = np.random.default_rng(1).uniform(0, 1, PULSES)
     fast = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
-    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    without_library(monkeypatch)
     slow = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
     assert decibels(fast - slow, slow) < -115
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import ecef, fly, pixel_grid, plan, planning_job, scatter
+from scenes import ecef, fly, pixel_grid, plan, planning_job, scatter, without_library
 from scenes import side_beam as beam_of
 
 from apertura.common.errors import CampaignError
@@ -105,7 +105,7 @@ def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
 def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallback(monkeypatch):
     """Nor where it alone would come near an accuracy: what costs more than the double sum is worth nothing."""
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
-    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    without_library(monkeypatch)
     monkeypatch.setattr(cuda, "available", lambda: True)
     job = planning_job()
     (double_sum,) = load_engine("reference").candidates(job, pulses=300, asked={})

@@ -5,15 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-
-import apertura as ap
-from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.antenna.beam import Beams
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.echoes import Echoes
-from apertura.core.focus.engines import native, native_binding
-from apertura.core.focus.gradient import path_gradient
-from tests.scenes import (
+from scenes import (
     TARGET_GRID,
     compiled,
     ecef,
@@ -22,7 +14,15 @@ from tests.scenes import (
     point_history,
     scatter,
     swaying_beam,
+    without_library,
 )
+
+import apertura as ap
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beams
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.echoes import Echoes
+from apertura.core.focus.gradient import path_gradient
 
 LOCAL = pixel_grid(40, 40)
 PLACES = ecef(LOCAL).reshape(-1, 3)[::7]
@@ -36,7 +36,7 @@ STEP_M = 1e-4
 def way(request, monkeypatch):
     """Both ways in which gradients are computed, one after the other."""
     if not request.param:
-        monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+        without_library(monkeypatch)
 
 
 def added(profiles):
@@ -111,17 +111,14 @@ def test_the_gradient_belongs_to_the_image_of_block_contributions():
 
 
 @compiled
-@pytest.mark.parametrize("isa", native.INSTRUCTION_SETS)
-def test_every_instruction_set_gives_what_numpy_gives(isa, monkeypatch):
-    if not native_binding.runs(isa):
-        pytest.skip(f"no {isa} here")
+@pytest.mark.usefixtures("isa")
+def test_every_instruction_set_gives_what_numpy_gives(monkeypatch):
     slope = peaks(added(PROFILES).sum(0))[1]
     beams = Beams(receive=swaying_beam(PROFILES.aperture.rx_m, (12.0, 0.5, 0.0)))
-    monkeypatch.setenv("APERTURA_ISA", isa)
     monkeypatch.setattr("apertura.core.focus.echoes._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
     monkeypatch.setattr("apertura.core.focus.echoes._VALUES_AT_ONCE", 33 * 50)
     fast = path_gradient(PROFILES, PLACES, slope, beams=beams)
-    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    without_library(monkeypatch)
     slow = path_gradient(PROFILES, PLACES, slope, beams=beams)
     for side in (*SIDES, "path_m"):
         one, other = getattr(fast, side), getattr(slow, side)

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from scenes import without_library
 
 from apertura.common.errors import CampaignError
 from apertura.core.focus.engines import native, native_binding
@@ -23,7 +24,7 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch):
 
 
 def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
-    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    without_library(monkeypatch)
     assert not native.available()
     with pytest.raises(RuntimeError, match="install a C\\+\\+ compiler"):
         native.instruction_set()

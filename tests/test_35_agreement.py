@@ -75,6 +75,7 @@ def test_tiles_share_out_the_scene():
     assert len(np.unique(pixels.round(6), axis=0)) == len(pixels)
 
 
+@pytest.mark.slow
 def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
     sightings, unknowns = seen(1)
     ground = ground_of(sightings)

@@ -117,6 +117,7 @@ def test_sharpness_alone_finds_both_where_the_speed_changes():
     assert np.linalg.norm(np.array(found.report["brightest_m"]) - POINTS[0]) < 0.06
 
 
+@pytest.mark.slow
 def test_at_constant_velocity_sharpness_tells_nothing():
     grid = SceneGrid.from_bounds("local", (-2.0, 2.5, 2.0, 5.5), spacing_m=0.05)
     found = align_on_scene(*given(steadily), grid, FlatGround(0.0), within_s=(2.5, 4.0), search_m=0.0)

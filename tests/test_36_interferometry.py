@@ -220,6 +220,7 @@ def test_coherence_is_what_geometry_leaves(rise_m, overlap):
     assert found.measured.coherence == pytest.approx(found.measured.overlap, abs=0.06)
 
 
+@pytest.mark.slow
 def test_tracks_too_close_together_tell_no_height():
     found, _ = parts(0.05)
     assert found.measured.coherent == found.measured.common

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from campaigns import compressed, draw
-from scenes import WAVELENGTH, compiled, ground_points, monostatic, plan, planning_job, straight_track
+from scenes import WAVELENGTH, compiled, ground_points, monostatic, plan, planning_job, straight_track, without_library
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.common.errors import CampaignError
@@ -136,7 +136,7 @@ def test_an_accuracy_beyond_every_table_is_left_to_the_double_sum():
 def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was_not(monkeypatch):
     assert plan(shape=(100, 100)).engine == "native"
     assert plan(shape=(4000, 4000), overrides={"presum": 1}).engine == "tree"
-    monkeypatch.setattr("apertura.core.focus.engines.native_binding._BUILT", "nowhere/_backprojection.so")
+    without_library(monkeypatch)
     assert plan().engine == "numba"
     with pytest.raises(CampaignError, match=r"cannot run here.* a C\+\+ compiler"):
         plan(overrides={"engine": "native"})

@@ -66,6 +66,7 @@ def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagge
     assert ("sidelink_ripple_or_echo" in flags) is flagged
 
 
+@pytest.mark.quick("4.0-True")
 @pytest.mark.parametrize(("backoff_db", "flagged"), [(4.0, True), (14.0, False)])
 def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
     flags = echo_of(flown(tmp_path, adc=Adc(backoff_db=backoff_db))).attrs["flags"]
@@ -85,6 +86,7 @@ def test_auto_takes_the_cheapest_adequate_correction_and_flags_none(tmp_path, sn
     assert "sidelink_noisy" not in attrs["flags"]
 
 
+@pytest.mark.quick("8.0-True")
 @pytest.mark.parametrize(("snr_db", "flagged"), [(8.0, True), (12.0, False)])
 def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, flagged):
     campaign = flown(tmp_path, sidelink_snr_db=snr_db)
@@ -102,6 +104,7 @@ def test_an_echo_in_the_sidelink_is_flagged_where_division_is_asked_for(tmp_path
     assert ("sidelink_echo" in echo_of(Campaign.load(campaign.root)).attrs["flags"]) is flagged
 
 
+@pytest.mark.slow
 def test_auto_avoids_ghosts_of_an_echo_in_the_sidelink(tmp_path):
     attrs = echo_of(flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=0.3),))).attrs
     assert attrs["sidelink"]["method"] == "two_parameter"
@@ -129,6 +132,7 @@ def test_a_sidelink_that_never_locks_is_refused(tmp_path):
     assert "uav2: sidelink" in message
 
 
+@pytest.mark.quick("8.0-True")
 @pytest.mark.parametrize(("ppm", "corrected"), [(8.0, True), (0.5, False)])
 def test_a_clock_is_corrected_in_the_samples_only_where_it_matters(tmp_path, ppm, corrected):
     clock = Clock(cfo_hz=ppm * 1200.0, sfo_hz=ppm * 1024.0)
@@ -148,12 +152,14 @@ def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
     assert "right without one" in secondary["flags"]["wrong_code"]
 
 
+@pytest.mark.quick("0.022-True")
 @pytest.mark.parametrize(("offset_s", "flagged"), [(22e-3, True), (4e-3, False)])
 def test_a_tag_offset_near_half_an_interval_is_flagged(tmp_path, offset_s, flagged):
     flags = echo_of(flown(tmp_path, time_tag=TimeTag(offset_s=offset_s))).attrs["flags"]
     assert ("association_ambiguous" in flags) is flagged
 
 
+@pytest.mark.slow
 def test_flags_reach_image_json(tmp_path):
     campaign = flown(tmp_path, adc=Adc(backoff_db=4.0))
     dataset = echo_of(campaign)

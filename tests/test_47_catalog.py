@@ -154,6 +154,7 @@ def test_a_product_made_by_other_code_or_settings_says_so(finished):
     assert described["#job/echo/f01/uav1-uav2"] == "As the code and settings of today would make it."
 
 
+@pytest.mark.quick("results/f01/uav1-uav1/db.tif", "raw/f01/uav2.sigmf-data")
 @pytest.mark.parametrize(
     "name",
     [

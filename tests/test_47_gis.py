@@ -136,6 +136,7 @@ def test_control_points_lie_where_the_pixel_is_centred(control):
         assert there == pytest.approx((x, y), rel=0, abs=MILLIMETRE / 10)
 
 
+@pytest.mark.quick("EPSG:32632-*")
 @pytest.mark.parametrize(
     "sampled",
     [

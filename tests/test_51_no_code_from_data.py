@@ -21,6 +21,7 @@ from test_43_terrain import write_plane
 from typer.main import get_command
 
 from apertura.common.errors import CampaignError
+from apertura.common.isolation import SAFE_PATH
 from apertura.pipeline.config.template import config_schema
 from apertura.pipeline.store.chunks import array_of
 from apertura.views.cli import app
@@ -177,8 +178,9 @@ def finished(_finished, tmp_path):
     return copy_writable(_finished, tmp_path / "campaign")
 
 
-def test_a_marker_that_is_run_or_opened_is_seen(unfinished, tmp_path):
+def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
     """What the other tests rest on: Python started in the folder, and a file outside that is read."""
+    monkeypatch.delenv(SAFE_PATH, raising=False)  # whatever ran in this process before
     planted = plant(unfinished)
     with planted.fires() as fired:
         subprocess.run([sys.executable, "-c", "import yaml"], cwd=unfinished, check=False)

@@ -30,6 +30,7 @@ def run(*words, **options):
     return subprocess.run([APERTURA, "inspect", *words], capture_output=True, check=False, timeout=120, **options)
 
 
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("suffix", EVERY_SUFFIX)
 @pytest.mark.parametrize(
     "content", [b"", b"\x00\xff\x1b[31m" * 700, b"$,%\n1,2\n{[(" * 300], ids=["empty", "bytes", "text"]
@@ -64,6 +65,7 @@ def test_a_setting_that_is_none_is_one_message(shared, setting):
         look(F01 / "uav1.track.csv", [setting])
 
 
+@pytest.mark.slow
 def test_hostile_names_are_shown_escaped(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "500")
     names = [b"new\nline\x1b[31m.csv", b"[red]x[bold].pos", b"\xff\xfe.npy", b"n" * 250 + b".out", b"a\tb"]

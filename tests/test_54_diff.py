@@ -34,6 +34,7 @@ def told(first, second):
     return {section: lines for section, lines in differences(first, second).items() if lines}
 
 
+@pytest.mark.quick("slc.tif", "image.json", "mask.tif", "image.zarr")
 @pytest.mark.parametrize("name", ["slc.tif", "quicklook.png", "image.json", "mask.tif", "image.zarr"])
 def test_a_product_and_its_copy_are_the_same(finished_tiny, root, name, capsys):
     assert print_differences(finished_tiny.root / PAIR / name, root / PAIR / name) == 0

@@ -29,6 +29,12 @@ def test_every_link_of_an_untouched_product_is_the_same(root):
     assert chain.notes == []
 
 
+@pytest.mark.quick(
+    "raw/f01/uav2.sigmf-data",
+    "results/f01/uav1-uav2/profile.manifest.json",
+    "results/scene.json",
+    "results/f01/uav1-uav2/db.tif",
+)
 @pytest.mark.parametrize(
     "touched",
     [
