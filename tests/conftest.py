@@ -134,6 +134,6 @@ def reader(request, monkeypatch):
     if request.param == "here":
         from in_this_process import Processes
 
-        from apertura.formats.reading import isolated
+        from apertura.formats import isolated
 
         monkeypatch.setattr(isolated, "subprocess", Processes)

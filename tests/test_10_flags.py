@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from apertura.common.flags import FLAGS
+from apertura.common.flags.raised import Flags
 from website.pages import PAGES
 
 ROOT = Path(__file__).parents[1]
@@ -40,6 +41,8 @@ def gathered(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and tells_flags(node):
             yield from (one for one in ast.walk(node) if isinstance(one, ast.Return) and one.value)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"Flags", "Flags.merged"}:
+            yield from node.args
         elif isinstance(node, ast.keyword) and node.arg == "flags":
             yield node.value
         elif isinstance(node, ast.Dict):
@@ -129,3 +132,20 @@ def test_every_flag_is_named_in_the_file_that_is_said_to_raise_it():
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_that_comes_from_the_code_is_as_it_would_be_written_now(name):
     assert (ROOT / name).read_text(encoding="utf-8") == PAGES[name](), "run: make pages"
+
+
+def test_two_parts_that_raise_one_flag_both_have_their_say():
+    """The union of dicts keeps the last line and loses the other without a word."""
+    merged = Flags.merged({"clipped": "tx: 3 %"}, {"fix_lost": "9 pulses"}, {"clipped": "rx: 40 %"})
+    assert merged == {"clipped": "tx: 3 %; rx: 40 %", "fix_lost": "9 pulses"}
+    assert Flags.merged(merged, {"clipped": "rx: 40 %"}) == merged
+    assert Flags.merged({"defocused": "2 dB"}, {"defocused": "2 dB; most likely time tags"}) == {
+        "defocused": "2 dB; most likely time tags"
+    }
+
+
+def test_flags_are_brought_together_in_one_way_alone():
+    other = re.compile(r"""\*\*[\w.()]*\bflags\b|\bflags["\]]* \|=? |\| [\w.]*\bflags\b|\bflags["\]]*\.update\(""")
+    sources = [path for path in (ROOT / "src/apertura").rglob("*.py") if path.name != "raised.py"]
+    assert len(sources) > 100
+    assert [path.name for path in sources if other.search(path.read_text(encoding="utf-8"))] == []

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.flags.raised import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, spread
@@ -100,7 +101,7 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     sample = np.concatenate([demodulated(read(block)["radar"]) for block in blocks_of(some)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
     phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
-    flags = {**code.flags, **(phase.flags if phase else {})}
+    flags = Flags.merged(code.flags, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
 
@@ -154,13 +155,13 @@ def transfer_by_sidelink(
     delay_m = state.delay_cells * cell_m
     residual = baseline_residual(delay_m, sidelink_m)
     suspect = detect_wrong_association(residual)
-    flags = {
-        **unclocked,
-        **state.flags,
-        **edges(chosen, state),
-        **second_path_flags(state, cell_m=cell_m),
-        **({"association_suspect": suspect} if suspect else {}),
-    }
+    flags = Flags.merged(
+        unclocked,
+        state.flags,
+        edges(chosen, state),
+        second_path_flags(state, cell_m=cell_m),
+        {"association_suspect": suspect} if suspect else {},
+    )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     saturation = Saturation()
 

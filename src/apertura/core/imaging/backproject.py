@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.flags.raised import Flags
 from apertura.common.validation import validated
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illuminate
@@ -142,7 +143,7 @@ def backproject(
         "setting": formation.plan.setting.line,
         "predicted_error_db": round(formation.plan.predicted_error_db, 2),
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
-        "flags": json.dumps({**flags, **plan.flags}, ensure_ascii=False),
+        "flags": json.dumps(Flags.merged(flags, plan.flags), ensure_ascii=False),
     }
     return xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
 

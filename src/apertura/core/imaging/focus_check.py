@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.flags.raised import Flags
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Weigh
 from apertura.core.imaging.echo_place import echo_elsewhere
@@ -100,15 +101,15 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     }
 
 
-def focus_flags(report: dict[str, Any], expected_db: float) -> dict[str, str]:
+def focus_flags(report: dict[str, Any], expected_db: float) -> Flags:
     """Return the flags `defocused` where the bright points say so, and `echo_elsewhere`."""
-    flags = {"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {}
-    if report["verdict"] != "defocused":
-        return flags
-    return flags | {
-        "defocused": f"{report['why']}; {abs(expected_db):.1f} dB are expected of what is stated in the budget: "
-        "positions, lever arms, heights or times are worse, or not stated"
-    }
+    flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
+    if report["verdict"] == "defocused":
+        flags["defocused"] = (
+            f"{report['why']}; {abs(expected_db):.1f} dB are expected of what is stated in the budget: positions, "
+            "lever arms, heights or times are worse, or not stated"
+        )
+    return flags
 
 
 def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:

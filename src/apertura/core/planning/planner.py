@@ -6,6 +6,7 @@ from typing import Any
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.antenna.illumination import decide_antennas
 from apertura.core.focus.engines.engine import Setting, power_sum_db
 from apertura.core.focus.job import Integration, Job
@@ -82,7 +83,7 @@ def make_plan(
         predicted_seconds=chosen.table_seconds + chosen.form_seconds / min(job.threads, job.tiles),
         memory_bytes=memory,
         disk_bytes=disk,
-        flags={**flags, **missed, **integrated.flags},
+        flags=Flags.merged(flags, missed, integrated.flags),
         terrain=job.terrain.called(str(terrain.value)),
         presum=presum,
         middle_m=job.points_m[len(job.points_m) // 2],

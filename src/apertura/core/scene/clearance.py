@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Terrain
@@ -61,12 +62,13 @@ def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, whe
     CampaignError
         If an antenna is in or below the ground under it; it names what said how high the ground is.
     """
-    flags: dict[str, str] = {}
+    flags = Flags()
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):
         above, ground = clearance(grid, terrain, antenna)
         if (above <= 0).any():
             raise _below_ground(above, ground, f"{where}: at {int((above <= 0).sum())} pulses the {which}", terrain)
-        flags |= {} if isinstance(terrain, FlatGround) else _below_scene(grid, terrain, antenna, which)
+        if not isinstance(terrain, FlatGround):
+            flags = Flags.merged(flags, _below_scene(grid, terrain, antenna, which))
     return flags
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -161,9 +162,8 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     }
     pulsed = {name: (dims[name], np.concatenate([getattr(one, name)[one.used] for one in histories])) for name in dims}
     attrs: dict[str, Any] = {"frame": first.frame} if first.frame else {}
-    flags = missing_flags(pulsed["time"][1].astype("datetime64[ns]").astype(np.int64))
-    for one in histories:
-        flags |= one.flags
+    missing = missing_flags(pulsed["time"][1].astype("datetime64[ns]").astype(np.int64))
+    flags = Flags.merged(missing, *(one.flags for one in histories))
     attrs |= {"pair": pair, "flags": flags}
     reasons = Counter[str]()
     for one in histories:

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.flags.raised import Flags
 from apertura.core.echo.association import Association
 from apertura.core.echo.association_edges import tag_jitter_s
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
@@ -141,11 +142,12 @@ def _attributes(
         **measured.report,
         "positions": placed.report,
         "time_tags": _time_tags(nodes[0], pulses),
-        "flags": {**pulses.flags, **placed.flags, **measured.flags, **missing},
+        "flags": Flags.merged(
+            pulses.flags, placed.flags, measured.flags, missing, calibration["flags"] if calibration else {}
+        ),
         "pulses": _counted(len(nodes[0].raw.time), pulses, placed, measured),
     }
     if calibration:
-        attrs["flags"] |= calibration["flags"]
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
     return attrs
 
@@ -198,9 +200,10 @@ def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
         held = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
         cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
-        flags |= cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **held)
+        cut = cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **held)
+        flags = Flags.merged(flags, cut)
     report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
-    return replace(measured, flags={**measured.flags, **flags}, report=report)
+    return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
 
 
 def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:

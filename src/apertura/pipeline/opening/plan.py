@@ -6,6 +6,7 @@ from dataclasses import replace
 from rich.filesize import decimal
 
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.job import Job
@@ -46,7 +47,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
     accuracy = asked_accuracy(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
-    plan = replace(plan, decisions=(*plan.decisions, accuracy), flags={**flags, **plan.flags})
+    plan = replace(plan, decisions=(*plan.decisions, accuracy), flags=Flags.merged(flags, plan.flags))
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
     free_disk = None if written else shutil.disk_usage(campaign.root).free
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")

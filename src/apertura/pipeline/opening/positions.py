@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.geometry.track_checks import CheckedTrack
 from apertura.pipeline.config import Node
 from apertura.pipeline.opening.node_log import NodeLog, Times
@@ -40,7 +41,7 @@ class Placed:
 
     good: NDArray[np.bool_]
     reasons: dict[str, int]
-    flags: dict[str, str]
+    flags: Flags
     report: dict[str, dict[str, Any]]
 
 
@@ -52,11 +53,10 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
     CampaignError
         If none is left.
     """
-    good, reasons, flags = np.ones(len(at), bool), dict[str, int](), dict[str, str]()
+    good, reasons, flags = np.ones(len(at), bool), dict[str, int](), Flags()
     for node in {one.name: one for one in (tx, rx)}.values():
         barred = node.checked.barred(node.log_seconds(at))
-        for name, line in _flags(node, at, barred).items():
-            flags[name] = f"{flags[name]}; {line}" if name in flags else line
+        flags = Flags.merged(flags, _flags(node, at, barred))
         for cause, out in barred.items():
             reasons[cause] = reasons.get(cause, 0) + int((out & good).sum())
             good &= ~out

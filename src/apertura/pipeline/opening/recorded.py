@@ -6,6 +6,7 @@ import xarray as xr
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.missing_pulses import missing_flags
 from apertura.core.geometry.geodesy import LOCAL
@@ -87,7 +88,7 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
         **axes,
     ).assign_attrs(
         frame=tx.track.attrs["frame"],
-        flags={**history.attrs["flags"], **placed.flags, **moved, **missing},
+        flags=Flags.merged(history.attrs["flags"], placed.flags, moved, missing),
         positions=placed.report,
         pulses=counts,
         stated_offset_m=rx.settings.path_offset_m.radar,

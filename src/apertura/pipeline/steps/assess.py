@@ -7,6 +7,7 @@ from typing import Any
 
 import xarray as xr
 
+from apertura.common.flags.raised import Flags
 from apertura.common.provenance import chained_sha256
 from apertura.core.combination.choice import choose_fusion
 from apertura.core.quality.agreement import Agreement
@@ -74,19 +75,18 @@ def assess(campaign: Campaign, flight: str) -> Path:
 
 def _flags(
     found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str], *, taken_off: Collection[str]
-) -> dict[str, dict[str, str]]:
+) -> dict[str, Flags]:
     """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell.
 
     What is `taken_off` before pairs are added, as the phase of tracks that were refined, is none.
     """
-    lines: dict[str, dict[str, list[str]]] = {pair: {} for pair in (reference, *found)}
+    flags = {pair: Flags() for pair in (reference, *found)}
     for pair, one in found.items():
         raised = _disagreement(one, (reference, pair), sure=pair in unconfirmed)
         for side, (name, line) in product((pair, reference), raised.items()):
-            if name in taken_off:
-                continue
-            lines[side].setdefault(name, []).append(line)
-    return {pair: {name: "; ".join(several) for name, several in flags.items()} for pair, flags in lines.items()}
+            if name not in taken_off:
+                flags[side] = Flags.merged(flags[side], {name: line})
+    return flags
 
 
 def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], reference: str) -> dict[str, str]:
@@ -103,7 +103,7 @@ def _suspected(
     campaign: Campaign,
     flight: str,
     images: Mapping[str, xr.Dataset],
-    flags: dict[str, dict[str, str]],
+    flags: dict[str, Flags],
     reference: str,
 ) -> list[dict[str, Any]]:
     """Try what may be wrong where the images look so; put the best behind their flags."""

@@ -8,6 +8,7 @@ import xarray as xr
 
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.common.provenance import canonical_json, chained_sha256
 from apertura.core.echo.calibration import estimate_path_offset, reflector_history
 from apertura.core.geometry.aperture import Aperture
@@ -100,7 +101,7 @@ def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: st
         "coherence_factor": coherence_factor(history),
         "phase_rad": [round(float(value), 4) for value in phase],
         "phase_std_rad": round(float(np.std(phase)), 4),
-        "flags": {**echo.attrs["flags"], **offset.flags},
+        "flags": Flags.merged(echo.attrs["flags"], offset.flags),
     }
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import xarray as xr
 
+from apertura.common.flags.raised import Flags
 from apertura.common.provenance import merged
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
@@ -44,5 +45,5 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     stage = stamped(formed.promised, "echo", **how)
     with writing(folder) as wip:
         write_blocks(wip, stage, "transfer", formed.blocks())
-        finish(wip, folder, lineage=lineage, flags={**stage.attrs["flags"], **formed.saturation.flags})
+        finish(wip, folder, lineage=lineage, flags=Flags.merged(stage.attrs["flags"], formed.saturation.flags))
     return folder

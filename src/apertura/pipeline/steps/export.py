@@ -10,6 +10,7 @@ import xarray as xr
 from rasterio import Affine
 
 from apertura.common.atomic import write_json
+from apertura.common.flags.raised import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
 from apertura.core.quality.fused import Amplitude
 from apertura.core.quality.measures import Raster, survey
@@ -39,7 +40,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "reference": assessed["reference"],
         "agreement": agreed["agreement"],
         "hypotheses": assessed["hypotheses"],
-        "flags": {**image.attrs["flags"], **agreed["flags"]},
+        "flags": Flags.merged(image.attrs["flags"], agreed["flags"]),
         "radiometry": {"image": ECHO.measured(peak, quality["noise_floor_db"]).report},
     }
     origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
@@ -71,11 +72,16 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "fusion": assessed["fusion"],
         "coherence": _coherence(assessed),
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
-        "flags": _flags(
-            {pair: image.attrs["flags"] | assessed["pairs"][pair]["flags"] for pair, image in images.items()},
-            assessed["fusion"]["left_out"],
-        )
-        | cube.attrs["flags"].get(flight, {}),
+        "flags": Flags.merged(
+            _flags(
+                {
+                    pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"])
+                    for pair, image in images.items()
+                },
+                assessed["fusion"]["left_out"],
+            ),
+            cube.attrs["flags"].get(flight, {}),
+        ),
     }
     name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
     titles = {
@@ -162,7 +168,7 @@ def _coherence(assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
     return {"mean": round(float(abs(1 + sum(phasors)) ** 2) / (len(told) + 1) ** 2, 4), **chance}
 
 
-def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> dict[str, str]:
+def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> Flags:
     """Return the flags of all pairs, each line with its pairs unless all say it, and who is not in the coherent sum."""
     raised: dict[str, dict[str, list[str]]] = {}
     for pair, flags in of_pairs.items():
@@ -175,7 +181,7 @@ def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str
         for flag, lines in raised.items()
     }
     alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in left_out.items())
-    return said | ({"pair_left_out": alone} if alone else {})
+    return Flags.merged(said, {"pair_left_out": alone} if alone else {})
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import xarray as xr
 
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
+from apertura.common.flags.raised import Flags
 from apertura.core.focus.engines import instruction_set
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.certify import certified, measures
@@ -74,8 +75,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         quality |= {"focus": focus, "budget": [line.report for line in lines]}
         expected_db = expected(lines).loss_db
         focus["expected_db"] = round(expected_db, 3)
-        flags = {**echo.attrs["flags"], **work.track.stage.attrs["flags"], **plan.flags, **quality["flags"]}
-        quality["flags"] = {**flags, **focus_flags(focus, expected_db)}
+        of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
+        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], focus_flags(focus, expected_db))
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 
