@@ -7,19 +7,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.echo.captures import Samples as Captured
+from apertura.core.echo.captures import Samples
 from apertura.core.echo.framing import Framing
 from apertura.core.echo.trigger import find_preambles
 
 _SAMPLES_AT_ONCE = 2**18
 
 
-class Samples(Protocol):
+class SampleSource(Protocol):
     """(sample, 2), I and Q: an array, or what reads slices of one from a file."""
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, span: slice, /) -> Captured: ...
+    def __getitem__(self, span: slice, /) -> Samples: ...
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class TriggeredCaptures:
 
 
 def trigger_captures(
-    samples: Samples, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float, sample_bits: int = 32
+    samples: SampleSource, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float, sample_bits: int = 32
 ) -> TriggeredCaptures:
     """Return the symbols of a continuous recording that follow a preamble and end inside it.
 
@@ -75,6 +75,6 @@ def trigger_captures(
     return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
 
 
-def _blocks(samples: Samples) -> Iterator[Captured]:
+def _blocks(samples: SampleSource) -> Iterator[Samples]:
     for start in range(0, len(samples), _SAMPLES_AT_ONCE):
         yield samples[start : start + _SAMPLES_AT_ONCE]

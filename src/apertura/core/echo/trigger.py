@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from apertura.core.echo.captures import Samples
 from apertura.core.echo.framing import Framing
 
-Samples = NDArray[np.int16 | np.float32]
 Complexes = NDArray[np.complex64]
 
 _SMALLEST_TRANSFORM = 2**16

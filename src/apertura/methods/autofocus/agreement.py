@@ -1,18 +1,17 @@
 """What two pairs see alike: the same spatial frequencies of the ground, at different times, speckle or not."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.methods.autofocus.blocks import Blocks, Contribution, PatchEcho
+from apertura.methods.autofocus.blocks import Blocks, Contribution, PatchEcho, Tracks
 from apertura.methods.autofocus.objective import phases
 from apertura.methods.autofocus.tiles import SAMPLING, Tile
 
 Floats = NDArray[np.float64]
-Tracks = Mapping[str, Floats]
 
 WEIGHT = 0.2
 """Of a resolution cell that two pairs see alike; docs/theory/autofocus.md, "Speckle"."""

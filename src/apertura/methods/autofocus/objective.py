@@ -1,15 +1,14 @@
 """How sharp the patches are, as a function of the tracks: value and gradient from cached contributions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.methods.autofocus.blocks import Blocks, Contribution
+from apertura.methods.autofocus.blocks import Blocks, Contribution, Tracks
 
 Floats = NDArray[np.float64]
-Tracks = Mapping[str, Floats]
 
 MOST_WEIGHT = 1e4
 _WEIGHT_OF_RATIO = 3.0
