@@ -2,7 +2,7 @@
 # from a stranger would run as code; the workflow reads and checks config/config.yaml itself.
 import os
 
-from apertura.common.signals import STATUS_FILE
+from apertura.common.processes import STATUS_FILE
 
 
 module apertura:

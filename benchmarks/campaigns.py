@@ -13,9 +13,8 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, range_compress
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
 from apertura.core.scene.swath import swath
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, GroundModels
 
 FLAT = FlatGround(0.0)
 

@@ -17,9 +17,8 @@ from apertura.core.focus.engines.engine import Setting
 from apertura.core.imaging.certify import certified
 from apertura.core.imaging.formation import Formation
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.planner import make_plan
-from apertura.core.planning.search import Search
-from apertura.core.quality.error_bound import error_bound
+from apertura.core.planning.planner import Search, make_plan
+from apertura.core.quality.error_check import error_bound
 
 TILE_PX = 32
 

@@ -23,13 +23,13 @@ from apertura.common.contracts import Window
 from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.error_check import random_pixels
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of
-from apertura.pipeline.opening.refined import open_refined
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.store import open_stage
 

@@ -23,7 +23,7 @@ from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.inputs import Profiles
 from apertura.core.focus.job import Job, Signal
 from apertura.core.planning.planner import make_plan
-from apertura.core.quality.error_bound import error_bound
+from apertura.core.quality.error_check import error_bound
 
 AIM_DB = -60.0
 LINES, GUARD, SCATTERERS, CHECKED = 128, 32, 200, 400

@@ -35,8 +35,7 @@ from apertura.core.planning.planner import make_plan
 from apertura.core.quality.agreement import agreement
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, GroundModels
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
 

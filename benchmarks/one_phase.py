@@ -21,12 +21,11 @@ from rich.table import Table
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.candidates import Candidates
-from apertura.methods.autofocus.one_phase import METHODS
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.inputs import Refinement
+from apertura.methods.autofocus.one_phase import METHODS, SpaceVariance, space_variance
+from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
 from apertura.methods.autofocus.refine import refine
-from apertura.methods.autofocus.space_variance import SpaceVariance, space_variance
 from benchmarks.refinement.__main__ import Key, keys
 
 MIDDLE_M = np.array([0.0, 15.0, 0.0])

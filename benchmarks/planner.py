@@ -16,8 +16,7 @@ from campaigns import Drawn, draw
 from apertura.core.focus.engines import load_engine, numba, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.planner import make_plan
-from apertura.core.planning.search import Search
+from apertura.core.planning.planner import Search, make_plan
 from apertura.core.quality.measures import numerical_error
 
 

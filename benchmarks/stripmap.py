@@ -37,12 +37,10 @@ from apertura.core.imaging.certify import certified, measures
 from apertura.core.imaging.focus_check import focus_report
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import imaging_job
-from apertura.core.imaging.range_profiles import RangeWindow, range_compress
-from apertura.core.imaging.stages import Rows
+from apertura.core.imaging.range_profiles import RangeWindow, Rows, range_compress
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, GroundModels
 
 FLAT = FlatGround(0.0)
 SPEED_M, HEIGHT_M = 0.02, 40.0

@@ -8,8 +8,7 @@ import time
 import numpy as np
 from scipy.signal import max_len_seq
 
-from apertura.core.echo.framing import Framing
-from apertura.core.echo.trigger import find_preambles
+from apertura.core.echo.trigger import Framing, find_preambles
 
 RATE_HZ = 1.024e9
 FRAMING = Framing(2 * max_len_seq(10)[0].astype(np.int64) - 1, 4, 204.8e6, RATE_HZ, guard_samples=256)

@@ -19,8 +19,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import FlatGround, GridHeights
+from apertura.core.scene.terrain import FlatGround, GridHeights, GroundModels
 
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 WAVELENGTH = C / 1.2e9

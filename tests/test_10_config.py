@@ -11,7 +11,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import apertura
-from apertura.common import validation
+from apertura.common import documents
 from apertura.common.errors import CampaignError
 from apertura.pipeline.config import Processing, Scene, Settings, validated
 from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template, flights_template
@@ -126,7 +126,7 @@ def test_a_layer_that_sees_no_settings_names_no_config_file():
 
 
 def a_scene(asked):
-    return validation.validated(Scene, asked, where="config", expected="a scene")
+    return documents.validated(Scene, asked, where="config", expected="a scene")
 
 
 @pytest.mark.parametrize(

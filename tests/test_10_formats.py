@@ -11,14 +11,12 @@ from apertura.common.leap_seconds import gps_ahead_s
 from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.names import PHASE_HISTORIES, TRACKS
 from apertura.formats.reading import read_track
-from apertura.formats.recordings.real_samples import EDGE, SETTLING
-from apertura.formats.recordings.sample_layout import SampleLayout
-from apertura.formats.recordings.sigmf_collection import Collection
-from apertura.formats.recordings.sigmf_meta import Capture, Framing, Global
+from apertura.formats.recordings.sample_file import EDGE, SETTLING, SampleLayout
+from apertura.formats.recordings.sigmf import Capture, Collection, Framing, Global
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.config import Flight, PulseWaveform, read_flights, read_segments
-from apertura.pipeline.config.clocks import read_clocks
+from apertura.pipeline.config.flights import read_clocks
 
 TEXT = (Path(__file__).parents[1] / "docs/formats.md").read_text(encoding="utf-8")
 

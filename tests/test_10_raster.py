@@ -12,10 +12,8 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 from scenes import UTM_GRID
 
-from apertura.core.scene.dem import MOST_POSTS
-from apertura.core.scene.dem_file import open_dem
-from apertura.core.scene.geoid import geoid_file
-from apertura.core.scene.geoid_grid import undulation
+from apertura.core.scene.dem import MOST_POSTS, open_dem
+from apertura.core.scene.geoid import geoid_file, undulation
 
 PLACE = (500000, 5400100, 2, 2)
 

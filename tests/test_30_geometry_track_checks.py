@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from apertura.core.geometry.phase_centres import position_spline
-from apertura.core.geometry.track_checks import check_track
-from apertura.core.geometry.track_faults import find_spikes, find_steps, misfits, scatter_m
-from apertura.core.geometry.track_writing import find_frozen, rounded_time_m
+from apertura.core.geometry.track_checks import (
+    check_track,
+    find_frozen,
+    find_spikes,
+    find_steps,
+    misfits,
+    rounded_time_m,
+    scatter_m,
+)
 
 X_BAND_M = 0.0316 / 16
 

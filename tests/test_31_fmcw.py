@@ -9,7 +9,7 @@ from folders import complaint
 from scipy.io import savemat, wavfile
 
 from apertura.core.echo.dechirp import Sweep, transfer_of
-from apertura.formats.phase_histories.fmcw_wav import trigger_starts
+from apertura.formats.phase_histories.fmcw import trigger_starts
 from apertura.formats.reading import read_phase_history
 from apertura.simulation.fmcw import beat_signal
 

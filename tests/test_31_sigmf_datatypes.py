@@ -14,9 +14,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import SATURATED_SHARE, Saturation
 from apertura.formats.names import recording_files
 from apertura.formats.reading import open_recording
-from apertura.formats.recordings.real_samples import EDGE, SETTLING, Mixing
-from apertura.formats.recordings.sample_file import SampleFile
-from apertura.formats.recordings.sample_layout import SampleLayout
+from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, SampleFile, SampleLayout
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.check.recordings import check_recordings

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from apertura.core.echo.captures import correct_clock
 from apertura.core.echo.clock import AMBIGUOUS_SHARE, ClockOffset, decide_clock, estimate_clock, interference_floor_db
 from apertura.core.echo.demodulate import Numerology
-from apertura.core.echo.resampling import correct_clock
 
 NUMBERS = np.arange(512)
 NUMEROLOGY = Numerology(1.2e9, 102.4e6, NUMBERS, prefix_samples=320, dft_samples=1024)  # Δf = 100 kHz, B = 51.2 MHz

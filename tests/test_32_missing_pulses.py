@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.core.echo.missing_pulses import missing_flags, missing_pulses
+from apertura.core.echo.association import missing_flags, missing_pulses
 
 SENT = np.arange(600) * 50_000_000
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.echo.code_check import own_code
-from apertura.core.echo.phase_check import phase_stability
+from apertura.core.echo.own_pulses import own_code, phase_stability
 
 PULSES, CELLS, PREFIX = 200, 256, 80
 

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from apertura.core.echo.second_path import second_path_flags
 from apertura.core.echo.sidelink import measure
+from apertura.core.echo.sidelink_state import second_path_flags
 
 NUMBER, CELL_M = np.arange(512), 0.732
 

@@ -7,8 +7,7 @@ import pytest
 from scipy.signal import max_len_seq
 from scipy.stats import ncx2
 
-from apertura.core.echo.framing import Framing
-from apertura.core.echo.trigger import find_preambles, score_threshold
+from apertura.core.echo.trigger import Framing, find_preambles, score_threshold
 
 RATE_HZ = 100e6
 SYMBOL = 1600

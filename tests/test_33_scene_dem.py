@@ -14,7 +14,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.scene import geoid
-from apertura.core.scene.dem_file import NAMES_FILES, open_dem
+from apertura.core.scene.dem import NAMES_FILES, open_dem
 from apertura.core.scene.grid import SceneGrid
 
 

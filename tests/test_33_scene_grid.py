@@ -12,7 +12,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
 from apertura.core.scene.auto_grid import auto_bounds, utm_crs
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.pixel_positions import block
+from apertura.core.scene.map_crs import block
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround
 

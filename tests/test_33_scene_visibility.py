@@ -4,10 +4,17 @@ import numpy as np
 import pytest
 from scenes import UTM_GRID
 
-from apertura.core.scene import sightlines
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import GridHeights
-from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.core.scene.visibility import (
+    LAYOVER,
+    SHADOW,
+    Relief,
+    bistatic_angle_deg,
+    incidence_deg,
+    surface_normals,
+    visibility,
+)
 from apertura.formats.export import layers as exported
 
 STREET = SceneGrid("local", 0.0, 3.0, 0.25, (12, 240))
@@ -119,4 +126,4 @@ def test_the_bistatic_angle_is_zero_for_one_place_and_right_across_for_two():
 
 
 def test_the_bits_of_the_mask_are_those_that_are_exported():
-    assert (sightlines.SHADOW, sightlines.LAYOVER) == (exported.SHADOW, exported.LAYOVER)
+    assert (SHADOW, LAYOVER) == (exported.SHADOW, exported.LAYOVER)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scenes import compiled, decibels, ecef, fly, pixel_grid, scatter, without_library
 
-from apertura.core.focus.band_limited import band_limited_image
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.echoes import DEGREE, TAPS, tap_polynomials
+from apertura.core.focus.contributions import DEGREE, TAPS, band_limited_image, block_contributions, tap_polynomials
 from apertura.core.focus.engines import native
 
 LOCAL = pixel_grid(40, 40)
@@ -132,7 +130,9 @@ class Recorded:
 
 @pytest.mark.usefixtures("way")
 def test_pulses_are_read_a_few_at_a_time_and_never_those_without_weight(monkeypatch):
-    monkeypatch.setattr("apertura.core.focus.echoes._BYTES_AT_ONCE", 8 * 10 * (PROFILES.samples.shape[1] + 2 * TAPS))
+    monkeypatch.setattr(
+        "apertura.core.focus.contributions._BYTES_AT_ONCE", 8 * 10 * (PROFILES.samples.shape[1] + 2 * TAPS)
+    )
     weights = np.ones(PULSES)
     weights[14:28] = 0
     lazy = Recorded(PROFILES.samples)

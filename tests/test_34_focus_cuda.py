@@ -15,10 +15,9 @@ from scenes import side_beam as beam_of
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines import cuda, load_engine
-from apertura.core.focus.engines.cuda_constants import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM
-from apertura.core.focus.engines.cuda_prediction import candidates
+from apertura.core.focus.engines.cuda_prediction import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM, candidates
 from apertura.core.focus.engines.engine import Setting
-from apertura.core.planning.search import Search
+from apertura.core.planning.planner import Search
 
 
 @pytest.fixture(scope="module")

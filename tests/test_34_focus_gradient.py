@@ -20,8 +20,7 @@ from scenes import (
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.echoes import Echoes
+from apertura.core.focus.contributions import Echoes, block_contributions
 from apertura.core.focus.gradient import path_gradient
 
 LOCAL = pixel_grid(40, 40)
@@ -115,8 +114,8 @@ def test_the_gradient_belongs_to_the_image_of_block_contributions():
 def test_every_instruction_set_gives_what_numpy_gives(monkeypatch):
     slope = peaks(added(PROFILES).sum(0))[1]
     beams = Beams(receive=swaying_beam(PROFILES.aperture.rx_m, (12.0, 0.5, 0.0)))
-    monkeypatch.setattr("apertura.core.focus.echoes._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
-    monkeypatch.setattr("apertura.core.focus.echoes._VALUES_AT_ONCE", 33 * 50)
+    monkeypatch.setattr("apertura.core.focus.contributions._BYTES_AT_ONCE", 8 * 33 * (PROFILES.samples.shape[1] + 16))
+    monkeypatch.setattr("apertura.core.focus.contributions._VALUES_AT_ONCE", 33 * 50)
     fast = path_gradient(PROFILES, PLACES, slope, beams=beams)
     without_library(monkeypatch)
     slow = path_gradient(PROFILES, PLACES, slope, beams=beams)

@@ -12,7 +12,7 @@ from scenes import without_library
 
 from apertura.common.errors import CampaignError
 from apertura.core.focus.engines import native, native_binding
-from apertura.core.focus.engines.native_constants import KERNEL
+from apertura.core.focus.engines.native_binding import KERNEL
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 

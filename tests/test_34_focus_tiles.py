@@ -8,7 +8,7 @@ from scenes import ecef, fly, pixel_grid, scatter
 
 from apertura.core.focus.engines import PATCH_PX, load_engine, native
 from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.engines.native_constants import KERNEL
+from apertura.core.focus.engines.native_binding import KERNEL
 from apertura.core.focus.tiles import compute_tiles, image_array
 from apertura.core.quality.measures import numerical_error
 from apertura.core.scene.terrain import FlatGround

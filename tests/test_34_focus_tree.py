@@ -13,8 +13,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.focus.engines import native, pieces, reference, tree
 from apertura.core.focus.engines.tree_inputs import roughness
-from apertura.core.focus.engines.tree_nodes import nodes, supports, weights, widest_band
-from apertura.core.focus.engines.tree_surface import surfaces_of
+from apertura.core.focus.engines.tree_nodes import nodes, supports, surfaces_of, weights, widest_band
 from apertura.core.focus.engines.tree_view import highest, nodes_for
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.core.quality.error_bound import error_bound
-from apertura.core.quality.error_check import Brightness, Certificate, random_pixels
+from apertura.core.quality.error_check import Brightness, Certificate, error_bound, random_pixels
 from apertura.core.quality.measures import coherence_factor, numerical_error, survey
 from apertura.core.quality.point_targets import Patch, cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid

@@ -14,9 +14,8 @@ from apertura.core.quality.budget import (
     position_lines,
     strictest_accuracy_db,
 )
-from apertura.core.quality.focus import judge, judge_parts, point_focus
+from apertura.core.quality.focus import compare_parts, judge, judge_parts, point_focus
 from apertura.core.quality.path_errors import Effect, PointPaths
-from apertura.core.quality.sub_apertures import compare_parts
 
 PULSES, WAVELENGTH_M = 600, 0.214
 

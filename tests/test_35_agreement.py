@@ -11,18 +11,14 @@ from apertura_research.study.refinement.scenes import Scatterers
 from apertura.core.echo.compression import window_weights
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.agreement import Ground
-from apertura.methods.autofocus.blocks import Blocks
-from apertura.methods.autofocus.gauge import Gauge
-from apertura.methods.autofocus.inputs import Sighting, TrackErrors
-from apertura.methods.autofocus.prior import NodePrior, Prior
-from apertura.methods.autofocus.solve import minimal
-from apertura.methods.autofocus.speckle import refined_by_speckle
-from apertura.methods.autofocus.tiles import tiles
+from apertura.methods.autofocus.inputs import NodePrior, Prior, Sighting, TrackErrors
+from apertura.methods.autofocus.objective import Blocks
+from apertura.methods.autofocus.solve import Gauge, minimal
+from apertura.methods.autofocus.speckle import Ground, refined_by_speckle, tiles
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)

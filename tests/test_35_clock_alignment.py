@@ -8,8 +8,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
-from apertura.methods.synchronisation.clock_alignment import align_on_point
-from apertura.methods.synchronisation.clock_drift import with_drift
+from apertura.methods.synchronisation.clock_alignment import align_on_point, with_drift
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
 
 BEHIND_S, PATH_M = 3.217, 1.43

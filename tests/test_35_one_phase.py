@@ -13,12 +13,10 @@ from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.candidates import Candidates
 from apertura.methods.autofocus.inputs import Sighting, TrackErrors
-from apertura.methods.autofocus.one_phase import METHODS, entropy
-from apertura.methods.autofocus.patches import Patch
+from apertura.methods.autofocus.one_phase import METHODS, entropy, space_variance
+from apertura.methods.autofocus.patches import Candidates, Patch
 from apertura.methods.autofocus.path_offsets import refine_one_phase
-from apertura.methods.autofocus.space_variance import space_variance
 
 FREQUENCY_HZ = 1.2e9 + 1.6e6 * np.arange(256)
 WEIGHT = np.hanning(258)[1:-1] / np.hanning(258).sum()

@@ -14,16 +14,15 @@ from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.path_errors import autocorrelation
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.candidates import LEAST_RATIO, bright_places
 from apertura.methods.autofocus.evidence import range_shifts
-from apertura.methods.autofocus.gauge import effects
-from apertura.methods.autofocus.inputs import ReferencePoint, TrackErrors
+from apertura.methods.autofocus.inputs import NodePrior, Prior, ReferencePoint, TrackErrors
 from apertura.methods.autofocus.objective import Sharpness
-from apertura.methods.autofocus.prior import NodePrior, Prior
+from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places
 from apertura.methods.autofocus.refine import Search, refine
+from apertura.methods.autofocus.solve import effects
 from apertura.pipeline.config import Node
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)

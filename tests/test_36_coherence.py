@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.methods.interferometry.coherence import chance, coherence, unbiased
-from apertura.methods.interferometry.common_band import common_band, window_px
+from apertura.methods.interferometry.coherence import chance, coherence, common_band, unbiased, window_px
 
 SIDE = 256
 INSIDE = (slice(8, -8), slice(8, -8))

@@ -11,10 +11,8 @@ import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.interferometry.comparison import Ground, compared
-from apertura.methods.interferometry.flags import raised
-from apertura.methods.interferometry.heights import placed
-from apertura.methods.interferometry.level import Known, Level, level, levelled
+from apertura.methods.interferometry.comparison import Ground, compared, raised
+from apertura.methods.interferometry.heights import Known, Level, level, levelled, placed
 from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
 from apertura.methods.interferometry.unwrapping import Unwrapped, contradictions, unwrap
 

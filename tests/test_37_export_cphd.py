@@ -10,8 +10,7 @@ from folders import edit_config, make_images, settle_ground
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.formats.export.cphd import write_cphd
-from apertura.formats.export.cphd_collection import Collection
+from apertura.formats.export.cphd import Collection, write_cphd
 from apertura.formats.reading import read_phase_history
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems

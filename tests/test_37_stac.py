@@ -11,9 +11,17 @@ from rasterio import Affine
 
 from apertura.common.errors import CampaignError
 from apertura.formats.catalog import CATALOG
-from apertura.formats.catalog.assets import asset_of, told_by
-from apertura.formats.catalog.fields import EXTENSIONS, Acquisition, projection
-from apertura.formats.catalog.stac import Image, catalog_files, instant, item_of
+from apertura.formats.catalog.stac import (
+    EXTENSIONS,
+    Acquisition,
+    Image,
+    asset_of,
+    catalog_files,
+    instant,
+    item_of,
+    projection,
+    told_by,
+)
 from apertura.formats.catalog.validation import document_problem, stac_problems
 from apertura.formats.export.cog import write_slc
 

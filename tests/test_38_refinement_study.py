@@ -28,8 +28,8 @@ from typer.testing import CliRunner
 
 from apertura.common.errors import CampaignError
 from apertura.common.tables import read_table, write_table
-from apertura.core.geometry.track_correction import TrackCorrection
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.methods.autofocus.inputs import Refinement
 
 
 def row(sigma_cm, said, *, scene="five", seed=1, product_db=0.2):

@@ -8,7 +8,7 @@ import pytest
 from growing import contestants, scene, table
 from growing.contestants import House, SkippedError
 
-from apertura.core.planning import memory
+from apertura.core.planning import plan
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_an_engine_meets_its_aim_at_the_pixels_compared(small):
 @pytest.mark.slow
 def test_blocks_of_pulses_add_up(small, monkeypatch):
     whole = House(small).planned("numba", -60.0, 60.0).run()[0]
-    monkeypatch.setattr(memory, "BLOCK_BYTES", 1 << 16)
+    monkeypatch.setattr(plan, "BLOCK_BYTES", 1 << 16)
     np.testing.assert_allclose(House(small).planned("numba", -60.0, 60.0).run()[0], whole, atol=1e-5 * abs(whole).max())
 
 

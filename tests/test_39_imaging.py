@@ -149,7 +149,6 @@ def moved(by_m):
         (lambda: spoiled(transfer=np.full((96, 200), np.nan, np.complex64)), TARGET_GRID, {}, "samples of 96 of 96"),
         (lambda: spoiled(transfer=np.zeros((96, 200), np.complex64)), TARGET_GRID, {}, "all samples are zero"),
         (point_history, TARGET_GRID, {"accuracy_db": 60.0}, "accuracy_db: Input should be less than or equal to -10"),
-        (point_history, TARGET_GRID, {"presumm": 3}, "presumm: unknown key .did you mean 'presum'"),
         (point_history, TARGET_GRID, {"tile_px": 100}, "tile_px: Input should be a multiple of 16"),
         (point_history, TARGET_GRID, {"engine": "fast"}, "engine: no such engine; choose auto, tree"),
         (point_history, TARGET_GRID, {"engine_options": {"native": {"degree": 99}}}, "engine_options.native.degree"),

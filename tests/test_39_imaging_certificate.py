@@ -14,7 +14,7 @@ from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.measures import numerical_error
-from apertura.core.scene.ground_models import GroundModels
+from apertura.core.scene.terrain import GroundModels
 
 SIDE_PX = 32
 

@@ -6,10 +6,8 @@ import pytest
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.imaging.echo_place import echo_elsewhere
-from apertura.core.imaging.parts import PART_PX, PARTS, part_images
+from apertura.core.imaging.focus_check import PART_PX, PARTS, echo_elsewhere, gathered, part_images
 from apertura.core.imaging.range_profiles import range_compress
-from apertura.core.imaging.sharpness import gathered
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 

@@ -8,7 +8,7 @@ from scenes import monostatic, straight_track
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.band_limited import band_limited_image
+from apertura.core.focus.contributions import band_limited_image
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.sector import Sector
 from apertura.core.imaging.noise import noise_power

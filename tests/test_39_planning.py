@@ -15,8 +15,7 @@ from apertura.core.echo.compression import window_weights
 from apertura.core.focus.engines import load_engine, native, reference
 from apertura.core.focus.engines.native_prediction import path_variants, view_of
 from apertura.core.focus.inputs import Profiles
-from apertura.core.planning.planner import make_plan
-from apertura.core.planning.search import Search
+from apertura.core.planning.planner import Search, make_plan
 from apertura.core.quality.measures import numerical_error
 
 

@@ -6,7 +6,7 @@ import pytest
 from scenes import monostatic, plan, straight_track
 
 from apertura.common.errors import CampaignError
-from apertura.core.planning.memory import memory_limit
+from apertura.core.planning.plan import memory_limit
 from apertura.pipeline.opening.plan import check_fits
 
 

@@ -5,7 +5,7 @@ import pytest
 from scenes import WAVELENGTH, ground_of, monostatic, plan, planning_job, straight_track
 
 from apertura.common.errors import CampaignError
-from apertura.core.planning.terrain_model import decide_terrain
+from apertura.core.planning.decisions import decide_terrain
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
 

@@ -10,7 +10,7 @@ import yaml
 from folders import copy_writable
 
 from apertura.common.errors import CampaignError
-from apertura.common.lock import hold
+from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.pipeline.digests import Sources, digest_of

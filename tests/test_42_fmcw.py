@@ -15,7 +15,7 @@ from apertura.core.quality.point_targets import find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.config import validated
-from apertura.pipeline.opening.recorded import recorded_echo
+from apertura.pipeline.opening.pair import recorded_echo
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign

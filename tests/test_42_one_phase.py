@@ -11,17 +11,15 @@ from spoiling.of_logs import noisy
 from track_noise import saying
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.imaging.stages import profiles_of
-from apertura.methods.autofocus.candidates import Candidates
-from apertura.methods.autofocus.one_phase import METHODS
+from apertura.core.imaging.range_profiles import profiles_of
+from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
+from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
-from apertura.methods.autofocus.space_variance import MOST_LOSS_DB, SpaceVariance
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.config.processing import Processing
-from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, decide_method
+from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
 from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.refined import clock_s, open_refined
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.sightings import seen
 from apertura.pipeline.steps import refine

@@ -12,22 +12,21 @@ from track_noise import saying
 
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.core.geometry.track_correction import TrackCorrection
-from apertura.core.imaging.stages import profiles_of
-from apertura.core.planning.autofocus import BORNE_DB, decide_autofocus
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.planning.decisions import BORNE_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
-from apertura.methods.autofocus.inputs import Sighting
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.inputs import Refinement, Sighting
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems
 from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.opening.acquisition import open_acquisition
+from apertura.pipeline.opening.autofocus import RefinedTrack, clock_s, open_refined
+from apertura.pipeline.opening.diagnosis import evidence_of, seen_from
 from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.refined import RefinedTrack, clock_s, open_refined
 from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.sightings import Seen, reference_points
-from apertura.pipeline.opening.suspects import evidence_of, seen_from
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.steps import echo, image, profile, refine, scene
 from apertura.pipeline.steps.stamping import stamped

@@ -15,13 +15,13 @@ from apertura.core.quality.point_targets import find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.config import validated
-from apertura.pipeline.opening.budget import budget_of
 from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import budget_of
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.transmitted import read_pulse
 from apertura.pipeline.resources import Resources
 from apertura.pipeline.steps import echo, ingest
-from apertura.pipeline.steps.suspect import hypotheses
+from apertura.pipeline.steps.assess import hypotheses
 from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
 from apertura.simulation.impairments import Timing

@@ -15,13 +15,12 @@ from rasterio.transform import from_origin
 
 from apertura.core.focus.engines import load_engine
 from apertura.core.geometry.geodesy import projected_from_ecef
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.ground import Ground
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of, plan_pair
-from apertura.pipeline.opening.scene import expected_scene, open_scene, settled_scene
+from apertura.pipeline.opening.scene import Ground, expected_scene, open_scene, settled_scene
 from apertura.pipeline.steps import profile, scene, terrain
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate

@@ -13,7 +13,7 @@ from folders import ROOT, copy_writable
 from rich.console import Console
 
 from apertura.common.errors import CampaignError
-from apertura.common.lock import hold, holder
+from apertura.common.processes import hold, holder
 from apertura.common.progress import told_at
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.runs.expectation import Outlook, Told, expected_seconds

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from folders import copy_writable
 
-from apertura.common.lock import hold
+from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.stale import stale_results
 

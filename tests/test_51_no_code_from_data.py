@@ -21,7 +21,7 @@ from test_43_terrain import write_plane
 from typer.main import get_command
 
 from apertura.common.errors import CampaignError
-from apertura.common.isolation import SAFE_PATH
+from apertura.common.processes import SAFE_PATH
 from apertura.pipeline.config.template import config_schema
 from apertura.pipeline.store.chunks import array_of
 from apertura.views.cli import app
@@ -443,7 +443,7 @@ UNUSED = {
 IN_ONE_PROCESS = """
 import sys, traceback, yaml
 from pathlib import Path
-from apertura.common.isolation import leave_working_folder
+from apertura.common.processes import leave_working_folder
 leave_working_folder()
 from apertura.pipeline.check import as_line, problems
 root = Path(sys.argv[1])

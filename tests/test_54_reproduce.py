@@ -6,7 +6,7 @@ import shutil
 import pytest
 from folders import complaint, contents, copy_writable
 
-from apertura.common.lock import hold
+from apertura.common.processes import hold
 from apertura.pipeline.workflow import run_workflow
 from apertura.views.verification.products import manifests
 from apertura.views.verification.reproduce import print_reproduced

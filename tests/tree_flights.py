@@ -9,9 +9,8 @@ from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.focus.engines import tree
 from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.engines.tree_surface import surfaces_of
-from apertura.core.focus.engines.tree_track import subaperture_sizes
-from apertura.core.focus.engines.tree_view import counts_of, look
+from apertura.core.focus.engines.tree_nodes import surfaces_of
+from apertura.core.focus.engines.tree_view import counts_of, look, subaperture_sizes
 from apertura.core.focus.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 

@@ -15,8 +15,7 @@ from apertura.core.focus.reach import pulse_blocks_of
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.planning.planner import make_plan
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, GroundModels
 from growing.scene import TILE_PX, Scene, Window
 
 Image = NDArray[np.complex64]

@@ -21,13 +21,10 @@ from apertura_research.study.refinement.measures import UNCORRECTED, image_secon
 from apertura_research.study.refinement.scenes import GRID
 
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.agreement import Ground
-from apertura.methods.autofocus.blocks import Blocks
-from apertura.methods.autofocus.outcome import Refinement
-from apertura.methods.autofocus.prior import NodePrior, Prior
+from apertura.methods.autofocus.inputs import NodePrior, Prior, Refinement
+from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.refine import refine
-from apertura.methods.autofocus.speckle import refined_by_speckle
-from apertura.methods.autofocus.tiles import tiles
+from apertura.methods.autofocus.speckle import Ground, refined_by_speckle, tiles
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")

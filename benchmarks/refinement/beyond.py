@@ -12,7 +12,7 @@ from apertura_research.study.refinement.flights import FLIGHTS, NODES, drawn_err
 from apertura_research.study.refinement.measures import judge
 from apertura_research.study.refinement.scenes import GRID, SCENES, Scatterers
 
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import TrackErrors
 from apertura.methods.autofocus.refine import refine

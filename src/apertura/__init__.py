@@ -30,7 +30,7 @@ _PUBLIC = {
     "backproject": "apertura.core.imaging.backproject",
     "gradient": "apertura.core.imaging.gradient",
     "open_campaign": "apertura.pipeline.opening.results",
-    "open_dem": "apertura.core.scene.dem_file",
+    "open_dem": "apertura.core.scene.dem",
     "range_compress": "apertura.core.imaging.range_profiles",
     "simulate": "apertura.simulation",
     "write_campaign": "apertura.pipeline.opening.writing",
@@ -49,4 +49,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted([*__all__, "__version__"])

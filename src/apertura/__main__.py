@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from apertura.common.isolation import leave_working_folder
+from apertura.common.processes import leave_working_folder
 
 _ENCODING, _BACKEND = "PYTHONIOENCODING", "MPLBACKEND"
 _PROJ = ("PROJ_DATA", "PROJ_LIB")

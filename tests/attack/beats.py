@@ -10,9 +10,8 @@ from scipy.io import savemat, wavfile
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.dechirp import Sweep
-from apertura.formats.phase_histories.fmcw import joined_sweeps, read_beat_npy, sweeps_of
+from apertura.formats.phase_histories.fmcw import cut_sweeps, joined_sweeps, read_beat_npy, sweeps_of
 from apertura.formats.phase_histories.fmcw_fields import read_beat_fields, read_wav
-from apertura.formats.phase_histories.fmcw_wav import cut_sweeps
 
 SWEEP = Sweep(2.26e9, 330e6, 1e-3, 44_100.0)
 DESCRIBED = {

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from apertura.common.errors import CampaignError, shown
-from apertura.core.scene.dem_file import open_dem
-from apertura.core.scene.geoid import geoid_file
-from apertura.core.scene.geoid_grid import undulation
+from apertura.core.scene.dem import open_dem
+from apertura.core.scene.geoid import geoid_file, undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.names import recording_files
@@ -25,7 +24,7 @@ from apertura.formats.phase_histories.afrl import joined
 from apertura.formats.phase_histories.mat_fields import read_fields
 from apertura.formats.phase_histories.pulson import read_pulson
 from apertura.formats.reading import open_recording, read_track
-from apertura.formats.recordings.sigmf_collection import check_listed
+from apertura.formats.recordings.sigmf import check_listed
 from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.pipeline.campaign import Campaign

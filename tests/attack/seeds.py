@@ -15,8 +15,7 @@ from rasterio.transform import from_origin
 from scipy.io import savemat
 
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.formats.export.cphd import write_cphd
-from apertura.formats.export.cphd_collection import Collection
+from apertura.formats.export.cphd import Collection, write_cphd
 from apertura.formats.phase_histories.pulson import MESSAGE
 from apertura.pipeline.config.template import config_template, flights_template
 from apertura.simulation import preset

@@ -16,8 +16,7 @@ PACKAGE = Path(__file__).parents[1]
 WITHOUT_EFFECT = (
     "apertura.common.errors",  # what a message says: a step that raised one has no result
     "apertura.common.progress",  # lines of a log
-    "apertura.common.isolation",  # where a process may look for code
-    "apertura.common.signals",  # how a process ends
+    "apertura.common.processes",  # where a process may look for code, and how it ends
     "apertura.pipeline.lineage",  # sources, settings and code of a result: a manifest records each, for itself
     "apertura.pipeline.digests",  # their hashes
 )

@@ -20,7 +20,7 @@ RECORDERS: Mapping[tuple[str, ...], str] = {
 """Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
 FINDERS: Mapping[tuple[str, ...], str] = {
-    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf_collection:find_sigmf",
+    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:find_sigmf",
 }
 """Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
 
@@ -96,7 +96,7 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
         ".mat", "apertura.formats.phase_histories.fmcw:read_beat_mat", described=True, waveform="fmcw"
     ),
     "beat_wav": HistoryFormat(
-        ".wav", "apertura.formats.phase_histories.fmcw_wav:read_beat_wav", described=True, waveform="fmcw"
+        ".wav", "apertura.formats.phase_histories.fmcw:read_beat_wav", described=True, waveform="fmcw"
     ),
 }
 """waveform.format → how it is read."""

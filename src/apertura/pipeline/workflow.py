@@ -17,11 +17,9 @@ from typing import IO, Literal
 from apertura.common.atomic import remove
 from apertura.common.code_imports import PACKAGE
 from apertura.common.errors import CampaignError
-from apertura.common.isolation import given, isolate
-from apertura.common.lock import hold
 from apertura.common.paths import check_shell_name, shipped
+from apertura.common.processes import INTERRUPTED, STATUS_FILE, given, hold, isolate
 from apertura.common.progress import RUN
-from apertura.common.signals import INTERRUPTED, STATUS_FILE
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
 from apertura.pipeline.check.stale import forms_results, stale_lines, stale_results
@@ -302,7 +300,7 @@ def _supervised(
     """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
     process = subprocess.Popen(
         command,
-        cwd=PACKAGE,  # never the campaign's: see `apertura.common.isolation`
+        cwd=PACKAGE,  # never the campaign's: see `apertura.common.processes`
         env=environment,
         stdout=output,
         stderr=output,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from numpy.random import Generator, default_rng
 
+from apertura.common.documents import validated
 from apertura.common.errors import CampaignError
-from apertura.common.validation import validated
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments

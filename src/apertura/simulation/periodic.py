@@ -5,7 +5,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.phasors import phasors, turned
+from apertura.core.echo.compression import phasors, turned
 from apertura.simulation.synthesis import Channel, sampling_rate
 
 

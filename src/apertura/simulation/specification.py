@@ -13,8 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
-from apertura.common.documents import read_yaml
-from apertura.common.validation import validated
+from apertura.common.documents import read_yaml, validated
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams

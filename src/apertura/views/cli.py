@@ -15,8 +15,7 @@ from typer.core import TyperCommand
 
 from apertura import __version__
 from apertura.common.errors import CampaignError, explained
-from apertura.common.isolation import as_typed, given
-from apertura.common.signals import INTERRUPTED, Interrupted, ended_by_signals, leave_status
+from apertura.common.processes import INTERRUPTED, Interrupted, as_typed, ended_by_signals, given, leave_status
 from apertura.views import product_commands, raw_commands
 from apertura.views.step_commands import Threads
 from apertura.views.step_commands import app as step

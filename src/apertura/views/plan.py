@@ -10,10 +10,9 @@ from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import BudgetLine, expected
 from apertura.core.quality.path_errors import Effect
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.budget import budget_of
+from apertura.pipeline.opening.autofocus import expected_track
 from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import plan_pair
-from apertura.pipeline.opening.refined import expected_track
+from apertura.pipeline.opening.plan import budget_of, plan_pair
 from apertura.pipeline.opening.scene import Flown, expected_scene
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.common.isolation import as_typed, given
+from apertura.common.processes import as_typed, given
 
 ALL_CORES = os.cpu_count() or 1
 

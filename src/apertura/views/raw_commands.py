@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.common.isolation import given
+from apertura.common.processes import given
 
 
 def inspect(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from apertura.common.isolation import as_typed, given
+from apertura.common.processes import as_typed, given
 from apertura.common.progress import telling, told_at
 
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")

@@ -18,8 +18,8 @@ from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.point_targets import locate_maximum
-from apertura.core.scene.ground_models import GroundModels
-from apertura.pipeline.opening.agreement import agreement_by_focus
+from apertura.core.scene.terrain import GroundModels
+from apertura.pipeline.opening.images import agreement_by_focus
 from apertura_research.error_atlas.flight import GRID, PAIRS, Flight, Floats, Heard, Told
 
 ACCURACY_DB = -70.0

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.pipeline.opening.budget import arithmetic_line
+from apertura.pipeline.opening.plan import arithmetic_line
 from apertura_research.error_atlas.causes import CAUSES
 from apertura_research.error_atlas.flight import GRID, PAIRS, Flight, Heard, Told
 from apertura_research.error_atlas.images import Seen, decibels, look

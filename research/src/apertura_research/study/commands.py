@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from apertura.common.errors import CampaignError
-from apertura.common.isolation import given
+from apertura.common.processes import given
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -12,12 +12,12 @@ OF_IMAGES = {
     "outside_swath": Flag(
         "share of the scene, and the integration angle",
         "a part of the scene is passed by no pulse inside the integration angle: it is zero",
-        "scene.bounds_m; processing.integration", "core/planning/integration.py"),
+        "scene.bounds_m; processing.integration", "core/planning/decisions.py"),
     "integration_turns": Flag(
         "the angle that places are seen under, and the integration angle",
         "the track turns, or passes places more than once: they are seen under more than the integration angle, "
         "and are sharper along some direction",
-        "config/segments.tsv, to image passes apart", "core/planning/integration.py"),
+        "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
     "spacing_coarse": Flag(
         "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
         "scene.spacing_m", "core/planning/checks.py"),
@@ -28,7 +28,7 @@ OF_IMAGES = {
     "pulses_missing": Flag(
         "missing pulses, of all in the aperture, and dB of the sidelobes they raise",
         "pulses missing inside the aperture, dropped or never recorded, raise sidelobes above −20 dB along the track",
-        "pulses of the echo: what was dropped and why", "core/echo/missing_pulses.py"),
+        "pulses of the echo: what was dropped and why", "core/echo/association.py"),
     "beyond_cyclic_prefix": Flag(
         "share of the scene that arrives too late",
         "part of the scene lies beyond the prefix, or the listening time, of every pulse", "scene.bounds_m",
@@ -36,7 +36,7 @@ OF_IMAGES = {
     "scene_beyond_samples": Flag(
         "share of the scene's total paths",
         "from Python: part of the scene's total paths lies beyond the profiles given", "how the profiles were cropped",
-        "core/imaging/checks.py"),
+        "core/imaging/job.py"),
     "beam_misses": Flag(
         "share of the scene", "part of the scene is seen by no antenna beam", "boresights; scene.bounds_m",
         "core/antenna/illumination.py"),
@@ -51,7 +51,7 @@ OF_IMAGES = {
     "refinement_too_few_patches": Flag(
         "bright places found, and those needed",
         "too few bright places to refine tracks by; images are formed from the logs",
-        "reflectors in the scene; processing.autofocus off", "methods/autofocus/candidates.py"),
+        "reflectors in the scene; processing.autofocus off", "methods/autofocus/patches.py"),
     "prior_inconsistent": Flag(
         "how large the motions are against the errors stated",
         "motions that the images settle are much larger or smaller than the errors that logs or config state",
@@ -95,22 +95,23 @@ OF_IMAGES = {
         "pixels more coherent than chance, of all that both images see; coherence, chance, and what geometry leaves",
         "most pixels of two images have nothing in common: no phase, no height",
         "distance of the tracks; what changed between the flights; focus of both images",
-        "methods/interferometry/flags.py"),
+        "methods/interferometry/comparison.py"),
     "height_insensitive": Flag(
         "pixels where one turn of the phase is more height than the range, of all that both images see",
         "tracks lie too close together for a height: there is none", "tracks further apart",
-        "methods/interferometry/flags.py"),
+        "methods/interferometry/comparison.py"),
     "height_ambiguous": Flag(
         "pixels in parts apart, or jumps of the phase where nobody unwraps; height of one turn",
         "heights are known up to multiples of the height of one turn, or left out where parts do not hang together",
-        "extra unwrap; tracks closer together; a wider interferometry.window_px", "methods/interferometry/flags.py"),
+        "extra unwrap; tracks closer together; a wider interferometry.window_px",
+        "methods/interferometry/comparison.py"),
     "unwrapping_inconsistent": Flag(
         "loops of four pixels around which the phase contradicts itself, of all; places that several pixels show",
         "the phase changes by more than half a turn per pixel, or is noise: heights may err by whole turns",
-        "tracks closer together; a DEM; interferometry.window_px", "methods/interferometry/flags.py"),
+        "tracks closer together; a DEM; interferometry.window_px", "methods/interferometry/comparison.py"),
     "height_relative": Flag(
         "that no point of known height shows",
         "a constant of the phase is not observable: heights count from the terrain, and an error of it changes over "
-        "the scene", "scene.reference_points", "methods/interferometry/flags.py"),
+        "the scene", "scene.reference_points", "methods/interferometry/comparison.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""

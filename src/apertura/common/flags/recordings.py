@@ -6,25 +6,25 @@ OF_RECORDINGS = {
     "association_ambiguous": Flag(
         "how far the tags of the two nodes are apart, in s and in repetition intervals",
         "time tags are nearly half a repetition interval apart: every pair may be off by one pulse",
-        "frame counters; the nodes' clocks", "core/echo/association_edges.py"),
+        "frame counters; the nodes' clocks", "core/echo/association.py"),
     "association_sparse": Flag(
         "pulses paired, of those of the shorter recording", "less than half of the shorter recording found a partner",
-        "flights and nodes in flights.tsv; missed triggers", "core/echo/association_edges.py"),
+        "flights and nodes in flights.tsv; missed triggers", "core/echo/association.py"),
     "frame_counter_conflict": Flag(
         "pulses dropped", "frame counter and time tags disagree at some pulses, which were dropped",
-        "the counter's bits", "core/echo/association_edges.py"),
+        "the counter's bits", "core/echo/association.py"),
     "time_tags_apart": Flag(
         "how far the tags of the two nodes are apart, in s and in m flown",
         "tags of the two nodes are more than 20 ms apart: positions are those of another moment",
-        "the time system of a node", "core/echo/association_edges.py"),
+        "the time system of a node", "core/echo/association.py"),
     "time_tag_outlier": Flag(
         "pulses left out, of all, and how far their tags are off",
         "single tags leave the line through all; their pulses were dropped", "triggers of both nodes",
-        "core/echo/association_edges.py"),
+        "core/echo/association.py"),
     "pulses_unpaired": Flag(
         "pulses of the transmitter before and after the other recording",
         "more than 5 % of the transmitter's pulses lie before or after the other recording",
-        "start and end of recordings; tags late by whole intervals", "core/echo/association_edges.py"),
+        "start and end of recordings; tags late by whole intervals", "core/echo/association.py"),
     "fix_poor": Flag(
         "pulses left out, of all, per node", "pulses were dropped where the log's solution is poorer than asked",
         "the log; nodes.<n>.worst_fix", "pipeline/opening/positions.py"),
@@ -69,7 +69,7 @@ OF_RECORDINGS = {
     "time_tag_jitter": Flag(
         "scatter of the tags in s rms, and the repetition interval",
         "tags scatter so much that single pulses may be paired with a neighbour", "frame counters",
-        "core/echo/association_edges.py"),
+        "core/echo/association.py"),
     "association_suspect": Flag(
         "m by which the sidelink leaves its geometry, and at which pulse",
         "the sidelink's path does not move as geometry says: pairs or positions are wrong", "tags, logs, lever arms",
@@ -87,11 +87,11 @@ OF_RECORDINGS = {
     "code_unconfirmed": Flag(
         "dB of the strongest echo above what lies beyond the prefix",
         "own echoes repeat from pulse to pulse and do not gather inside the prefix, or the listening time",
-        "waveform.codes, waveform.pulse; another transmitter", "core/echo/code_check.py"),
+        "waveform.codes, waveform.pulse; another transmitter", "core/echo/own_pulses.py"),
     "phase_unstable": Flag(
         "second differences of phase, rad rms, and steadiness of magnitude",
         "own echoes keep their magnitude from pulse to pulse and not their phase: speckle",
-        "the node's oscillator; which node transmits", "core/echo/phase_check.py"),
+        "the node's oscillator; which node transmits", "core/echo/own_pulses.py"),
     "wrong_code": Flag(
         "SNR of the sidelink",
         "the sidelink is there but carries another code: this image is right without one, the transmitter's own "
@@ -120,7 +120,7 @@ OF_RECORDINGS = {
         "dB and m of the arrival beside the direct path",
         "what arrives beside the direct path is an echo, or may be one and not the transmitter's ripple: paths "
         "and phases may be wrong by what is said",
-        "reflections at the sidelink antenna", "core/echo/second_path.py"),
+        "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
     "sidelink_code": Flag(
         "the correction that was asked for", "the correction needs the code, which the sidelink does not carry",
         "waveform.codes", "core/echo/sidelink.py"),

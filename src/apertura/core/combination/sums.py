@@ -1,9 +1,138 @@
-"""What the pairs of one flight add up to."""
+"""Images of one flight added up: which of them with their phases, what sums hold, what they do to clutter."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+# ---- What a coherent sum does to what is not a target --------------------------------------------------------------
+
+
+def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> float:
+    """Return by how much clutter lies lower, against the peak, in a coherent sum than in its images.
+
+    Parameters
+    ----------
+    single_db
+        (pair,) clutter of each image of the sum: its median power over its peak power, dB.
+    coherent_db
+        The same of the sum.
+
+    Returns
+    -------
+    float
+        dB; 10 lg of the number of images where the targets add in phase and the clutter does not, 0 where the images
+        show one thing, less where targets do not add in phase.
+
+    Raises
+    ------
+    ValueError
+        If there is no image.
+
+    Notes
+    -----
+    Source: docs/theory/fusion.md, eq. 3.
+
+    Examples
+    --------
+    >>> round(clutter_reduction_db([-40.0, -40.0], -43.01), 2)
+    3.01
+    """
+    if not single_db:
+        raise ValueError("no image: a sum of nothing reduces nothing")
+    return float(10 * np.log10(np.mean(10 ** (np.asarray(single_db) / 10))) - coherent_db)
+
+
+# ---- Which images of a flight are added with their phases: those that were seen to be in phase, or made so ---------
+
+
+class Phase(Protocol):
+    """How a pair lies against the reference in phase."""
+
+    @property
+    def phase_rad(self) -> float: ...  # noqa: D102
+    @property
+    def phase_std_rad(self) -> float: ...  # noqa: D102
+    @property
+    def coherence(self) -> float: ...  # noqa: D102
+    @property
+    def points(self) -> int: ...  # noqa: D102
+    @property
+    def out_of_phase(self) -> bool: ...  # noqa: D102
+
+
+LEAST_COHERENCE = 0.5
+"""Phases of the points of two images that scatter more than this say nothing that a constant could mend."""
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """What the coherent sum holds.
+
+    Attributes
+    ----------
+    phases_rad
+        Pair → phase taken off before it is added; 0 where none was asked for or needed.
+    left_out
+        Pair → why it is only in the sums without phase.
+    why
+        Pair → why it is in, in one line.
+    """
+
+    phases_rad: Mapping[str, float]
+    left_out: Mapping[str, str]
+    why: Mapping[str, str]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values."""
+        phases = {pair: round(phase, 4) for pair, phase in self.phases_rad.items()}
+        return {"phases_rad": phases, "left_out": dict(self.left_out), "why": dict(self.why)}
+
+
+def choose_fusion(
+    reference: str, found: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
+) -> Fusion:
+    """Return which pairs add coherently to the reference.
+
+    Parameters
+    ----------
+    reference
+        The pair that others are measured against.
+    found
+        Every other pair → its phase against the reference at bright points; None where they share none.
+    unfit
+        Pairs that show other places than the reference → why.
+    align
+        Whether a constant phase is taken off.
+
+    Examples
+    --------
+    >>> choose_fusion("a-a", {"a-b": None}, unfit={}, align=False).phases_rad
+    {'a-a': 0.0, 'a-b': 0.0}
+    """
+    phases, left_out, why = {reference: 0.0}, {}, {reference: "the others are measured against it"}
+    for pair, phase in found.items():
+        if pair in unfit:
+            left_out[pair] = unfit[pair]
+        elif phase is None:
+            phases[pair], why[pair] = 0.0, f"phase not measured: no bright point in common with {reference}"
+        else:
+            line = f"{phase.phase_rad:+.2f} ± {phase.phase_std_rad:.2f} rad at {phase.points} bright points"
+            if phase.coherence < LEAST_COHERENCE:
+                left_out[pair] = f"{line}, coherence {phase.coherence:.2f}: no common phase"
+            elif align:
+                phases[pair], why[pair] = phase.phase_rad, f"{line}, taken off"
+            elif phase.out_of_phase:
+                left_out[pair] = f"{line}; processing.fusion.align_phase takes it off"
+            else:
+                phases[pair], why[pair] = 0.0, line
+    return Fusion(phases, left_out, why)
+
+
+# ---- What the pairs of one flight add up to ------------------------------------------------------------------------
 
 
 def coherent_sum(

@@ -1,17 +1,92 @@
-"""Which capture of the receiver belongs to which pulse of the transmitter, and when that answer is suspect."""
+"""Which capture of the receiver belongs to which pulse of the transmitter, when that is suspect, what is missing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.core.echo.association_edges import association_flags, is_outlier
-from apertura.core.echo.frame_counter import pairs_by_frame
-from apertura.core.echo.framing import ABSENT
-from apertura.core.echo.time_tags import Integers, Pairs, fit_modulo_interval, fit_pairs, nearest_pairs, residual_ns
+from apertura.core.echo.trigger import ABSENT
+
+# ---- How the time tags of two nodes lie to each other: an offset, a drift, and the pairs that follow from them
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Pairs = tuple[Integers, Integers]
+"""Something of the transmitter and the same of the receiver: tags, or indices of paired pulses."""
+
+LARGEST_DRIFT_PPM = 100.0
+"""Free-running crystals stay inside this; a faster drift of the tags is not searched for."""
+
+
+class TagLine(NamedTuple):
+    """Offset of the receiver's tags: offset_ns + drift·(tag - origin_ns)."""
+
+    offset_ns: float
+    drift: float
+    origin_ns: int
+
+
+def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
+    """Return the offset line under which the receiver's tags best fall on the transmitter's, modulo the interval."""
+    tx, rx = tags
+    some = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse: modulo the interval all give the same
+    cycles = (rx - tx[some]) / interval_ns
+    elapsed_ns = (rx - rx[0]).astype(np.float64)
+    reach = LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] / interval_ns
+    steps = int(np.ceil(4 * reach)) if reach > 0.25 else 0
+    drifts = np.arange(-steps, steps + 1) * (LARGEST_DRIFT_PPM * 1e-6 / max(steps, 1))
+    sums = np.array([np.exp(2j * np.pi * (cycles - drift * elapsed_ns / interval_ns)).sum() for drift in drifts])
+    best = int(np.argmax(np.abs(sums)))
+    return TagLine(float(np.angle(sums[best])) / (2 * np.pi) * interval_ns, float(drifts[best]), int(rx[0]))
+
+
+def nearest_pairs(tags: Pairs, line: TagLine, interval_ns: float) -> Pairs:
+    """Return pairs that are each other's nearest, within half an interval, once the offset is taken out."""
+    tx, rx = tags
+    corrected = (rx - rx[0]) - _offset_ns(rx, line)
+    tx_ns = (tx - rx[0]).astype(np.float64)
+    middles = (tx_ns[1:] + tx_ns[:-1]) / 2
+    nearest_tx = np.searchsorted(middles, corrected)
+    distance = np.abs(corrected - tx_ns[nearest_tx])
+    order = np.lexsort((distance, nearest_tx))
+    _, first = np.unique(nearest_tx[order], return_index=True)
+    kept = np.sort(order[first])
+    kept = kept[distance[kept] < interval_ns / 2]
+    return nearest_tx[kept], kept
+
+
+def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
+    """Return the line (Theil-Sen, then median) through the offsets of pairs; less than half of them may be wrong."""
+    tx_tag, rx_tag = tags[0][pairs[0]], tags[1][pairs[1]]
+    offset_ns = (rx_tag - tx_tag).astype(np.float64)
+    elapsed_ns = (rx_tag - rx_tag[0]).astype(np.float64)
+    drift = 0.0
+    if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would pose as drift
+        some = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
+        drift = _theil_sen_slope(elapsed_ns[some], offset_ns[some])
+    return TagLine(float(np.median(offset_ns - drift * elapsed_ns)), drift, int(rx_tag[0]))
+
+
+def _theil_sen_slope(x: Floats, y: Floats) -> float:
+    """Return the median of the slopes between all pairs of points, x ascending; scipy.stats imports for a second."""
+    first, second = np.triu_indices(x.size, 1)
+    return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
+
+
+def residual_ns(tags: Pairs, pairs: Pairs, line: TagLine) -> Floats:
+    """Return (pair,) float64: how far the receiver's tag lies from where the line puts it, nanoseconds."""
+    rx_tag = tags[1][pairs[1]]
+    return np.asarray(rx_tag - tags[0][pairs[0]] - _offset_ns(rx_tag, line), np.float64)
+
+
+def _offset_ns(rx_tag: Integers, line: TagLine) -> Floats:
+    return np.asarray(line.offset_ns + line.drift * (rx_tag - line.origin_ns), np.float64)
+
+
+# ---- Which capture of the receiver belongs to which pulse of the transmitter, and when that answer is suspect ------
 
 
 @dataclass(frozen=True)
@@ -169,3 +244,219 @@ def _agreed_pairs(
     tx, rx = tx[order], rx[order]
     ascending = np.concatenate([[True], rx[1:] > np.maximum.accumulate(rx)[:-1]]) if rx.size else np.zeros(0, bool)
     return (tx[ascending], rx[ascending]), int((~agreed).sum())
+
+
+# ---- Pulses that carry the same frame number, however often the counter wrapped between them -----------------------
+
+
+def pairs_by_frame(
+    tags: Pairs, frames: tuple[Integers | None, Integers | None], interval_ns: float, modulus: int | None
+) -> Pairs | None:
+    """Return pairs of equal frame number, wraps undone; None where a node has no counter."""
+    if frames[0] is None or frames[1] is None:
+        return None
+    tx, rx = (np.flatnonzero(frame != ABSENT) for frame in (frames[0], frames[1]))
+    if tx.size == 0 or rx.size == 0:
+        return None
+    tx_count, rx_count = frames[0][tx].astype(np.int64), frames[1][rx].astype(np.int64)
+    if modulus is None and ((np.diff(tx_count) < 0).any() or (np.diff(rx_count) < 0).any()):
+        modulus = 1 << int(max(tx_count.max(), rx_count.max())).bit_length()
+    if modulus is not None:
+        tx_count = _unwrapped(tx_count, tags[0][tx], interval_ns, modulus)
+        rx_count = _unwrapped(rx_count, tags[1][rx], interval_ns, modulus)
+        # whole turns of the counter between the nodes: those that bring their tags closest
+        expected_ns = tags[0][tx[0]] + (rx_count - tx_count[0]) * interval_ns
+        rx_count += modulus * int(np.rint(np.median(tags[1][rx] - expected_ns) / (modulus * interval_ns)))
+    _, at_tx, at_rx = np.intersect1d(tx_count, rx_count, return_indices=True)
+    return tx[at_tx], rx[at_rx]
+
+
+def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
+    """Return the count that never wraps; a misread number costs itself, not those after it."""
+    step = np.mod(np.diff(count), modulus)
+    step += modulus * np.rint((np.diff(tags) / interval_ns - step) / modulus).astype(np.int64)
+    return np.asarray(count[0] + np.concatenate([[0], np.cumsum(step)]), np.int64)
+
+
+# ---- When a pairing of two nodes' pulses is suspect, and which tags are wrong by themselves ------------------------
+
+LARGEST_JITTER = 1 / 6
+"""RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
+
+NEAR_HALF = 0.4
+"""Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
+
+APART_S = 20e-3
+"""Offset between two nodes' tags, good to a few milliseconds each, that is no longer the error of good tags."""
+
+OUTLIER_S = 5e-3
+"""A single tag that leaves the line by no more than this is as good as tags are."""
+
+_OUTLIER_SIGMA = 6.0
+
+LARGEST_UNPAIRED = 0.05
+"""Share of the transmitter's pulses before or after the other recording that is worth a remark."""
+
+_FEW = 2  # pulses that a recorder may begin late or end early by
+
+
+def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
+    """Return (pair,) bool: which tags leave the line by more than `OUTLIER_S` and six times the scatter of all.
+
+    Examples
+    --------
+    >>> is_outlier(np.array([0.0, 1e-4, -1e-4, 2e-4, 0.03, -1e-4]))
+    array([False, False, False, False,  True, False])
+    """
+    size = np.abs(residual_s)
+    return np.asarray(size > max(OUTLIER_S, _OUTLIER_SIGMA * 1.4826 * float(np.median(size))))
+
+
+def tag_jitter_s(time_ns: Integers) -> float:
+    """Return the RMS error of a node's own tags about equal steps, as a radar's timer makes them, seconds.
+
+    Parameters
+    ----------
+    time_ns
+        (pulse,) int64, tags of one node, ascending; missed pulses are bridged.
+
+    Notes
+    -----
+    Where triggers do not come in equal steps this is an upper bound. An error that all tags share cannot be seen.
+
+    Examples
+    --------
+    >>> regular = np.arange(100) * 50_000_000
+    >>> tag_jitter_s(np.delete(regular, [7, 8])), round(tag_jitter_s(regular + np.arange(100) % 2 * 2_000_000), 5)
+    (0.0, 0.001)
+    """
+    if time_ns.size < 3:
+        return 0.0
+    steps = np.diff(time_ns)
+    number = np.concatenate([[0.0], np.cumsum(np.round(steps / np.median(steps)))])
+    elapsed_s = (time_ns - time_ns[0]) * 1e-9
+    return round(float(np.std(elapsed_s - np.polyval(np.polyfit(number, elapsed_s, 1), number))), 9)
+
+
+def association_flags(
+    association: "Association", tags: Pairs, interval_s: float, *, conflicts: int, speed_m_s: float | None
+) -> dict[str, str]:
+    """Return flags: edge that an association crosses → what was measured, in one line.
+
+    Parameters
+    ----------
+    tags
+        (pulse,) int64 tags of transmitter and receiver, nanoseconds.
+    interval_s
+        Nominal time between pulses, seconds.
+    conflicts
+        Pairs that the frame counter makes and the tags contradict.
+    speed_m_s
+        Of the transmitter; None: unknown.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association".
+    """
+    flags = {}
+    share, by_tags = abs(association.offset_s) / interval_s, association.method == "time tags"
+    if by_tags and share > NEAR_HALF:
+        flags["association_ambiguous"] = (
+            f"tags are {association.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
+            "every pair may be off by one pulse"
+        )
+    if abs(association.offset_s) > APART_S:
+        flags["time_tags_apart"] = _apart(association, speed_m_s)
+    if conflicts:
+        flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
+    if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
+        flags["time_tag_jitter"] = (
+            f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "
+            "single pulses may be paired with a neighbour"
+        )
+    if association.outlier.any():
+        flags["time_tag_outlier"] = (
+            f"{int(association.outlier.sum())} of {association.outlier.size} pulses left out: "
+            f"their tags leave the line through all by more than {OUTLIER_S:g} s"
+        )
+    pairs = association.tx_index.size
+    shorter = pairs + min(association.tx_dropped, association.rx_dropped)
+    if pairs < shorter / 2:
+        flags["association_sparse"] = f"{pairs} pulses paired of {shorter} in the shorter recording"
+    unpaired = _unpaired(association, tags, interval_s)
+    if unpaired:
+        flags["pulses_unpaired"] = unpaired
+    return flags
+
+
+def _apart(association: "Association", speed_m_s: float | None) -> str:
+    line = f"time tags of the nodes are {association.offset_s:+.4f} s apart (pairs by {association.method})"
+    if speed_m_s is None:
+        return line
+    return f"{line}: the transmitter's decide, and moved {abs(association.offset_s) * speed_m_s:.2f} m meanwhile"
+
+
+def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str | None:
+    """Return one line on the transmitter's pulses before the first and after the last pair, if they are many."""
+    tx, rx = tags
+    early, late = int(association.tx_index[0]), tx.size - 1 - int(association.tx_index[-1])
+    if early + late <= max(LARGEST_UNPAIRED * tx.size, _FEW):
+        return None
+    line = f"{early} pulses before and {late} after the other recording, of {tx.size}"
+    begin_s, end_s = (rx[0] - tx[0]) * 1e-9, (rx[-1] - tx[-1]) * 1e-9
+    if abs(begin_s - end_s) <= 1.5 * interval_s < abs(begin_s):
+        line += f": both recordings are equally long and {begin_s:+.3f} s apart, as if the tags of one were off by that"
+    return line
+
+
+# ---- What pulses that are missing inside an aperture do to its image -----------------------------------------------
+
+LARGEST_SIDELOBE = 0.1
+"""Of the peak, what missing pulses may add anywhere along the track: -20 dB, of a tenth of the aperture in a row."""
+
+
+def missing_pulses(time_ns: Integers) -> tuple[int, float]:
+    """Return how many pulses are missing between the first and the last, and the highest sidelobe that they add.
+
+    Parameters
+    ----------
+    time_ns
+        (pulse,) int64, ascending tags of the pulses that there are; most are one interval apart.
+
+    Returns
+    -------
+    tuple
+        Number of missing pulses; amplitude of the sidelobe relative to the peak.
+
+    Notes
+    -----
+    The response of the aperture is that of all pulses less that of the missing ones:
+    |Σ_missing exp(j2πkm/M)|/used at a cell or more from the peak, k ≥ 1. Source: docs/theory/planner.md, "Pulses".
+
+    Examples
+    --------
+    >>> sent = np.arange(1000) * 50_000_000
+    >>> missing_pulses(sent), missing_pulses(np.delete(sent, np.arange(400, 500)))
+    ((0, 0.0), (100, 0.109...))
+    """
+    if time_ns.size < 3:
+        return 0, 0.0
+    steps = np.diff(time_ns)
+    single = steps[np.abs(steps / np.median(steps) - 1) < 0.25].mean()
+    number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / single), 1).astype(np.int64))])
+    absent = np.ones(number[-1] + 1)
+    absent[number] = 0
+    response = np.abs(np.fft.rfft(absent, 4 * absent.size))[4:]
+    return int(absent.sum()), float(response.max()) / time_ns.size
+
+
+def missing_flags(time_ns: Integers) -> dict[str, str]:
+    """Return a flag where missing pulses add sidelobes above `LARGEST_SIDELOBE`; parameters as `missing_pulses`."""
+    flags = {}
+    missing, sidelobe = missing_pulses(time_ns)
+    if sidelobe > LARGEST_SIDELOBE:
+        flags["pulses_missing"] = (
+            f"{missing} of {missing + time_ns.size} pulses inside the aperture are missing: "
+            f"sidelobes of up to {20 * np.log10(sidelobe):.0f} dB along the track"
+        )
+    return flags

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.captures import AT_ONCE, spread
+from apertura.core.echo.captures import AT_ONCE, Complexes, Floats, spread
 from apertura.core.echo.demodulate import Numerology
-from apertura.core.echo.resampling import Complexes, Floats
 
 SIGMAS = 3.0
 """A clock that is not this many standard deviations off is one that noise suggests; it is left alone."""

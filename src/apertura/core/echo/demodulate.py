@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.phasors import phasors, turned
+from apertura.core.echo.compression import phasors, turned
 
 _PULSES_AT_ONCE = 64
 

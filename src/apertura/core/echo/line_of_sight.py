@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.phasors import phasors
+from apertura.core.echo.compression import phasors
 
 Complexes = NDArray[np.complex64]
 Floats = NDArray[np.float64]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.core.echo.line_of_sight import Complexes, LineOfSight, fit_line_of_sight, phasor
-from apertura.core.echo.sidelink_arrivals import GATE_CELLS
-from apertura.core.echo.sidelink_state import ECHO_DB, NULL_DB, SidelinkState, measure
+from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 

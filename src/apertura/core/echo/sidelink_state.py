@@ -1,16 +1,150 @@
-"""State of a sidelink: its SNR, echoes and ripple, and the pulses in which it locks."""
+"""State of a sidelink: its average, SNR, echoes and ripple, a second path, and the pulses in which it locks."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainccinv
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import AT_ONCE
-from apertura.core.echo.line_of_sight import Complexes, Floats, LineOfSight, fit_block, joined
-from apertura.core.echo.sidelink_arrivals import GATE_CELLS, changing_near, decibels, ripple, strongest_echo
-from apertura.core.echo.sidelink_average import Averaging, SidelinkAverage
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_block, joined
+
+# ---- The pulses of a sidelink averaged, each aligned to its direct path: what they have in common and what changes
+
+
+class SidelinkAverage(NamedTuple):
+    """The locked pulses of a flight, aligned to a direct path of delay 0 and amplitude 1."""
+
+    pulses: int
+    noise: float  # mean power of the noise in a delay cell of one pulse
+    power: Floats  # (cell,) mean power
+    mean: NDArray[np.complex128]  # (cell,) mean
+    spectrum: Floats  # (subcarrier,) mean power
+    second_cell: int  # typical strongest arrival of a pulse beside the direct path
+    second_power: float
+
+
+class Averaging:
+    """Sums over the locked pulses, block by block.
+
+    Parameters
+    ----------
+    subcarriers
+        Of the sidelink, and cells of its profile.
+    """
+
+    def __init__(self, subcarriers: int) -> None:
+        self._power, self._spectrum = np.zeros(subcarriers), np.zeros(subcarriers)
+        self._mean = np.zeros(subcarriers, np.complex128)
+        self._noise: list[Floats] = []
+        self._cells: list[NDArray[np.intp]] = []
+        self._levels: list[NDArray[np.float32]] = []
+
+    def add(self, sidelink: Complexes, path: LineOfSight, profile: Complexes) -> None:
+        """Add some pulses, (pulse, subcarrier), their direct path, and their aligned profile, (pulse, cell)."""
+        locked = path.locked
+        if not locked.any():
+            return
+        direct = path.select(locked)
+        size = 1 / direct.amplitude
+        turned = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
+        unit = profile[locked] * turned[:, None]
+        power = np.square(unit.real) + np.square(unit.imag)
+        self._power += power.sum(0)
+        self._mean += unit.sum(0)
+        self._spectrum += (np.square(np.abs(sidelink[locked])) * np.square(size)[:, None]).sum(0)
+        self._noise.append(direct.noise_power * np.square(size))
+        self._cells.append(power[:, 2:-1].argmax(1) + 2)
+        self._levels.append(power[:, 2:-1].max(1))
+
+    def result(self) -> SidelinkAverage:
+        """Return the average of what was added, at least one pulse."""
+        level, noise = np.concatenate(self._levels), np.concatenate(self._noise)
+        typical, count = int(np.argsort(level, kind="stable")[level.size // 2]), level.size
+        return SidelinkAverage(
+            count,
+            float(np.mean(noise)) / self._power.size,
+            self._power / count,
+            self._mean / count,
+            self._spectrum / count,
+            int(np.concatenate(self._cells)[typical]),
+            float(level[typical]),
+        )
+
+
+# ---- What arrives beside the direct path of a sidelink: echoes, ripple, and what changes from pulse to pulse -------
+#
+# Source: docs/theory/echo_methods.md, "State of a sidelink".
+
+GATE_CELLS = 16
+"""Half width of the gate, in cells of 1/B around the direct path."""
+
+
+def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
+    """Return level (dB) and delay (cells, 0 if none) of the strongest arrival beside the direct path.
+
+    Ripple makes echoes on both sides of the direct path, a reflection on one; only the excess of one side counts.
+    """
+    cells = np.arange(2, average.power.size - 1)
+    excess = average.power - average.noise
+    one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
+    best = int(np.argmax(one_sided))
+    level, cell = float(one_sided[best]), int(cells[best])
+    # what the highest of N averages of exponential noise passes with the chance of a false lock
+    highest = gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
+    seen = average.noise * (float(highest) - 1)
+    # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
+    highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
+    if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
+        level, cell = average.second_power, average.second_cell
+    if level <= seen:
+        return decibels(seen), 0
+    return decibels(level), cell if cell < average.power.size / 2 else cell - average.power.size
+
+
+def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, float]:
+    """Return ripple (peak to peak, dB) inside the gate, its strongest cell, and ripple outside.
+
+    It is told by echoes that all pulses have in common:
+
+    cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
+    inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
+    """
+    power = np.abs(average.mean / average.mean[0]) ** 2
+    cells = np.arange(1, power.size // 2)
+    noise = average.noise / average.pulses
+    sides = np.stack([power[cells], power[-cells]]) - noise
+    single = np.sqrt(np.where(sides > 9 * noise, sides, 0.0)).sum(0)
+    paired = np.sqrt(np.where(sides.min(0) > 5 * noise, sides.min(0), 0.0)) * 2
+    inside = cells <= GATE_CELLS
+    amplitudes = (single if one_sided else paired)[inside], paired[~inside]
+    coarse, fine = (min(float(np.sqrt((amplitude**2).sum())), 0.95) for amplitude in amplitudes)
+    strongest = int(cells[inside][amplitudes[0].argmax()]) if coarse else 0
+    return _peak_to_peak_db(coarse), strongest, _peak_to_peak_db(fine)
+
+
+def changing_near(average: SidelinkAverage) -> float:
+    """Return what changes from pulse to pulse within two cells of the direct path, dB; -300 where it is noise."""
+    near = [1, 2, -1, -2]
+    excess = average.power[near] - np.abs(average.mean[near]) ** 2 - average.noise
+    seen = 5 * average.noise * np.sqrt(len(near) / average.pulses)
+    total = float(excess.sum())
+    return decibels(total) if total > seen and average.pulses > 1 else -300.0
+
+
+def _peak_to_peak_db(amplitude: float) -> float:
+    return float(20 * np.log10((1 + amplitude) / (1 - amplitude)))
+
+
+def decibels(power: float) -> float:
+    """Return 10 log10 of a power; -300 of none."""
+    return float(10 * np.log10(max(power, 1e-30)))
+
+
+# ---- State of a sidelink: its SNR, echoes and ripple, and the pulses in which it locks -----------------------------
 
 ECHO_DB = -20.0
 """Ghosts this far below the image are tolerated; an echo of the sidelink makes one as strong as itself."""
@@ -204,3 +338,51 @@ def _flags(state: SidelinkState) -> dict[str, str]:
             "they are attenuated, not divided"
         )
     return flags
+
+
+# ---- A second path of the sidelink too close to the first to resolve: what it would do to an image if it is one
+
+
+def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
+    """Return a flag where what arrives near the direct path is an echo, or may be one and not the transmitter's ripple.
+
+    Parameters
+    ----------
+    state
+        Of the sidelink.
+    cell_m
+        c/B, metres of path.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Ripple or echo".
+    """
+    if state.near_db > ECHO_DB:
+        seen = (
+            f"an arrival of {state.near_db:.1f} dB within {2 * cell_m:.2f} m of the direct path changes over the flight"
+        )
+        harm = _harm(10 ** (state.near_db / 20), 1, cell_m)
+        return {"sidelink_ripple_or_echo": f"{seen}, as an echo does: {harm}"}
+    if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_stays:
+        line = (
+            f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "
+            "the flight: an echo, or the transmitter's ripple; what corrects one makes ghosts as strong of the other"
+        )
+        return {"sidelink_ripple_or_echo": line}
+    swing = 10 ** (state.ripple_db / 20)
+    amplitude = (swing - 1) / (swing + 1)
+    if amplitude <= 10 ** (ECHO_DB / 20):
+        return {}
+    line = (
+        f"ripple of {state.ripple_db:.1f} dB in the sidelink is taken for the transmitter's; one channel cannot tell "
+        f"it from a second path {state.ripple_cells * cell_m:.2f} m longer that stays so; if it is one, "
+    )
+    return {"sidelink_ripple_or_echo": line + _harm(amplitude, state.ripple_cells, cell_m)}
+
+
+def _harm(amplitude: float, cells: int, cell_m: float) -> str:
+    """Return what an echo of that amplitude does, in words; unresolved ones move what resolved ones repeat."""
+    if cells > 1:
+        return f"it makes ghosts of {20 * np.log10(amplitude):.1f} dB"
+    path_cm, phase_rad = 100 * amplitude * cells * cell_m / np.sqrt(2), amplitude / np.sqrt(2)
+    return f"paths err by about {path_cm:.0f} cm, phases by about {phase_rad:.2f} rad"

@@ -15,15 +15,22 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags.raised import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
-from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, spread
+from apertura.core.echo.captures import (
+    Complexes,
+    Floats,
+    Pulses,
+    Read,
+    Samples,
+    Saturation,
+    blocks_of,
+    correct_clock,
+    spread,
+)
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of, decide_clock
-from apertura.core.echo.code_check import CodeEvidence, own_code
 from apertura.core.echo.demodulate import Numerology, demodulate
-from apertura.core.echo.phase_check import phase_stability
-from apertura.core.echo.resampling import Complexes, Floats, correct_clock
-from apertura.core.echo.second_path import second_path_flags
+from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
-from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks
+from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 
 _STRETCH = 128  # neighbouring pulses that own code and phase are looked for in
 _CLOCK_STRETCH = 256

@@ -1,14 +1,104 @@
-"""Finding the pulses in a recording that never stops: correlation with the preamble, at a set rate of false alarms."""
+"""Recordings that never stop: what is sent before each symbol, how it is detected, and the captures cut there."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.core.echo.captures import Samples
-from apertura.core.echo.framing import Framing
+
+# ---- What is sent before each symbol: a preamble that triggers, and a payload that counts --------------------------
+
+ABSENT = -1
+"""Frame number of a pulse whose payload was not read."""
+
+
+@dataclass(frozen=True)
+class Framing:
+    """preamble | counter bits, most significant first, then inverted | guard | cyclic prefix, symbol.
+
+    Attributes
+    ----------
+    preamble
+        (chip,) int of ±1.
+    chip_samples
+        Samples per chip.
+    centre_hz
+        Baseband frequency on which the chips are keyed.
+    sample_rate_hz
+        Complex samples per second.
+    counter_bits
+        Width of the frame counter; 0 without payload.
+    bit_chips
+        Chips per payload bit, all of one sign: +1 for a one.
+    guard_samples
+        Silence between payload and cyclic prefix.
+    """
+
+    preamble: NDArray[np.int64]
+    chip_samples: int
+    centre_hz: float
+    sample_rate_hz: float
+    counter_bits: int = 16
+    bit_chips: int = 15
+    guard_samples: int = 0
+
+    @property
+    def payload_samples(self) -> int:
+        """Samples of the counter and its inverse."""
+        return 2 * self.counter_bits * self.bit_chips * self.chip_samples
+
+    @property
+    def lead_samples(self) -> int:
+        """Samples from the start of the preamble to the start of the cyclic prefix."""
+        return len(self.preamble) * self.chip_samples + self.payload_samples + self.guard_samples
+
+    def template(self) -> NDArray[np.complex64]:
+        """Return (sample,) complex64, the preamble as it arrives without delay."""
+        return np.asarray(np.repeat(self.preamble, self.chip_samples) * self._carrier(0, len(self.preamble)))
+
+    def read_counter(self, samples: Samples) -> int:
+        """Return the frame number of a capture that starts with its preamble, -1 where a bit is not certain.
+
+        Parameters
+        ----------
+        samples
+            (sample, 2), at least preamble and payload.
+
+        Examples
+        --------
+        >>> framing = Framing(np.array([1, 1, -1, 1, -1]), 2, 0.0, 1e6, counter_bits=2, bit_chips=3)
+        >>> chips = np.concatenate([framing.preamble, np.repeat([1, -1, -1, 1], 3)])
+        >>> capture = np.stack([np.repeat(chips, 2) * 100, np.zeros(34, int)], -1).astype(np.int16)
+        >>> framing.read_counter(capture), framing.read_counter(capture[:-8])
+        (2, -1)
+        """
+        keyed = len(self.preamble) * self.chip_samples
+        if self.counter_bits == 0 or len(samples) < keyed + self.payload_samples:
+            return ABSENT
+        iq = samples[: keyed + self.payload_samples, 0] + 1j * samples[: keyed + self.payload_samples, 1]
+        phase = np.vdot(self.template(), iq[:keyed])
+        if phase == 0:
+            return ABSENT
+        carrier = self._carrier(len(self.preamble), 2 * self.counter_bits * self.bit_chips)
+        sums = (iq[keyed:] * carrier.conj()).reshape(2 * self.counter_bits, -1).sum(1)
+        soft, inverse = np.split(np.real(sums * phase.conj()) / np.abs(phase) ** 2 * keyed, 2)
+        expected = self.bit_chips * self.chip_samples  # if noise is left out
+        bits = soft > inverse
+        if (np.sign(soft) == np.sign(inverse)).any() or (np.abs(soft - inverse) < expected).any():
+            return ABSENT
+        return int("".join("1" if bit else "0" for bit in bits), 2)
+
+    def _carrier(self, first_chip: int, chips: int) -> NDArray[np.complex64]:
+        sample = np.arange(first_chip * self.chip_samples, (first_chip + chips) * self.chip_samples)
+        return np.asarray(np.exp(2j * np.pi * self.centre_hz / self.sample_rate_hz * sample), np.complex64)
+
+
+# ---- Finding the pulses in a recording that never stops: correlation with the preamble, at a set rate of false
+# alarms
 
 Complexes = NDArray[np.complex64]
 
@@ -171,3 +261,74 @@ class _PeakSearch:
         # the score of a signal of SNR ρ per sample is about (ρL + 1)/(L·(ρ + 1)), L the length of the preamble
         ratio = max(score * self.reach - 1, 1e-3) / (self.reach * max(1 - score, 1e-9))
         yield Detection(sample, score, float(10 * np.log10(ratio)))
+
+
+# ---- Captures cut from a recording that never stopped, at the preamble before each symbol --------------------------
+
+_SAMPLES_AT_ONCE = 2**18
+
+
+class SampleSource(Protocol):
+    """(sample, 2), I and Q: an array, or what reads slices of one from a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, span: slice, /) -> Samples: ...
+
+
+@dataclass(frozen=True)
+class TriggeredCaptures:
+    """What a triggered recorder would have captured of a recording.
+
+    Attributes
+    ----------
+    start
+        (capture,) int64, first sample of each symbol's cyclic prefix.
+    frame
+        (capture,) int64, frame number sent before it, -1 where not read.
+    report
+        Captures, rate of false alarms, median SNR, duty cycle and mean data rate.
+    """
+
+    start: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    report: dict[str, Any]
+
+
+def trigger_captures(
+    samples: SampleSource, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float, sample_bits: int = 32
+) -> TriggeredCaptures:
+    """Return the symbols of a continuous recording that follow a preamble and end inside it.
+
+    Parameters
+    ----------
+    samples
+        (sample, 2), I and Q of the trigger's channel; read in blocks.
+    framing, symbol_samples, false_alarms_per_s
+        As for `find_preambles`.
+    sample_bits
+        Of a sample of one channel as it was recorded.
+    """
+    detections = [
+        detection
+        for detection in find_preambles(
+            _blocks(samples), framing, symbol_samples=symbol_samples, false_alarms_per_s=false_alarms_per_s
+        )
+        if detection.sample + framing.lead_samples + symbol_samples <= len(samples)
+    ]
+    places = np.array([detection.sample for detection in detections], np.int64)
+    numbers = [framing.read_counter(samples[place : place + framing.lead_samples]) for place in places]
+    duty_cycle = len(detections) * symbol_samples / len(samples)
+    report = {
+        "captures": len(detections),
+        "false_alarms_per_s": false_alarms_per_s,
+        "snr_db": round(float(np.median([one.snr_db for one in detections])), 2) if detections else None,
+        "duty_cycle": duty_cycle,
+        "mean_rate_bit_s": framing.sample_rate_hz * sample_bits * duty_cycle,  # of one channel
+    }
+    return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
+
+
+def _blocks(samples: SampleSource) -> Iterator[Samples]:
+    for start in range(0, len(samples), _SAMPLES_AT_ONCE):
+        yield samples[start : start + _SAMPLES_AT_ONCE]

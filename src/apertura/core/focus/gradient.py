@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.echoes import Echoes, job_of, pulses_at_once, tiles
+from apertura.core.focus.contributions import Echoes, job_of, pulses_at_once, tiles
 from apertura.core.focus.engines.native_binding import available, call
 from apertura.core.focus.inputs import Profiles
 

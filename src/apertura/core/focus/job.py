@@ -12,8 +12,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import Illumination
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import Terrain
+from apertura.core.scene.terrain import GroundModels, Terrain
 
 
 @dataclass(frozen=True, eq=False)

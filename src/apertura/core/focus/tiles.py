@@ -1,7 +1,8 @@
-"""An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own."""
+"""An image as a dask array of tiles: computed when asked for, each tile on its own, here or by workers of a cluster."""
 
+import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -9,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
+from dask.highlevelgraph import MaterializedLayer
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
+from apertura.common.errors import CampaignError
 from apertura.common.progress import progress
+from apertura.common.provenance import code_sha256
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.engines import load_engine
+from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.presum import Presum, presummed
@@ -24,6 +28,124 @@ from apertura.core.scene.terrain import Terrain
 
 if TYPE_CHECKING:
     from dask.array.core import Array
+
+
+# ---- Tiles formed by the workers of a `distributed` scheduler, over TCP; they come back to whoever asked -----------
+
+KEY = "processing.scheduler"
+NAMED_BY = "DASK_SCHEDULER_ADDRESS"
+"""Environment variable, dask's own: who connects to a scheduler runs what that sends, and a config is a stranger's."""
+
+_CONNECT_S = 5.0
+_WORKERS_S = 10.0
+
+
+def formed_elsewhere(
+    graph: Any, keys: Sequence[tuple[Any, ...]], scheduler: str
+) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+    """Yield each tile with its number as soon as a worker has formed it.
+
+    Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes
+    back. A worker that dies is made up for by the others.
+
+    Parameters
+    ----------
+    graph, keys
+        Tasks of an image of `apertura.core.focus.tiles.image_array`, and those that are tiles.
+    scheduler
+        Address of a running scheduler, ``tcp://host:port``.
+
+    Raises
+    ------
+    CampaignError
+        If the environment does not name the same scheduler, it does not answer, or has no workers with this code.
+    """
+    with _connected(scheduler) as client:
+        from distributed import as_completed
+
+        futures = client.get(graph, list(keys), sync=False)
+        numbers = {future.key: number for number, future in enumerate(futures)}
+        done = as_completed(futures, loop=client.loop, with_results=True)
+        del futures  # so that a tile leaves its worker when it has come
+        for future, tile in done:
+            yield numbers[future.key], tile
+
+
+def _connected(scheduler: str) -> Any:
+    named = os.environ.get(NAMED_BY)
+    if named != scheduler:
+        raise CampaignError(
+            f"{scheduler}, but {NAMED_BY} is {named or 'not set'}",
+            where=KEY,
+            expected="the scheduler that whoever runs this names: it may send code",
+            remedy=f"If it is yours, run `export {NAMED_BY}={scheduler}`; else set {KEY} to threads.",
+        )
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise _unusable(scheduler, "package distributed is not installed", "Install apertura[distributed].") from error
+    try:
+        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise _unusable(scheduler, "nobody answers there", "Start `dask scheduler`, or correct the address.") from error
+    try:
+        _check_workers(client, scheduler)
+    except BaseException:
+        client.close()
+        raise
+    return client
+
+
+def _check_workers(client: Any, scheduler: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_WORKERS_S)
+    except TimeoutError as error:
+        raise _unusable(scheduler, "it has no workers", f"Start some: `dask worker {scheduler}`.") from error
+    modules = ("apertura.core.focus.tiles", *ENGINES.values())
+    own, theirs = code_sha256(*modules), client.run(code_sha256, *modules)
+    other = [worker for worker, code in theirs.items() if code != own]
+    if other:
+        found = f"{len(other)} of {len(theirs)} workers run other code, first {other[0]}"
+        raise _unusable(scheduler, found, "Install the same version there.")
+
+
+def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
+    return CampaignError(f"{scheduler}: {found}", KEY, "a dask scheduler with workers that have this apertura", remedy)
+
+
+# ---- Tiles in dask: a graph that is built again for the tiles that are asked for -----------------------------------
+
+Place = tuple[int, int]
+
+
+class TilesLayer(MaterializedLayer):
+    """The tasks of some tiles of an image.
+
+    Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
+    dask would therefore compute all tiles for the sake of one; here whoever asks for some gets the graph of those.
+
+    Parameters
+    ----------
+    name
+        Of the array.
+    graph
+        Rows and columns of tiles → key → task.
+    places
+        Row and column of every tile.
+    """
+
+    def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):
+        self.name, self.graph, self.places = name, graph, list(places)
+        super().__init__(graph(self.places))
+
+    def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:
+        """Return the layer of the tiles among the keys, and the dependencies of its tasks."""
+        places = [place for place in self.places if (self.name, *place) in keys]
+        asked = TilesLayer(self.name, self.graph, places)
+        return asked, {key: asked.get_dependencies(key, all_hlg_keys) for key in asked}
+
+
+# ---- An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own
 
 _NOTHING = np.complex64(complex(np.nan, np.nan))
 
@@ -64,8 +186,6 @@ def image_array(
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
-
-    from apertura.core.focus.layer import TilesLayer
 
     name, weighing = f"image-{uuid4().hex}", weighing or Weighing()
     chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)
@@ -240,8 +360,6 @@ def compute_tiles(
     ]
     graph = image.dask.cull(set(keys))
     if scheduler != "threads":
-        from apertura.core.focus.cluster import formed_elsewhere
-
         with progress("tiles", len(keys)) as done:
             for number, tile in formed_elsewhere(graph, keys, scheduler):
                 _write(target, windows[number], tile)

@@ -1,37 +1,36 @@
 """The front door from Python: one call from profiles or phase history to a planned, certified, lazy image."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.documents import validated
 from apertura.common.flags.raised import Flags
-from apertura.common.validation import validated
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Job
-from apertura.core.imaging.checks import check_inputs
-from apertura.core.imaging.choices import ImagingChoices
+from apertura.core.imaging.choices import Degrees, ImagingChoices, Resolution
 from apertura.core.imaging.formation import Formation
-from apertura.core.imaging.job import imaging_job, profiles_job
-from apertura.core.imaging.range_profiles import RangeWindow, range_compress
-from apertura.core.imaging.stages import inputs_of
-from apertura.core.planning.memory import memory_limit
+from apertura.core.imaging.job import check_inputs, imaging_job, profiles_job
+from apertura.core.imaging.range_profiles import RangeWindow, inputs_of, range_compress
+from apertura.core.planning.plan import memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import MOST_ACCURACY_DB
-from apertura.core.quality.error_bound import CONFIDENCE, ErrorBound, error_bound
+from apertura.core.quality.error_check import CONFIDENCE, ErrorBound, error_bound
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import Terrain, ground_of
+from apertura.core.scene.terrain import GroundModels, Terrain, ground_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-def backproject(
+def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor completes it
     profiles: "Profiles | PhaseHistory | xr.Dataset",
     grid: SceneGrid,
     accuracy_db: float = MOST_ACCURACY_DB,
@@ -40,8 +39,13 @@ def backproject(
     engine: str = "auto",
     beams: Beams | None = None,
     certified_pixels: int = 64,
-    terrain_model: str = "auto",
-    **choices: Any,
+    terrain_model: Literal["auto", "plane", "tilted_plane", "dem"] = "auto",
+    window: Literal["hann", "none"] = "hann",
+    integration: "Literal['auto', 'all'] | Degrees | Resolution | Mapping[str, float]" = "auto",
+    presum: int | Literal["auto"] = "auto",
+    pulse_blocks: int | Literal["auto"] = "auto",
+    tile_px: int = 256,
+    engine_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> "xr.DataArray":
     """Return a focused image over a grid: planned for the accuracy asked, lazy until it is computed.
 
@@ -66,10 +70,19 @@ def backproject(
         asked on them gives way to the plan's next.
     terrain_model
         'auto', 'plane', 'tilted_plane' or 'dem': what stands for the ground.
-    **choices
-        The others of `apertura.core.imaging.choices.ImagingChoices`: engine_options, presum, pulse_blocks, integration,
-        tile_px (side of a tile, which is a chunk of the array, 256), window (over the subcarriers of a stage `echo`,
-        'hann').
+    window
+        Weighting over the subcarriers of transfer functions; profiles have theirs.
+    integration
+        How much of a pass a pixel is integrated over: 'auto', what the pixels' spacing carries; 'all';
+        ``{"degrees": x}`` of a straight pass; ``{"resolution_m": x}`` along the flight.
+    presum
+        Pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all.
+    pulse_blocks
+        Blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all.
+    tile_px
+        Side of a tile, pixels: a chunk of the array.
+    engine_options
+        Options of engines that the planner shall not choose: engine → option → value.
 
     Returns
     -------
@@ -111,7 +124,17 @@ def backproject(
 
     asked = validated(
         ImagingChoices,
-        {**choices, "accuracy_db": accuracy_db, "engine": engine, "terrain": terrain_model},
+        {
+            "accuracy_db": accuracy_db,
+            "engine": engine,
+            "terrain": terrain_model,
+            "window": window,
+            "integration": integration,
+            "presum": presum,
+            "pulse_blocks": pulse_blocks,
+            "tile_px": tile_px,
+            "engine_options": engine_options,
+        },
         where="backproject",
         expected="choices of ImagingChoices",
     )

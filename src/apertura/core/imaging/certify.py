@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.contracts import Window
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
-from apertura.core.quality.error_bound import CONFIDENCE, ErrorBound
-from apertura.core.quality.error_check import Brightness, Certificate, random_pixels
+from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, ErrorBound, random_pixels
 from apertura.core.quality.measures import coherence_factor, survey
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid

@@ -1,6 +1,7 @@
-"""How well an image is focused, measured on itself: bright points, parts of the aperture, and the echo's own place."""
+"""How well an image is focused, measured on itself: bright points, parts of the aperture, noise, echo's place."""
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,249 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags.raised import Flags
-from apertura.core.focus.inputs import Profiles
-from apertura.core.geometry.aperture import Weigh
-from apertura.core.imaging.echo_place import echo_elsewhere
-from apertura.core.imaging.formation import Formation
-from apertura.core.imaging.parts import PART_PX, part_images
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import reached
+from apertura.core.echo.compression import compress, range_step
+from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.focus.engines.engine import Engine
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.reach import PULSES
+from apertura.core.geometry.aperture import Aperture, Weigh
+from apertura.core.imaging.formation import PULSES_READ, Formation
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
 from apertura.core.quality.bright_points import BrightPoint, bright_points
-from apertura.core.quality.focus import Focus, PointFocus, judge, judge_parts, point_focus
-from apertura.core.quality.sub_apertures import SubApertures, compare_parts
+from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.swath import swath
+from apertura.core.scene.terrain import FlatGround, Terrain
+
+# ---- Images of a few places by parts of the aperture, and by even and odd pulses of each ---------------------------
+
+PARTS = 8
+"""Parts of the aperture."""
+
+PART_PX = 64
+"""Places along a side."""
+
+_MARGIN_SAMPLES = 16  # that engines need beyond the places
+
+
+def part_images(
+    profiles: Profiles, places: Sequence[NDArray[np.float64]], *, beams: Beams | None = None
+) -> NDArray[np.complex64]:
+    """Return patches of the image by parts of the aperture; their sum over parts is the image.
+
+    Parameters
+    ----------
+    profiles
+        Of every pulse.
+    places
+        Patches of (PART_PX, PART_PX, 3) float64 positions, metres, in the frame of the phase centres.
+    beams
+        Of the antennas; isotropic by default.
+
+    Returns
+    -------
+    ndarray
+        (patch, 2, part, y, x) complex64: by even and by odd pulses of each part. Nothing is made of fewer than four
+        pulses a part.
+    """
+    images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
+    aperture = profiles.aperture
+    if len(profiles) < 4 * PARTS:
+        return images[:0]
+    engine = table_engine()
+    for patch, where in enumerate(places):
+        seen = _seeing(beams, aperture, where)
+        for number, block in enumerate(aperture[seen].blocks(PARTS)):
+            for first in range(seen.start + block.start, seen.start + block.stop, PULSES_READ):
+                last = min(first + PULSES_READ, seen.start + block.stop)
+                read = _around(profiles[first:last], where)
+                for odd in range(min(2, last - first)):
+                    tables = engine.prepare(read[odd::2])
+                    weights = beams and beams[first + odd : last : 2]
+                    images[patch, odd, number] += engine.form(tables, where, beams=weights) / len(profiles)
+    return np.nan_to_num(images)
+
+
+def _seeing(beams: Beams | None, aperture: Aperture, places: NDArray[np.float64]) -> slice:
+    """Return the first to the last pulse that may see a patch."""
+    middle = places[PART_PX // 2, PART_PX // 2]
+    radius = np.linalg.norm(places - middle, axis=-1).max()
+    lit = np.flatnonzero(reached(beams, aperture, middle[None], np.array([radius]), pulses=PULSES)[:, 0])
+    return slice(int(lit[0]) * PULSES, min(int(lit[-1] + 1) * PULSES, len(aperture))) if lit.size else slice(0, 0)
+
+
+def table_engine() -> Engine:
+    """Return the first engine that reads profiles and runs here."""
+    engines = (load_engine(name) for name in ENGINES)
+    return next(engine for engine in engines if engine.READS == "profiles" and engine.available())
+
+
+def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
+    """Return the samples of profiles that a patch needs."""
+    corners = places[:: PART_PX - 1, :: PART_PX - 1].reshape(-1, 3)
+    at = (profiles.aperture.path(corners) - profiles.start_m[:, None]) / profiles.step_m
+    reach = 2 * np.linalg.norm(places[1, 1] - places[0, 0]) * PART_PX / 2 / profiles.step_m  # nadir inside the patch
+    first = max(0, int(np.nanmin(at) - reach) - _MARGIN_SAMPLES)
+    last = min(profiles.samples.shape[1], int(np.nanmax(at)) + _MARGIN_SAMPLES + 1)
+    start_m = profiles.start_m + first * profiles.step_m
+    return replace(profiles, samples=profiles.samples[:, first:last], start_m=start_m)
+
+
+# ---- Whether the strongest echo of the pulses comes from the scene at all ------------------------------------------
+
+ELSEWHERE_DB = 20.0
+"""An echo this much stronger than all from the scene says that the scene is not where the echo is."""
+
+UNGATHERED_DB = 25.0
+"""An echo so far above the median of the scene's ranges is a point's, which some place must gather; speckle has 10."""
+
+LEAST_PULSES = 64
+"""Fewer are not enough to tell whether a point dominates its cell."""
+
+_MOST_PULSES = 64
+_NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
+
+
+def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> str | None:
+    """Return one line where pulses hold a strong echo that an image without bright points does not gather; None if not.
+
+    Parameters
+    ----------
+    history
+        Of every pulse; some of them are looked at.
+    grid, terrain
+        The scene.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas does not count.
+    """
+    some = history[history.aperture.sample(_MOST_PULSES)]
+    step_m, length = range_step(some.frequency_hz, oversampling=1.0)
+    path_m, power = _profiles(some, step_m, length)
+    nearest, farthest = swath(grid, terrain, some.aperture)
+    span_m = step_m * length
+    margin = _NEAR_CELLS * step_m
+    beyond = (path_m - (nearest[:, None] - margin)) % span_m > (farthest - nearest)[:, None] + 2 * margin
+    direct = np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)
+    apart = (path_m - direct[:, None] + span_m / 2) % span_m - span_m / 2
+    beside = np.where(beyond & (np.abs(apart) > margin), power, 0.0)
+    outside = beside.max(axis=1)
+    within = np.where(beyond, np.nan, power)
+    inside = np.nanmax(within, axis=1)
+    scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
+    above_db = _median_db(outside / np.maximum(inside, 1e-30))
+    if min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > ELSEWHERE_DB:
+        at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
+        return (
+            f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
+            f"{scene}: heights, positions or path offsets are wrong, or something bright stands elsewhere"
+        )
+    alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
+    if len(history) >= LEAST_PULSES and alone_db > UNGATHERED_DB:
+        return (
+            f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and no place of the image "
+            "gathers it: times, positions or heights are wrong, or it comes from beside the scene"
+        )
+    return None
+
+
+def _median_db(ratio: NDArray[np.float64]) -> float:
+    return 10 * float(np.log10(max(float(np.median(ratio)), 1e-30)))
+
+
+def _profiles(history: PhaseHistory, step_m: float, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return total paths and powers (pulse, range) over the whole unambiguous range."""
+    samples = compress(
+        history.transfer,
+        history.frequency_hz,
+        weight=history.weight,
+        reference_delay_s=history.reference_delay_s,
+        start_m=np.zeros(len(history)),
+        count=length,
+        oversampling=1.0,
+    )
+    path_m = np.broadcast_to(step_m * np.arange(length), samples.shape)
+    return path_m, np.abs(samples).astype(np.float64) ** 2
+
+
+# ---- How well several echoes gather at one place: what hypotheses about a campaign's geometry are compared by ------
+
+_EVERY = 8  # points along a side that tell which paths a piece of ground spans
+
+
+def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
+    """Return how much of their echoes several pairs gather at the place where they do so best together.
+
+    Parameters
+    ----------
+    histories
+        Of pairs that see one scene.
+    grid
+        Places to look at; level ground.
+    height_m
+        Of the ground above the ellipsoid (z in a local frame).
+
+    Returns
+    -------
+    float
+        Power against that of an echo that holds all the energy of its pulses, half of it added pair by pair, half with
+        their phases; two hypotheses about one recording compare by its ratio.
+
+    Raises
+    ------
+    ValueError
+        If the places are deeper than the unambiguous range.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Hypotheses".
+
+    Examples
+    --------
+    >>> from apertura.core.geometry.aperture import Aperture
+    >>> frequency = 1.2e9 + 1e6 * np.arange(128)
+    >>> track = np.stack([np.linspace(-4, 4, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)
+    >>> flown = Aperture(track, track)
+    >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown)
+    >>> gathered([history], SceneGrid("local", -3.2, 3.2, 0.1, (64, 64)), 0.0) > 0.9
+    True
+    """
+    engine, ground = table_engine(), FlatGround(height_m)
+    places = ground.positions(grid)
+    power, total = np.zeros(grid.shape), np.zeros(grid.shape, np.complex128)
+    for history in histories:
+        tables = engine.prepare(range_compress(history, grid, ground, window=_window(history, places)))
+        image = np.nan_to_num(engine.form(tables, places)) / (len(history) * np.sqrt(_echo_power(history)))
+        power += np.abs(image) ** 2
+        total += image
+    return float((power / len(histories) + np.abs(total / len(histories)) ** 2).max() / 2)
+
+
+def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
+    """Return total paths that hold those of a small piece of ground, from some of its points."""
+    every = max(1, min(places.shape[:2]) // _EVERY)
+    some = places[::every, ::every]
+    paths = history.aperture.path(some).reshape(len(history), -1)
+    between = 2 * float(np.linalg.norm(some[1, 1] - some[0, 0]))  # a path grows by two metres per metre at most
+    step, length = range_step(history.frequency_hz, oversampling=OVERSAMPLING)
+    first = paths.min(axis=1) - between - GUARD_SAMPLES * step
+    samples = int(np.ceil((np.ptp(paths, axis=1).max() + 2 * between) / step)) + 2 * GUARD_SAMPLES + 1
+    return RangeWindow(first, samples, step, length, paths.max(axis=1))
+
+
+def _echo_power(history: PhaseHistory) -> float:
+    """Return the power of the profile of an echo that held all the energy of a pulse, mean over the pulses."""
+    power: NDArray[np.float64] = (np.abs(history.transfer) ** 2).astype(np.float64) @ history.weight
+    return float(power.mean()) * float(history.weight.sum())
+
+
+# ---- How well an image is focused, measured on itself: bright points, parts of the aperture, and the echo's own
+# place
 
 APART_CELLS = 6.0
 """Bright points stand so many resolution cells apart."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import reached
-from apertura.core.focus.band_limited import band_limited_image
+from apertura.core.focus.contributions import band_limited_image
 from apertura.core.focus.engines import load_engine, pieces, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.inputs import PhaseHistory, Profiles

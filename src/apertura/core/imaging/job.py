@@ -1,4 +1,4 @@
-"""From what is known of a pair and a scene to the planner's job."""
+"""From what is known of a pair and a scene to the planner's job, checked before anything is planned."""
 
 from functools import partial
 from typing import Any
@@ -7,20 +7,101 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Integration, Job, Signal
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.imaging.range_profiles import RangeWindow
-from apertura.core.planning.integration import integrate
+from apertura.core.planning.checks import check_positions
+from apertura.core.planning.decisions import integrate
 from apertura.core.quality.measures import content_loss_db
+from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.ground_models import GroundModels
-from apertura.core.scene.terrain import FlatGround, Terrain
+from apertura.core.scene.map_crs import check_crs
+from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
+
+# ---- Whether what was recorded belongs to the scene asked for, before anything is planned --------------------------
 
 _POINTS = 9
+_PULSES = 256
+
+
+def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
+    """Return flags: limit that the inputs exceed on a scene → what was found, in one line.
+
+    Parameters
+    ----------
+    inputs
+        Phase history or profiles, their phase centres in the frame of the pixels.
+    grid, terrain
+        The scene.
+
+    Raises
+    ------
+    CampaignError
+        If the grid's CRS is not one for a scene, a position, sample or height is not finite, an antenna is in the
+        ground, all samples are zero, or the scene lies where the inputs hold no echo.
+    """
+    if grid.crs != LOCAL:
+        check_crs(grid.crs, grid.bounds_m)
+    check_positions(inputs.aperture)
+    _check_samples(inputs)
+    points = terrain.positions_at(grid, *grid.sample_pixels(_POINTS)).reshape(-1, 3)
+    if not np.isfinite(points).all():
+        raise CampaignError(
+            "heights of the terrain are not finite",
+            where="backproject: terrain",
+            expected="a height in metres at every pixel",
+            remedy="Fill its voids, or make the grid smaller.",
+        )
+    outside = _outside(inputs, points)
+    if outside == 1:
+        raise CampaignError(
+            "no echo of the scene is in the samples: its total paths lie beyond them at every pulse",
+            where="backproject: grid",
+            expected="phase centres and pixels in one frame, in metres, within the range that was recorded",
+            remedy="Check the grid's CRS and corner, the terrain's height, and the frame of the positions.",
+        )
+    flags = check_antennas(grid, terrain, inputs.aperture, where="backproject")
+    if outside:
+        flags["scene_beyond_samples"] = f"{100 * outside:.1f} % of the scene's total paths lie beyond the samples"
+    return flags
+
+
+def _check_samples(inputs: PhaseHistory | Profiles) -> None:
+    samples = inputs.transfer if isinstance(inputs, PhaseHistory) else inputs.samples
+    lost = np.array([not np.isfinite(row).all() for row in samples])
+    if lost.any() or not any(row.any() for row in samples):
+        raise CampaignError(
+            f"samples of {int(lost.sum())} of {len(lost)} pulses are not finite, first at pulse {int(lost.argmax())}"
+            if lost.any()
+            else "all samples are zero",
+            where="backproject",
+            expected="finite samples that hold an echo",
+            remedy="Leave such pulses out.",
+        )
+
+
+def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
+    """Return the share of total paths, from some pulses to some points, that lie beyond the samples.
+
+    A phase history repeats itself every c/Δf; beyond that to either side of its reference a scene is taken for wrong.
+    """
+    some = inputs[inputs.aperture.sample(_PULSES)]
+    path = some.aperture.path(points)
+    if isinstance(some, PhaseHistory):
+        unambiguous_m = SPEED_OF_LIGHT_M_S / float(np.abs(np.diff(some.frequency_hz)).mean())
+        return float((np.abs(path - SPEED_OF_LIGHT_M_S * some.reference_delay_s[:, None]) > unambiguous_m).mean())
+    place = (path - some.start_m[:, None]) / some.step_m
+    return float(((place < 0) | (place > some.samples.shape[1] - 1)).mean())
+
+
+# ---- From what is known of a pair and a scene to the planner's job -------------------------------------------------
+
 _PATCH_PX = 256
 _CONTENT_PIXELS = 128
 _CONTENT_PULSES = 16384  # of which the terms of so many pixels take 32 MB
@@ -44,7 +125,7 @@ def settle(
     grid, level
         The scene, on level ground.
     antennas, asked
-        As of `apertura.core.planning.integration.integrate`.
+        As of `apertura.core.planning.decisions.integrate`.
     """
     points_m = grid.sample_points(_POINTS, level.height_m)
     geometry: dict[str, Any] = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre_hz}
@@ -77,7 +158,7 @@ def imaging_job(
     beams
         Of the antennas, where they have any.
     integration
-        As `apertura.core.planning.integration.integrate` is asked.
+        As `apertura.core.planning.decisions.integrate` is asked.
 
     Returns
     -------

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import reached
-from apertura.core.focus.band_limited import band_limited_image
+from apertura.core.focus.contributions import band_limited_image
 from apertura.core.focus.inputs import Profiles
 from apertura.core.focus.reach import PULSES
 

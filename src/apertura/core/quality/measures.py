@@ -1,4 +1,4 @@
-"""How good an image is as a whole: numerical error, entropy, coherence, noise floor."""
+"""How good an image is as a whole: numerical error, entropy, coherence, noise floor; and sums of several images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+# ---- How good an image is as a whole: numerical error, entropy, coherence, noise floor -----------------------------
 
 
 class Raster(Protocol):
@@ -183,3 +185,33 @@ def content_loss_db(terms: NDArray[np.complex128]) -> float:
     incoherent = float((np.abs(terms[:, usual]) ** 2).sum(axis=0).mean())
     coherent = float(power[usual].mean())
     return float(10 * np.log10(incoherent / coherent)) if coherent > 0 and incoherent > 0 else 0.0
+
+
+# ---- Measures of what several images of one scene add up to --------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A raster of power as complex amplitudes without phase, block by block.
+
+    Attributes
+    ----------
+    power
+        (y, x) float32, linear.
+
+    Examples
+    --------
+    >>> Amplitude(np.array([[4.0, 9.0]], np.float32))[0:1, 1:2]
+    array([[3.+0.j]], dtype=complex64)
+    """
+
+    power: Raster
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows, columns."""
+        return self.power.shape
+
+    def __getitem__(self, window: tuple[slice, slice]) -> NDArray[np.complex64]:
+        power: NDArray[Any] = np.asarray(self.power[window])
+        return np.asarray(np.sqrt(power), np.complex64)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
-from apertura.core.scene.map_crs import axis_attributes, check_crs, grid_mapping
-from apertura.core.scene.pixel_positions import BLOCK_PX, block
+from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_crs, grid_mapping
 
 Floats = NDArray[np.float64]
 

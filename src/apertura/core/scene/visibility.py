@@ -2,14 +2,194 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.sightlines import BLOCK, mark_layover, mark_shadow
 from apertura.core.scene.terrain import Terrain
+
+# ---- Walks over a relief along lines of sight: what lies in shadow, and what shares its range with other ground
+#
+# Kernels (docs/theory/terrain.md, sections 3 and 4). `legs` is (pulse, leg, 3): row, column and height of each phase
+# centre; `ground` is heights (row, column) float32, spacing of the pixels and 1/2R of the Earth (metres, 1/m). Every
+# step goes one pixel along one index, so that ground is interpolated between two pixels only.
+
+SHADOW, LAYOVER = 1, 2
+"""Bits of the mask."""
+
+BLOCK = 16
+"""Side of the blocks of pixels whose highest ground is known beforehand."""
+
+TOLERANCE_M = 1e-3
+"""Ground that rises no more than this above a line of sight does not block it."""
+
+STRAIGHT_BELOW = 0.05
+"""Where the path's slope over the ground is less than this, the antenna is overhead and has no side to look from."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
+    """Height at a point of which at least one index is whole; NaN outside."""
+    rows, columns = height.shape
+    r, c = int(np.floor(row)), int(np.floor(column))
+    if row < 0 or column < 0 or row > rows - 1 or column > columns - 1:
+        return np.nan
+    down, right = row - r, column - c
+    # Between two pixels of the row above the point; the next column is read only where it has weight.
+    low = height[r, c]
+    if right > 0:
+        low = (1 - right) * low + right * height[r, c + 1]
+    if down == 0:
+        return low
+    # And of the row below it.
+    high = height[r + 1, c]
+    if right > 0:
+        high = (1 - right) * high + right * height[r + 1, c + 1]
+    return (1 - down) * low + down * high
+
+
+@numba.njit(cache=True, nogil=True)
+def _steps_left(index, step):  # type: ignore[no-untyped-def]
+    """How many whole steps stay inside the block that `index` is in, along one axis."""
+    if step == 0:
+        return 1 << 30
+    block = np.floor(index / BLOCK) * BLOCK
+    room = block + BLOCK - index if step > 0 else index - block
+    return int(room / abs(step))
+
+
+@numba.njit(cache=True, nogil=True)
+def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-untyped-def]
+    """Whether ground rises above the straight line from a pixel to an antenna."""
+    height, spacing, curvature = ground
+    own = height[row, column]
+    down, right, up = antenna[0] - row, antenna[1] - column, antenna[2] - own
+    # One step is one pixel along the longer of both axes: the line crosses the other axis between two pixels.
+    steps = max(abs(down), abs(right))
+    if steps < 1:
+        return False
+    dr, dc = down / steps, right / steps
+    # A line of length d is s(1 − s)d²/2R below the straight rise between its ends, s = t/steps, on the curved Earth.
+    bend = curvature * spacing * spacing * (dr * dr + dc * dc)
+    t = 1
+    while t < steps:
+        r, c = row + t * dr, column + t * dc
+        there = _interpolated(height, r, c)
+        if np.isnan(there):  # the line has left the scene: what is beside it blocks nothing
+            return False
+        line = own + up * t / steps - bend * t * (steps - t)
+        if there > line + TOLERANCE_M:
+            return True
+        # From here on a rising line comes no lower than this. Above all ground of the scene it is free; above all of
+        # this block (known with one pixel around it) the walk leaps to the last step inside the block.
+        leap, least = 1, line - bend * steps
+        if up > 0 and least > top:
+            return False
+        if up > 0 and least > highest[int(r) // BLOCK, int(c) // BLOCK]:
+            leap = max(1, min(_steps_left(r, dr), _steps_left(c, dc)))
+        t += leap
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-def]
+    """Set `SHADOW` in `mask`, (row, column) uint8 whose pixel (0, 0) is `first`, where most pulses are blocked."""
+    pulses, top = legs.shape[0], highest.max()
+    for i in range(mask.shape[0]):
+        for j in range(mask.shape[1]):
+            blocked = 0
+            for pulse in range(pulses):
+                # Decided: more than half are blocked already, or can no longer become so.
+                if 2 * blocked > pulses or 2 * (pulse - blocked) >= pulses:
+                    break
+                # One blocked leg, to the transmitter or to the receiver, takes the pulse away.
+                for leg in range(legs.shape[1]):
+                    if _blocked(legs[pulse, leg], first[0] + i, first[1] + j, highest, top, ground):
+                        blocked += 1
+                        break
+            if 2 * blocked > pulses:
+                mask[i, j] |= SHADOW
+
+
+@numba.njit(cache=True, nogil=True)
+def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
+    """Length of the way from one antenna to a pixel (row, column) at a height and on to the other antenna."""
+    _, spacing, curvature = ground
+    path = 0.0
+    for leg in range(2):
+        south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
+        flat = south * south + east * east
+        # Seen from the antenna's horizontal the ground falls away by d²/2R.
+        up = legs[leg, 2] - height_m + curvature * flat
+        path += np.sqrt(flat + up * up)
+    return path
+
+
+@numba.njit(cache=True, nogil=True)
+def _laid_over(way, legs, pixel, extreme, ground):  # type: ignore[no-untyped-def]
+    """Whether ground along `way` (rows and columns per step, sign) shares the path of the pixel.
+
+    Behind the pixel (sign +1) paths should be longer, before it (−1) shorter. `extreme` is the height that could break
+    that from farthest away: the highest ground behind, the lowest before.
+    """
+    height, sign = ground[0], way[2]
+    own = _total_path(legs, pixel, height[pixel[0], pixel[1]], ground)
+    t = 1
+    while True:
+        there = (pixel[0] + t * way[0] * sign, pixel[1] + t * way[1] * sign)
+        height_m = _interpolated(height, there[0], there[1])
+        if np.isnan(height_m):  # the end of the scene
+            return False
+        # Not even the most extreme ground of the scene could share the path from here on.
+        if sign * (_total_path(legs, there, extreme, ground) - own) > 0:
+            return False
+        if sign * (_total_path(legs, there, height_m, ground) - own) <= 0:
+            return True
+        t += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _path_gradient(legs, pixel, height_m, spacing):  # type: ignore[no-untyped-def]
+    """Horizontal gradient of the total path, along rows and columns: the line of sight over the ground."""
+    down, right = 0.0, 0.0
+    for leg in range(2):
+        south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
+        up = legs[leg, 2] - height_m
+        distance = np.sqrt(south * south + east * east + up * up)
+        down, right = down + south / distance, right + east / distance
+    return down, right
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untyped-def]
+    """Set `LAYOVER` in `mask`, whose pixel (0, 0) is `first`; `extremes`: lowest and highest ground."""
+    height, spacing = ground[0], ground[1]
+    for i in range(mask.shape[0]):
+        for j in range(mask.shape[1]):
+            pixel = (first[0] + i, first[1] + j)
+            own = height[pixel]
+            # The pulse with the shortest path: there the gradient is square to the track.
+            nearest, least = 0, np.inf
+            for pulse in range(legs.shape[0]):
+                path = _total_path(legs[pulse], pixel, own, ground)
+                if path < least:
+                    nearest, least = pulse, path
+            down, right = _path_gradient(legs[nearest], pixel, own, spacing)
+            steep = max(abs(down), abs(right))
+            if steep < STRAIGHT_BELOW:  # overhead: every way leads away
+                continue
+            # One pixel per step along the longer axis, as for shadow; away from the antenna, then towards it.
+            dr, dc = down / steep, right / steep
+            if _laid_over((dr, dc, 1), legs[nearest], pixel, extremes[1], ground) or _laid_over(
+                (dr, dc, -1), legs[nearest], pixel, extremes[0], ground
+            ):
+                mask[i, j] |= LAYOVER
+
+
+# ---- How the scene is seen: incidence, bistatic angle, and where terrain casts shadow or is laid over --------------
 
 EARTH_RADIUS_M = 6371e3
 

@@ -1,17 +1,266 @@
 """Images as a static STAC catalog: one item for each, with footprint, time, radar, processing, files and inputs."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import pystac
 from pystac.layout import CustomLayoutStrategy
 
+from apertura.common.errors import CampaignError
+from apertura.common.raster import opened_raster
 from apertura.formats.catalog import CATALOG
-from apertura.formats.catalog.assets import media_type, multihash
-from apertura.formats.catalog.fields import EXTENSIONS, Acquisition
+
+# ---- Fields of STAC's extensions, and where their schemas are known by ---------------------------------------------
+
+_BASE = "https://stac-extensions.github.io"
+
+EXTENSIONS: Mapping[str, str] = {
+    "file": f"{_BASE}/file/v2.1.0/schema.json",
+    "processing": f"{_BASE}/processing/v1.2.0/schema.json",
+    "proj": f"{_BASE}/projection/v2.0.0/schema.json",
+    "raster": f"{_BASE}/raster/v1.1.0/schema.json",
+    "sar": f"{_BASE}/sar/v1.3.0/schema.json",
+}
+"""Prefix of the fields → address of the schema, which is its name: nothing is fetched."""
+
+_BANDS_GHZ = {
+    "P": (0.25, 0.5),
+    "L": (1.0, 2.0),
+    "S": (2.0, 4.0),
+    "C": (4.0, 8.0),
+    "X": (8.0, 12.5),
+    "Ku": (12.5, 18.0),
+    "K": (18.0, 26.5),
+    "Ka": (26.5, 40.0),
+}
+"""Frequency bands of the extension; it knows none between P and L, nor above Ka."""
+
+_FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # GPS time begins; nothing here was recorded before
+_NO_CLOCK = "none: the recording carries no time of day, so times count pulses from 1970-01-01"
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """When an image was recorded, and on which frequencies.
+
+    Attributes
+    ----------
+    start, end
+        UTC of the first and of the last pulse.
+    centre_hz, bandwidth_hz
+        Of the band that was received.
+    """
+
+    start: datetime
+    end: datetime
+    centre_hz: float
+    bandwidth_hz: float
+
+    @property
+    def middle(self) -> datetime:
+        """The instant half way."""
+        return self.start + (self.end - self.start) / 2
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Fields of the extension sar that follow; without the band where it has no letter."""
+        ghz = self.centre_hz / 1e9
+        band = next((name for name, (low, high) in _BANDS_GHZ.items() if low <= ghz < high), None)
+        return {
+            "sar:center_frequency": round(ghz, 9),
+            "sar:bandwidth": round(self.bandwidth_hz / 1e9, 9),
+            **({"sar:frequency_band": band} if band else {}),
+            **({"apertura:clock": _NO_CLOCK} if self.start < _FIRST_CLOCK else {}),
+        }
+
+    @classmethod
+    def together(cls, parts: Sequence["Acquisition"]) -> "Acquisition":
+        """Return that of a sum: from the first pulse to the last, over all frequencies.
+
+        Examples
+        --------
+        >>> day = [datetime(2025, 5, 14, hour, tzinfo=UTC) for hour in range(4)]
+        >>> both = Acquisition.together([Acquisition(*day[:2], 1.3e9, 2e8), Acquisition(*day[1:3], 1.5e9, 2e8)])
+        >>> both.end.hour, both.centre_hz, both.bandwidth_hz
+        (2, 1400000000.0, 400000000.0)
+        """
+        low = min(part.centre_hz - part.bandwidth_hz / 2 for part in parts)
+        high = max(part.centre_hz + part.bandwidth_hz / 2 for part in parts)
+        ends = min(part.start for part in parts), max(part.end for part in parts)
+        return cls(*ends, (low + high) / 2, high - low)
+
+
+def projection(wkt: str, shape: tuple[int, int], transform: Sequence[float]) -> dict[str, Any]:
+    """Return where the pixels of a north-up raster lie.
+
+    Parameters
+    ----------
+    wkt
+        Its CRS, as pyproj reads it.
+    shape
+        Rows, columns.
+    transform
+        The six numbers of an affine transform, row by row: column and row to easting and northing, metres.
+
+    Examples
+    --------
+    >>> from pyproj import CRS
+    >>> fields = projection(CRS("EPSG:32632").to_wkt(), (40, 60), (0.5, 0, 500000, 0, -0.5, 100))
+    >>> fields["proj:code"], fields["proj:bbox"]
+    ('EPSG:32632', [500000, 80.0, 500030.0, 100])
+    """
+    from pyproj import CRS
+
+    crs = CRS.from_user_input(wkt)
+    code = crs.to_authority(min_confidence=100)
+    step_x, _, west, _, step_y, north = transform
+    return {
+        "proj:code": ":".join(code) if code else None,
+        "proj:wkt2": crs.to_wkt(),
+        "proj:shape": list(shape),
+        "proj:transform": list(transform),
+        "proj:bbox": [west, north + shape[0] * step_y, west + shape[1] * step_x, north],
+    }
+
+
+# ---- A file of an image as STAC describes it: type, role, size, checksum, and what the pixels of a raster are ------
+
+COG = "image/tiff; application=geotiff; profile=cloud-optimized"
+
+MEDIA_TYPES: Mapping[str, str] = {
+    ".cphd": "application/octet-stream",
+    ".csv": "text/csv",
+    ".geojson": "application/geo+json",
+    ".html": "text/html",
+    ".json": "application/json",
+    ".npy": "application/octet-stream",
+    ".png": "image/png",
+    ".qml": "application/xml",
+    ".tif": COG,
+    ".tsv": "text/tab-separated-values",
+    ".vrt": "application/xml",
+    ".xml": "application/xml",
+    ".yaml": "application/yaml",
+}
+"""How the name of a file ends → its media type."""
+
+UNKNOWN_TYPE = "application/octet-stream"
+
+_ROLES: Mapping[str, tuple[str, ...]] = {
+    "quicklook.png": ("overview", "visual"),
+    "mask.tif": ("data-mask", "metadata"),
+    "incidence.tif": ("local-incidence-angle", "metadata"),
+    "looks.tif": ("metadata",),
+    "bistatic_angle.tif": ("metadata",),
+    "nesz.tif": ("noise-power", "metadata"),
+}
+_ROLES_OF_TYPE: Mapping[str, tuple[str, ...]] = {".tif": ("data",), ".qml": ("style",)}
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a file says of itself.
+
+    Attributes
+    ----------
+    title
+        What a person would call it.
+    bands
+        Of a raster: fields of the raster extension, one mapping a band.
+    inputs
+        File → sha256 of what a raster was made from.
+    """
+
+    title: str
+    bands: list[dict[str, Any]] = field(default_factory=list)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+def multihash(sha256: str) -> str:
+    """Return a sha256 as the file extension writes it: which hash, how many bytes, the hash.
+
+    Examples
+    --------
+    >>> multihash("ab" * 32)[:8]
+    '1220abab'
+    """
+    return f"1220{sha256}"
+
+
+def media_type(name: str) -> str:
+    """Return the media type of a file by its name.
+
+    Examples
+    --------
+    >>> media_type("f01/a-b/mask.tif"), media_type("raw/f01/a.sigmf-data")
+    ('image/tiff; application=geotiff; profile=cloud-optimized', 'application/octet-stream')
+    """
+    return MEDIA_TYPES.get(Path(name).suffix, UNKNOWN_TYPE)
+
+
+def told_by(path: Path) -> Told:
+    """Return what a file says of itself; of a GeoTIFF its bands and what it was made from.
+
+    Raises
+    ------
+    CampaignError
+        If it is called a GeoTIFF and cannot be opened as one.
+    """
+    if path.suffix != ".tif":
+        return Told(path.name)
+    expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
+    try:
+        with opened_raster(path, expected=expected, remedy=remedy) as raster:
+            bands = [_band(raster, number) for number in range(raster.count)]
+            told = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
+            inputs = {str(name): str(digest) for name, digest in told.items()}
+            return Told(raster.descriptions[0] or path.name, bands, inputs)
+    except (ValueError, AttributeError) as error:
+        raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
+
+
+def _band(raster: Any, number: int) -> dict[str, Any]:
+    dtype, nodata, unit = (of[number] for of in (raster.dtypes, raster.nodatavals, raster.units))
+    band: dict[str, Any] = {
+        "data_type": {"complex64": "cfloat32", "complex128": "cfloat64"}.get(dtype, dtype),
+        "sampling": "area",
+        "spatial_resolution": raster.res[0],
+    }
+    if nodata is not None:
+        band["nodata"] = "nan" if nodata != nodata else nodata  # noqa: PLR0124 - NaN alone differs from itself
+    if unit:
+        band["unit"] = unit
+    return band
+
+
+def asset_of(path: Path, href: str, *, sha256: str, told: Told) -> pystac.Asset:
+    """Return the asset of a file.
+
+    Parameters
+    ----------
+    path
+        The file; only its size is looked up.
+    href
+        Where it lies, seen from the item, percent-encoded.
+    sha256
+        Of its bytes, hex.
+    told
+        What it says of itself.
+    """
+    name = path.name
+    roles = _ROLES.get(name) or _ROLES_OF_TYPE.get(path.suffix) or ("metadata",)
+    extra = {"file:checksum": multihash(sha256), "file:size": path.stat().st_size}
+    if told.bands:
+        extra["raster:bands"] = told.bands
+    return pystac.Asset(href, told.title, media_type=media_type(name), roles=list(roles), extra_fields=extra)
+
+
+# ---- Images as a static STAC catalog: one item for each, with footprint, time, radar, processing, files and inputs
 
 RECORDED = "apertura:recorded"
 """Field of the catalog: the first and the last pulse of all images, UTC."""

@@ -144,7 +144,7 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     import dask.array as da
     import xarray as xr
 
-    from apertura.core.echo.missing_pulses import missing_flags
+    from apertura.core.echo.association import missing_flags
 
     first = histories[0]
     frequency = _even(first, expected)

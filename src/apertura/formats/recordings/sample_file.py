@@ -1,20 +1,234 @@
-"""Samples in a recorder's file, read where they are wanted, a bounded number at a time.
+"""Samples in a recorder's file: their layout, real ones mixed to baseband, read a bounded number at a time."""
 
-They are read and not mapped: pages of a mapped file count as memory of the process, and a file that is cut short
-meanwhile ends the process instead of raising an error.
-"""
-
+import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError
-from apertura.formats.recordings.real_samples import SETTLING
-from apertura.formats.recordings.sample_layout import SampleLayout, Samples
+
+# ---- Real samples at an intermediate frequency become complex baseband: analytic signal, then mixing, at the same
+# rate
+
+SETTLING = 63
+"""Samples on either side that the filter reaches: where it runs over the end of a capture, they are wrong."""
+
+EDGE = 0.025
+"""Of the sample rate: bands keep that far from both ends of their Nyquist zone; the mirror image is then -80 dB."""
+
+_KAISER = 8.0
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """How real samples x are mixed: s = (x + j·H{x})·exp(-j2π·if_hz·n/f_s), with H the Hilbert transform.
+
+    Attributes
+    ----------
+    if_hz
+        Where baseband zero lies in the samples, before any aliasing; negative where the mixer mirrors the spectrum.
+    sample_rate_hz
+        Real samples per second, and complex ones afterwards.
+    restarts
+        The phase is zero (n = 0) at the first sample of every capture; else at that of the file.
+
+    Notes
+    -----
+    Source: docs/theory/recordings.md, eq. 1 and 2.
+    """
+
+    if_hz: float
+    sample_rate_hz: float
+    restarts: bool
+
+    @property
+    def alias_hz(self) -> float:
+        """Where baseband zero lies after aliasing, -f_s/2 to f_s/2."""
+        half = self.sample_rate_hz / 2
+        return (self.if_hz + half) % self.sample_rate_hz - half
+
+    def baseband(self, real: NDArray[np.int16 | np.float32], first: int = 0) -> NDArray[np.float32]:
+        """Return stretches of samples as I and Q; right but for `SETTLING` samples at either end.
+
+        Parameters
+        ----------
+        real
+            (stretch, sample, channel).
+        first
+            Number n of the first sample.
+
+        Returns
+        -------
+        ndarray
+            (stretch, sample, channel, 2) float32.
+
+        Examples
+        --------
+        >>> tone = np.cos(2 * np.pi * 0.3 * np.arange(400))[None, :, None]
+        >>> Mixing(0.25, 1.0, restarts=True).baseband(tone)[0, 205, 0].round(4)  # exp(j2π·0.05·205)
+        array([0., 1.], dtype=float32)
+        """
+        from scipy.signal import oaconvolve
+
+        if not real.shape[0] * real.shape[1]:
+            return np.zeros((*real.shape, 2), np.float32)
+        x = real.astype(np.float64)
+        side = 1.0 if self.alias_hz >= 0 else -1.0
+        quadrature = oaconvolve(x, _hilbert()[None, :, None], mode="full", axes=1)[:, SETTLING : SETTLING + x.shape[1]]
+        turns = self.if_hz / self.sample_rate_hz * (first + np.arange(x.shape[1]))
+        mixed = (x + 1j * side * quadrature) * np.exp(-2j * np.pi * (turns % 1.0))[None, :, None]
+        return np.asarray(mixed.astype(np.complex64)[..., None].view(np.float32))
+
+    def problem(self, lowest_hz: float, highest_hz: float, prefix_samples: int) -> str | None:
+        """Return why a band about baseband zero cannot be had of these samples, or None.
+
+        Parameters
+        ----------
+        lowest_hz, highest_hz
+            Edges of the band, relative to baseband zero.
+        prefix_samples
+            At the start of each capture that nothing is measured in.
+
+        Examples
+        --------
+        >>> Mixing(20e6, 64e6, restarts=True).problem(0.0, 16e6, 100)
+        'the band lies at 20 to 36 MHz in samples at 64 MHz, within 1.6 MHz of an end of a Nyquist zone'
+        """
+        rate = self.sample_rate_hz
+        low, high = self.if_hz + lowest_hz, self.if_hz + highest_hz
+        zone = np.floor(2 * self.if_hz / rate)
+        inside = low >= (zone / 2 + EDGE) * rate and high <= (zone / 2 + 0.5 - EDGE) * rate
+        if not inside:
+            return (
+                f"the band lies at {low / 1e6:g} to {high / 1e6:g} MHz in samples at {rate / 1e6:g} MHz, "
+                f"within {EDGE * rate / 1e6:g} MHz of an end of a Nyquist zone"
+            )
+        if self.restarts and prefix_samples < SETTLING:
+            return f"a prefix of {prefix_samples} samples, in which the filter needs {SETTLING} to settle"
+        return None
+
+
+@cache
+def _hilbert() -> NDArray[np.float64]:
+    """Return the taps of H, (2·SETTLING+1,): 2/(πk) for odd k under a Kaiser window."""
+    k = np.arange(-SETTLING, SETTLING + 1)
+    taps = np.zeros(k.size)
+    odd = k % 2 == 1
+    taps[odd] = 2 / (np.pi * k[odd])
+    return np.asarray(taps * np.kaiser(k.size, _KAISER))
+
+
+# ---- How the samples of a recording lie in its file: which numbers, what stands between them, real ones at which IF
+
+Samples = NDArray[np.int16 | np.float32]
+"""(…, 2), I and Q: counts of up to 16 bits as int16, all others as float32."""
+
+_DATATYPE = re.compile(r"([cr])(?:([iu]8)|([iu](?:16|32)|f(?:16|32|64))_([lb])e)", re.ASCII)
+
+DATATYPES = "ci16_le: c or r (complex, real); i8, u8, or i16, u16, i32, u32, f16, f32, f64 with _le or _be"
+"""What datatypes are read, for messages."""
+
+_LARGEST = np.float64(1e15)  # of a float: sums of squares stay in float32
+
+
+def _none() -> NDArray[np.int64]:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleLayout:
+    """How samples lie in a file.
+
+    Attributes
+    ----------
+    datatype
+        As SigMF names it.
+    trailing_bytes
+        At the end of the file that are no samples.
+    segment_start, skipped_bytes
+        (segment,) int64: first samples of what lies behind bytes that are no samples, ascending, and how many such
+        bytes the file holds before each; none where there are no such bytes.
+    mixing
+        Of real samples; None: they are complex.
+
+    Examples
+    --------
+    >>> SampleLayout("ri16_be").stored, SampleLayout("ri16_be").components
+    (dtype('>i2'), 1)
+    """
+
+    datatype: str = "ci16_le"
+    trailing_bytes: int = 0
+    segment_start: NDArray[np.int64] = field(default_factory=_none)
+    skipped_bytes: NDArray[np.int64] = field(default_factory=_none)
+    mixing: Mixing | None = None
+
+    @property
+    def stored(self) -> np.dtype[Any]:
+        """Of one number in the file; ValueError if the datatype is none of those that are read."""
+        match = _DATATYPE.fullmatch(self.datatype)
+        if match is None:
+            raise ValueError(f"no datatype {self.datatype}")
+        kind, order = match[2] or match[3], "<" if match[4] == "l" else ">"
+        return np.dtype(f"{order if match[4] else '|'}{kind[0]}{int(kind[1:]) // 8}")
+
+    @property
+    def components(self) -> int:
+        """Numbers per sample of a channel: I and Q, or one."""
+        return 2 if self.datatype.startswith("c") else 1
+
+    def numbers(self, data: NDArray[np.uint8]) -> Samples:
+        """Return the bytes of a file as numbers, flat: int16 where that holds them, else float32.
+
+        Unsigned counts lose half their range: 128 of u8 is zero. Those of 32 bits are rounded to 24.
+
+        Raises
+        ------
+        ValueError
+            If a float is not finite or beyond 1e15; its second argument is the index of the first.
+        """
+        stored = data.view(self.stored)
+        if stored.dtype.kind == "u":
+            stored = stored - np.float64(1 << 8 * stored.itemsize - 1)
+        elif stored.dtype.kind == "f":
+            with np.errstate(invalid="ignore"):  # a NaN that signals
+                good = np.abs(stored) <= _LARGEST  # false for NaN
+            if not good.all():
+                raise ValueError("not finite or beyond 1e15", int(np.argmin(good)))
+        if self.stored.kind in "iu" and self.stored.itemsize <= 2:
+            return stored.astype(np.int16, copy=False)
+        return stored.astype(np.float32, copy=False)
+
+    def kept(self) -> tuple[dict[str, Any], dict[str, xr.Variable]]:
+        """Return attributes and variables of the `raw` stage that `of` makes a layout of again."""
+        attributes = {
+            "datatype": self.datatype,
+            "trailing_bytes": self.trailing_bytes,
+            "mixing": None if self.mixing is None else asdict(self.mixing),
+        }
+        segments = {"segment_start": self.segment_start, "segment_skipped": self.skipped_bytes}
+        return attributes, {name: xr.Variable("segment", one) for name, one in segments.items() if one.size}
+
+    @classmethod
+    def of(cls, raw: xr.Dataset) -> "SampleLayout":
+        """Return the layout of the file that a `raw` stage refers to."""
+        start, skipped = (raw[name].values if name in raw else _none() for name in ("segment_start", "segment_skipped"))
+        stated = raw.attrs["mixing"]
+        mixing = None if stated is None else Mixing(**stated)
+        return cls(raw.attrs["datatype"], raw.attrs["trailing_bytes"], start, skipped, mixing)
+
+
+# ---- Samples in a recorder's file, read where they are wanted, a bounded number at a time --------------------------
+#
+# They are read and not mapped: pages of a mapped file count as memory of the process, and a file that is cut short
+# meanwhile ends the process instead of raising an error.
 
 Spans = Sequence[tuple[int, int]]
 """First sample, and that behind the last."""

@@ -1,4 +1,4 @@
-"""What autopilots log: a receiver's epochs in UTC, and attitude by a clock that counts from the autopilot's start."""
+"""What autopilots log: a receiver's epochs in UTC, attitude by a clock from start, Doppler velocities."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,13 +8,166 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import utc_times
-from apertura.formats.tracks.boot_clock import clock_of
 from apertura.formats.tracks.log_options import LogOptions
-from apertura.formats.tracks.own_velocity import contradicted
 from apertura.formats.tracks.track import make_track
 
+# ---- An autopilot's clock, which counts from its start, against UTC: the line through what its receiver tells ------
+
 Floats = NDArray[np.float64]
+
+_AGREES_S = 0.25  # receivers' messages are late by about 0.1 s, and now and then by some tens of milliseconds more
+_FASTEST = 1e-4  # the worst of quartz clocks
+_MOST_AGREE = 0.9
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The autopilot's clock against UTC: UTC = origin + offset_s + rate·boot_s, when it heard of epochs.
+
+    Attributes
+    ----------
+    origin
+        Some UTC near the log.
+    offset_s, rate
+        Of the line.
+    delay_s
+        By how much later than they were true epochs are heard of.
+    """
+
+    origin: np.datetime64
+    offset_s: float
+    rate: float
+    delay_s: float
+
+    def utc(self, boot_s: Floats) -> NDArray[np.datetime64]:
+        """Return UTC of the autopilot's clock.
+
+        Examples
+        --------
+        >>> clock = Clock(np.datetime64("2025-05-14T09:30:00", "ns"), 0.0, 1.0, 0.1)
+        >>> str(clock.utc(np.array([1.1]))[0])
+        '2025-05-14T09:30:01.200000000'
+        """
+        since = self.offset_s + self.rate * (boot_s + self.delay_s)
+        return np.asarray(self.origin + np.rint(since * 1e9).astype("timedelta64[ns]"))
+
+    def boot_s(self, utc: NDArray[np.datetime64]) -> Floats:
+        """Return the autopilot's clock at UTC."""
+        return np.asarray(((utc - self.origin) / np.timedelta64(1, "s") - self.offset_s) / self.rate - self.delay_s)
+
+
+def clock_of(
+    boot_s: Floats, time_utc: NDArray[np.datetime64], *, delay_s: float, where: Path
+) -> tuple[Clock, NDArray[np.bool_]]:
+    """Return the autopilot's clock against UTC, and which epochs agree with it: a line through what most say.
+
+    Parameters
+    ----------
+    boot_s, time_utc
+        (epoch,): the autopilot's clock when it heard of epochs, and their times.
+    delay_s
+        By how much it hears of them late.
+    where
+        The log, for messages.
+
+    Raises
+    ------
+    CampaignError
+        If more than a tenth of the epochs is 0.25 s off, as where the receiver learns of a leap second late.
+
+    Examples
+    --------
+    >>> times = np.datetime64("2025-05-14T09:30:00", "ns") + np.array([0, 1, 2]) * np.timedelta64(1, "s")
+    >>> clock, agree = clock_of(np.array([5.0, 6.0, 7.1]), times, delay_s=0.0, where=Path("x.ulg"))
+    >>> str(clock.utc(np.array([6.0]))[0]), bool(agree.all())
+    ('2025-05-14T09:30:01.000000000', True)
+    """
+    origin, zero = time_utc[0], float(np.median(boot_s))
+    since = (time_utc - origin) / np.timedelta64(1, "s")
+    ahead, beside = since - boot_s, boot_s - zero
+    line = np.array([0.0, float(np.median(ahead))])
+    reach = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2
+    for _ in range(2):  # what is off by seconds goes before a line is laid through the rest
+        near = np.abs(ahead - np.polyval(line, beside)) <= reach
+        if near.sum() >= 8 and np.ptp(beside[near]) * _FASTEST > 0.01:
+            line = np.polyfit(beside[near], ahead[near], 1)
+        elif near.any():
+            line = np.array([0.0, float(np.median(ahead[near]))])
+        reach = _AGREES_S
+    off = np.abs(ahead - np.polyval(line, beside))
+    agree = off <= _AGREES_S
+    if agree.mean() < _MOST_AGREE:
+        first = int(np.flatnonzero(~agree)[0])
+        raise CampaignError(
+            f"{int((~agree).sum())} of {agree.size} times of the receiver do not fit the autopilot's clock; epoch "
+            f"{first} at {time_utc[first]} is {off[first]:.2f} s off",
+            where,
+            f"one line within {_AGREES_S} s",
+            "Cut the log where the receiver corrects its time, or take another source (nodes.<node>.log.body).",
+        )
+    slope, middle = (float(one) for one in line)
+    return Clock(origin, middle - slope * zero, 1 + slope, delay_s), agree
+
+
+# ---- A receiver's positions against its own velocities, which come of Doppler shifts: two words on the same motion
+
+_NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the 20 m/s² by which velocity may bend between epochs
+_MOST, _FEW = 0.5, 10
+
+
+def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: Floats) -> NDArray[np.bool_]:
+    """Return which epochs are not where their neighbours and the velocities lead.
+
+    A step that starts or ends at an epoch misses by |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch whose steps all
+    miss is contradicted. Where more than half of ten or more steps miss, it is the velocities that are wrong: no epoch
+    is.
+
+    Parameters
+    ----------
+    time_utc
+        (epoch,) datetime64[ns].
+    geodetic
+        (epoch, 3) float64: WGS 84 latitude (deg), longitude (deg), ellipsoidal height (m).
+    velocity
+        (epoch, 3) float64 to north, east and down, m/s; NaN where not known.
+
+    Returns
+    -------
+    ndarray
+        (epoch,) bool.
+
+    Notes
+    -----
+    Source: docs/theory/autopilots.md, eq. 2.
+
+    Examples
+    --------
+    >>> times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(30) * np.timedelta64(100, "ms")
+    >>> place = np.tile([0.0, 9.0, 600.0], (30, 1))
+    >>> place[7, 2] += 1
+    >>> np.flatnonzero(contradicted(times, place, np.zeros((30, 3)))).tolist()
+    [7]
+    """
+    wrong = np.zeros(len(time_utc), bool)
+    if len(wrong) < 3:
+        return wrong
+    ends = velocity[:-1], velocity[1:]  # of each step; one stands in for the other where that is not known
+    with np.errstate(invalid="ignore"):  # of what is no place on Earth, which is refused later
+        position = ecef_from_geodetic(*geodetic.T)
+        steps = np.einsum("eij,ei->ej", ned_axes(position)[:-1], np.diff(position, axis=0))
+        lasting = (np.diff(time_utc) / np.timedelta64(1, "s"))[:, None]
+        before, after = (np.where(np.isnan(v), w, v) for v, w in (ends, ends[::-1]))
+        missed = steps - (before + after) / 2 * lasting
+        far = (np.abs(missed) > _NEAR_M + _CURVED_M_S2 * lasting**2).any(axis=1)  # NaN is not
+    if far.size >= _FEW and far.mean() > _MOST:
+        return wrong
+    return np.asarray(np.concatenate([[True], far]) & np.concatenate([far, [True]]))
+
+
+# ---- What autopilots log: a receiver's epochs in UTC, and attitude by a clock that counts from the autopilot's
+# start
 
 _WORST_STD_M = 1e4
 _UNIT = 1e-2

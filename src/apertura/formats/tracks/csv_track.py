@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
-from apertura.formats.tracks.left_open import contradicted, start_time, unsaid
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.tables import cut_off, numbers, read_table
-from apertura.formats.tracks.track import FIXES, make_track
+from apertura.formats.tracks.track import FIXES, contradicted, make_track, start_time, unsaid
 
 _TIMES = ("time_utc", "time", "time_s")
 _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {

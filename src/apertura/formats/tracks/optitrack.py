@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
-from apertura.formats.tracks.left_open import start_time, unsaid
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.tables import LARGEST_LOG, number
-from apertura.formats.tracks.track import make_track
+from apertura.formats.tracks.track import make_track, start_time, unsaid
 
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _NEEDED = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis in "XYZ"]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.isolated import UnreadableError, read_isolated
-from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
-from apertura.formats.tracks.boot_clock import clock_of
+from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track, clock_of
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.track import FIXES
 from apertura.formats.tracks.ulog_fields import ATTITUDE, DELAY, FUSED, RECEIVERS

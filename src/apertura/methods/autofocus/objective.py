@@ -1,14 +1,233 @@
-"""How sharp the patches are, as a function of the tracks: value and gradient from cached contributions."""
+"""How sharp the patches are as a function of the tracks: blocks of pulses, their contributions, value and gradient."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.methods.autofocus.blocks import Blocks, Contribution, Tracks
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.contributions import block_contributions
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.methods.autofocus.inputs import Sighting
+from apertura.methods.autofocus.patches import Patch, bandwidth_hz
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+
+# ---- Blocks of pulses: what tracks are corrected by, and what each block of a pair adds to the patches -------------
 
 Floats = NDArray[np.float64]
+Tracks = Mapping[str, Floats]
+
+_PULSES = 4096  # read at once
+_MARGIN = 10  # samples beyond a patch, for the interpolation and for tracks that move
+
+
+@dataclass(frozen=True, eq=False)
+class PatchEcho:
+    """What the blocks of a pair that see a patch recorded of it, summed towards its middle.
+
+    Attributes
+    ----------
+    patch
+        Where.
+    blocks
+        Which of the pair's blocks.
+    profiles
+        Over those blocks: range profiles about the patch, as one pulse at the mean place of each block's would have
+        them.
+    """
+
+    patch: Patch
+    blocks: slice
+    profiles: Profiles
+
+    @property
+    def values(self) -> int:
+        """How many values tell what its blocks add to its pixels."""
+        return len(self.patch.pixels_m) * len(self.profiles)
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """The pulses of one pair, by the knots of the corrections.
+
+    Attributes
+    ----------
+    sighting
+        The pair.
+    edges
+        (knot + 1,) int64, first pulse of each block, and the number of pulses.
+    average
+        (block, knot) sparse float64: mean over the pulses of a block of what is linear between knots.
+    aperture
+        Mean phase centres of each block's pulses, as the logs have them.
+    sidelink_m
+        (block, 3) float64, mean of the sighting's; None where it has none.
+    """
+
+    sighting: Sighting
+    edges: NDArray[np.int64]
+    average: "csr_array"
+    aperture: Aperture
+    sidelink_m: Floats | None
+
+    @classmethod
+    def of(cls, sighting: Sighting, knots_s: Floats) -> "Blocks":
+        """Return the blocks of a pair about equally spaced knots."""
+        from scipy.sparse import csr_array  # slow to import
+
+        count, step_s, pulses = len(knots_s), float(knots_s[1] - knots_s[0]), len(sighting.time_s)
+        edges = np.searchsorted(sighting.time_s, np.append(knots_s - step_s / 2, np.inf))
+        edges[0] = 0
+        block = np.repeat(np.arange(count), np.diff(edges))
+        share = 1 / np.diff(edges)[block]
+        mean = csr_array((share, (block, np.arange(pulses))), shape=(count, pulses))
+        place = np.clip((sighting.time_s - knots_s[0]) / step_s, 0, count - 1)
+        left = np.minimum(place.astype(np.int64), count - 2)
+        rows = np.tile(np.arange(pulses), 2)
+        between = csr_array(
+            (np.concatenate([1 - (place - left), place - left]), (rows, np.concatenate([left, left + 1]))),
+            shape=(pulses, count),
+        )
+        aperture = Aperture(*(mean @ leg for leg in sighting.profiles.aperture.legs))
+        sidelink_m = None if sighting.sidelink_m is None else mean @ sighting.sidelink_m
+        return cls(sighting, edges, mean @ between, aperture, sidelink_m)
+
+    def average_of(self, tracks: Floats) -> Floats:
+        """Return (mode, block, 3) float64, the mean of (mode, knot, 3) tracks over the pulses of each block."""
+        modes, knots, _ = tracks.shape
+        flat = np.moveaxis(tracks, 1, 0).reshape(knots, -1)
+        return np.moveaxis((self.average @ flat).reshape(knots, modes, 3), 0, 1)
+
+    def moves(self, tracks: Tracks) -> Tracks:
+        """Return node → (block, 3) float64, metres, of the nodes of the pair."""
+        return {node: np.asarray(self.average @ tracks[node]) for node in dict.fromkeys(self.sighting.nodes)}
+
+    def echoes(self, patches: Sequence[Patch]) -> list[PatchEcho]:
+        """Return what the pair recorded of each patch; every pulse is read once.
+
+        Notes
+        -----
+        Source: docs/theory/autofocus.md, eq. 9: about the middle of a patch paths of a block differ by what they do at
+        the middle.
+        """
+        profiles, beams, edges = self.sighting.profiles, self.sighting.beams, self.edges
+        starts = [self._offsets(patch) for patch in patches]
+        sums = [np.zeros((len(offsets), len(edges) - 1), np.complex64) for offsets in starts]
+        first = 0
+        while first < len(edges) - 1:
+            last = max(first + 1, int(np.searchsorted(edges, edges[first] + _PULSES, side="right")) - 1)
+            last = min(last, len(edges) - 1)
+            pulses = slice(int(edges[first]), int(edges[last]))
+            if pulses.stop > pulses.start:
+                part = profiles[pulses]
+                part = replace(part, samples=np.asarray(part.samples))
+                for patch, offsets, total in zip(patches, starts, sums, strict=True):
+                    weights = None
+                    if beams is not None:
+                        weights = beams[pulses].weight(part.aperture, patch.place_m[None])[:, 0]
+                    inside = edges[first : last + 1] - edges[first]
+                    total[:, first:last] = _towards(part, patch.place_m, offsets, inside, weights)
+            first = last
+        return [self._echo(*one) for one in zip(patches, starts, sums, strict=True)]
+
+    def _offsets(self, patch: Patch) -> Floats:
+        """Return (sample,) float64, metres of total path about a patch's middle."""
+        some = self.sighting.profiles.aperture.sample(64)
+        aperture, step_m = self.sighting.profiles.aperture[some], self.sighting.profiles.step_m
+        corners = patch.pixels_m[:: max(1, len(patch.pixels_m) - 1)]
+        corners = np.concatenate(
+            [corners, 2 * patch.place_m - corners, patch.pixels_m[:: max(1, len(patch.pixels_m) // 8)]]
+        )
+        reach = float(np.abs(aperture.path(corners) - aperture.path(patch.place_m[None])).max())
+        half = int(np.ceil(reach / step_m)) + _MARGIN
+        return np.asarray(np.arange(-half, half + 1) * step_m, np.float64)
+
+    def _echo(self, patch: Patch, offsets: Floats, sums: NDArray[np.complex64]) -> PatchEcho:
+        seen = np.flatnonzero(np.abs(sums).any(axis=0))
+        blocks = slice(int(seen[0]), int(seen[-1]) + 1) if seen.size else slice(0, 1)
+        whole, aperture = self.sighting.profiles, self.aperture[blocks]
+        middle = aperture.path(patch.place_m)
+        wavenumber = 2 * np.pi * whole.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        turned = sums[:, blocks].T * np.exp(-1j * wavenumber * (middle[:, None] + offsets))
+        return PatchEcho(
+            patch,
+            blocks,
+            replace(whole, samples=turned.astype(np.complex64), start_m=middle + offsets[0], aperture=aperture),
+        )
+
+    def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":
+        """Return what each block adds to the pixels of a patch where its nodes have moved by so much."""
+        tx, rx = self.sighting.nodes
+        moves = [moved[node][echo.blocks] for node in (tx, rx)]
+        logged = echo.profiles.aperture
+        aperture = Aperture(logged.tx_m + moves[0], logged.rx_m + moves[1])
+        further_m, along = np.zeros(len(aperture)), np.zeros((len(aperture), 3))
+        if self.sidelink_m is not None:
+            between = self.sidelink_m[echo.blocks]
+            corrected = between + moves[0] - moves[1]
+            length = np.linalg.norm(corrected, axis=1)
+            further_m = length - np.linalg.norm(between, axis=1)
+            along = corrected / np.maximum(length, 1e-9)[:, None]
+        away = [leg - echo.patch.place_m for leg in aperture.legs]
+        unit = [one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9) for one in away]
+        slopes = {tx: unit[0] + unit[1]} if tx == rx else {tx: unit[0] - along, rx: unit[1] + along}
+        profiles = echo.profiles.moved(aperture, further_m)
+        profiles = replace(profiles, samples=np.asarray(profiles.samples))
+        values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))
+        wavenumber, band = (
+            2 * np.pi * frequency / SPEED_OF_LIGHT_M_S
+            for frequency in (profiles.centre_frequency_hz, bandwidth_hz(profiles) / np.sqrt(12))
+        )
+        return Contribution(values, echo.blocks, slopes, wavenumber, band)
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """What the blocks of a pair that see a patch add to it.
+
+    Attributes
+    ----------
+    values
+        (pixel, block) complex64.
+    blocks
+        Which of the pair's blocks those are.
+    slopes
+        Node → (block, 3) float64, growth of the path at the patch per metre that the node moves (eq. 2).
+    wavenumber
+        2πf_mid/c.
+    band
+        The same of the band's standard deviation, taken as flat.
+    """
+
+    values: NDArray[np.complex64]
+    blocks: slice
+    slopes: Mapping[str, Floats]
+    wavenumber: float
+    band: float
+
+
+def _towards(
+    profiles: Profiles, place_m: Floats, offsets: Floats, edges: NDArray[np.int64], weights: Floats | None
+) -> NDArray[np.complex64]:
+    """Return Σ s(R + δ)·exp(jk(R + δ)) over the pulses of each block, (offset, block), R the path of a place.
+
+    Antennas on a line at -R/2 see places at δ/2 on it over the path R + δ.
+    """
+    on_line = np.zeros((len(profiles), 3))
+    on_line[:, 0] = -profiles.aperture.path(place_m) / 2
+    places = np.zeros((len(offsets), 3))
+    places[:, 0] = offsets / 2
+    at = replace(profiles, aperture=Aperture(on_line, on_line))
+    return block_contributions(at, places, edges=edges, weights=weights)
+
+
+# ---- How sharp the patches are, as a function of the tracks: value and gradient from cached contributions ----------
 
 MOST_WEIGHT = 1e4
 _WEIGHT_OF_RATIO = 3.0

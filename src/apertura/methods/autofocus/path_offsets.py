@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
-from apertura.methods.autofocus.candidates import Candidates
-from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, gains_db
-from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, MOST_RATIO, gains_db
+from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
 from apertura.methods.autofocus.objective import Seen
 from apertura.methods.autofocus.one_phase import METHODS, Patches
-from apertura.methods.autofocus.outcome import Refinement
-from apertura.methods.autofocus.patches import LEAST_PATCHES, Patch, affordable, bandwidth_hz
-from apertura.methods.autofocus.uncertainty import MOST_RATIO
+from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, affordable, bandwidth_hz
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -1,10 +1,76 @@
-"""Coherence and phase of two images of one scene, over a square window, and what chance makes of them."""
+"""Coherence and phase of two images of one scene over a window, the common band, and what chance makes of them."""
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from math import exp, lgamma
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+
+# ---- How much two images can have in common: the share of the ground's spectrum that both have seen ----------------
+
+
+def common_band(
+    carriers: tuple[NDArray[np.float64], NDArray[np.float64]], spectra: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> float:
+    """Return the coherence of ground that did not change, seen by two images through bands of Gaussian shape.
+
+    Parameters
+    ----------
+    carriers
+        (2,) float64 each, cycles per metre east and north, the middle of the image's band.
+    spectra
+        (2, 2) float64 each, cycles² per m², the covariance of that band.
+
+    Returns
+    -------
+    float
+        0 to 1, within 0.09 of what equally wide bands with sharp edges share.
+
+    Notes
+    -----
+    Source: docs/theory/interferometry.md, eq. 1a.
+
+    Examples
+    --------
+    >>> flat = np.eye(2) / 12  # as wide as a band of one cycle per metre
+    >>> [round(common_band((np.zeros(2), np.array([apart, 0.0])), (flat, flat)), 2) for apart in (0, 0.2, 0.5, 1)]
+    [1.0, 0.89, 0.47, 0.05]
+    """
+    apart, both = carriers[1] - carriers[0], (spectra[0] + spectra[1]) / 2
+    shape = np.linalg.det(spectra[0]) * np.linalg.det(spectra[1]) / np.linalg.det(both) ** 2
+    return float(shape**0.25 * np.exp(-apart @ np.linalg.solve(both, apart) / 4))
+
+
+def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float = 16, most: int = 65) -> int:
+    """Return the side of the smallest window that holds some looks, pixels, odd.
+
+    Parameters
+    ----------
+    spectrum
+        (2, 2) float64, cycles² per m², the covariance of the image's band: of one with sharp edges a look is
+        1/(12 √det) m².
+    spacing_m
+        Between pixels.
+    looks
+        Independent samples that coherence is measured on.
+    most
+        A window is not wider than so many pixels.
+
+    Examples
+    --------
+    >>> window_px(np.eye(2) / 12, 0.25), window_px(np.eye(2) / 12, 2.0)
+    (17, 5)
+    """
+    cells = 12 * np.sqrt(max(np.linalg.det(spectrum), 0.0)) * spacing_m**2  # of one pixel
+    side = np.sqrt(looks / min(cells, 1)) if cells > 0 else np.inf
+    return int(min(2 * np.ceil((side - 1) / 2) + 1, most))
+
+
+# ---- Coherence and phase of two images of one scene, over a square window, and what chance makes of them -----------
 
 
 def coherence(
@@ -137,3 +203,76 @@ def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.compl
     alike = alike[np.ix_(near % alike.shape[0], near % alike.shape[1])]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(alike / alike[window - 1, window - 1].real)
+
+
+# ---- Coherence and phase of two whole images, tile by tile: what does not depend on how they lie to each other
+
+
+@dataclass(frozen=True, eq=False)
+class Formed:
+    """Coherence and phase of two images.
+
+    Attributes
+    ----------
+    magnitude, phase, looks
+        As of `coherence.coherence`; looks are the median of the tiles', NaN where none has any.
+    shared
+        (y, x) float32, pixels that a window's energy is spread over, as a share of it: about 1/2 of ground, 1/`looks`
+        of a point (docs/theory/interferometry.md, eq. 6).
+    """
+
+    magnitude: NDArray[np.float32]
+    phase: NDArray[np.float32]
+    shared: NDArray[np.float32]
+    looks: float
+
+
+def formed(
+    first: NDArray[np.complex64], second: NDArray[np.complex64], tiles: Iterable[Window], *, window: int
+) -> Formed:
+    """Return what `apertura.methods.interferometry.coherence.coherence` tells of the whole.
+
+    Parameters
+    ----------
+    first, second
+        (y, x) complex64 on one grid, NaN where nothing was formed; read a tile with its margin at a time.
+    tiles
+        Windows that make up the grid.
+    window
+        Pixels along a side, odd.
+
+    Examples
+    --------
+    >>> image = np.exp(1j * np.arange(64.0).reshape(8, 8) ** 2).astype(np.complex64)
+    >>> halves = [(slice(0, 8), slice(0, 4)), (slice(0, 8), slice(4, 8))]
+    >>> apart, whole = formed(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
+    >>> bool((apart.magnitude == whole[0]).all() and (apart.phase == whole[1]).all())
+    True
+    """
+    shape, margin = first.shape, window // 2
+    planes = [np.full(shape, np.nan, np.float32) for _ in range(3)]
+    looks: list[float] = []
+    for tile in tiles:
+        wider = tuple(
+            slice(max(0, part.start - margin), min(size, part.stop + margin))
+            for part, size in zip(tile, shape, strict=True)
+        )
+        inner = tuple(
+            slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(tile, wider, strict=True)
+        )
+        one, other = np.asarray(first[wider]), np.asarray(second[wider])
+        magnitude, phase, own = coherence(one, other, window=window)
+        looks.append(own)
+        planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
+        planes[2][tile] = _shared(one, other, window)[inner]
+    there = [one for one in looks if np.isfinite(one)]
+    return Formed(planes[0], planes[1], planes[2], float(np.median(there)) if there else float("nan"))
+
+
+def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
+    """Return (Σp)²/(N Σp²) over a window about each pixel, p the magnitude of the images' product."""
+    power = np.abs(one.astype(np.complex128) * other)
+    there = np.isfinite(power)
+    power = np.where(there, power, 0)
+    total, squares, count = boxed(power, window), boxed(power**2, window), boxed(there.astype(np.float64), window)
+    return np.asarray(total**2 / np.maximum(count * squares, np.finfo(np.float64).tiny))

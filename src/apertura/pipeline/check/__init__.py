@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from apertura.common.errors import CampaignError
-from apertura.common.isolation import as_typed
+from apertura.common.processes import as_typed
 from apertura.pipeline.check.loading import load
 from apertura.pipeline.config import located
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from apertura.core.scene.grid import SceneGrid
     from apertura.formats.recordings.recording import Recording
-    from apertura.pipeline.opening.ground import Ground
+    from apertura.pipeline.opening.scene import Ground
     from apertura.pipeline.opening.transmitted import Transmitted
 
 T = TypeVar("T")
@@ -99,7 +99,7 @@ class Inspected:
         """What is wrong with phase history: of every pair whose files are small, and of one that the frame rests on."""
         if self.waveform is not None:
             return []
-        from apertura.pipeline.opening.recorded import recorded_echo
+        from apertura.pipeline.opening.pair import recorded_echo
 
         wrong: list[CampaignError] = []
         pairs = [(flight.name, pair) for flight in self.campaign.flights for pair in flight.pairs]
@@ -223,7 +223,7 @@ class Inspected:
 
     @cached_property
     def _ground(self) -> "tuple[Ground | None, list[CampaignError], float]":
-        from apertura.pipeline.opening.ground import Ground
+        from apertura.pipeline.opening.scene import Ground
 
         flown_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
         asked = self.campaign.settings.scene

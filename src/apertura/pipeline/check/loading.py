@@ -18,7 +18,7 @@ from apertura.pipeline.config import (
     read_segments,
     read_settings,
 )
-from apertura.pipeline.config.table import table_rows
+from apertura.pipeline.config.section import table_rows
 
 T = TypeVar("T")
 

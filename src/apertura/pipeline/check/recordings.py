@@ -9,7 +9,7 @@ from apertura.common.paths import inside
 from apertura.formats.recordings.recording import Recording
 from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.config import CONFIG, OfdmWaveform, SampledWaveform
-from apertura.pipeline.opening.mixing import check_mixing
+from apertura.pipeline.opening.transmitted import check_mixing
 
 _SAME = 1e-9
 """Carriers and rates that differ by less, relative to what the config states, are the same."""

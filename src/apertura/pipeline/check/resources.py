@@ -40,7 +40,7 @@ def free_memory(meminfo: Path = MEMINFO) -> int:
     >>> 0 < free_memory() <= free_memory(Path("none"))
     True
     """
-    from apertura.core.planning.memory import memory_limit
+    from apertura.core.planning.plan import memory_limit
 
     lines = meminfo.read_text(encoding="utf-8").splitlines() if meminfo.is_file() else []
     stated = [int(line.split()[1]) * 1024 for line in lines if line.startswith(("MemAvailable:", "SwapFree:"))]

@@ -5,15 +5,12 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from apertura.common import validation
+from apertura.common import documents
 from apertura.common.documents import read_yaml
-from apertura.pipeline.config.history_waveforms import PhaseHistoryWaveform
-from apertura.pipeline.config.interferometry import Interferometry
 from apertura.pipeline.config.nodes import Node
-from apertura.pipeline.config.processing import Calibration, Processing
-from apertura.pipeline.config.scene import Scene
+from apertura.pipeline.config.processing import Calibration, Interferometry, Processing, Scene
 from apertura.pipeline.config.section import Name, Section, Title
-from apertura.pipeline.config.waveform import Waveform
+from apertura.pipeline.config.waveform import PhaseHistoryWaveform, Waveform
 
 CONFIG = Path("config/config.yaml")
 """Where the config lies in a campaign folder."""
@@ -93,4 +90,4 @@ def validated(document: object, *, where: object) -> Settings:
     apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
     """
     expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
-    return validation.validated(Settings, document, where=where, expected=expected)
+    return documents.validated(Settings, document, where=where, expected=expected)

@@ -1,15 +1,24 @@
-"""config/flights.tsv: one line per flight."""
+"""Tables of the config: flights.tsv, segments.tsv and clocks.tsv."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter, ValidationError
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.config.config import CONFIG
-from apertura.pipeline.config.section import Name
-from apertura.pipeline.config.table import table_rows
+from apertura.pipeline.config.section import Name, table_rows
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+# ---- config/flights.tsv: one line per flight -----------------------------------------------------------------------
 
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
@@ -95,3 +104,179 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
             remedy="Correct the line.",
         )
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)
+
+
+# ---- config/segments.tsv: which part of the track images a pair; without the file, all of it -----------------------
+
+SEGMENTS = Path("config/segments.tsv")
+_FIRST_YEAR, _LAST_YEAR = 1980, 2199
+_SEGMENT_COLUMNS = ["flight", "pair", "start", "end"]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One line of segments.tsv: pulses from start to end, both included, image the pair.
+
+    Attributes
+    ----------
+    start, end
+        UTC, ISO 8601 without time zone, on the transmitter's time tags.
+    """
+
+    flight: str
+    pair: str
+    start: str
+    end: str
+
+
+def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]:
+    """Yield the lines of a segments.tsv; none where there is no such file.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, pair, start, end; several lines of a pair are all used.
+    flights
+        Those of flights.tsv.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    if not path.is_file():
+        return
+    pairs = {flight.name: flight.pairs for flight in flights}
+    for where, cells in table_rows(path, _SEGMENT_COLUMNS, remedy="Write one line per segment."):
+        problem, expected = None, "flight, pair, start and end in UTC such as 2025-05-14T09:30:00.5"
+        if cells["flight"] not in pairs:
+            problem, expected = f"flight {quoted(cells['flight'])} is not in {FLIGHTS}", f"one of {', '.join(pairs)}"
+        elif cells["pair"] not in pairs[cells["flight"]]:
+            problem = f"flight {cells['flight']} has no pair {quoted(cells['pair'])}"
+            expected = f"one of {', '.join(pairs[cells['flight']])}"
+        start, end = (_utc(cells[name]) for name in ("start", "end"))
+        for name, time in (("start", start), ("end", end)):
+            if not problem and time is None:
+                problem = f"{name} {quoted(cells[name])} is no time"
+        if not problem and start is not None and end is not None and start >= end:
+            problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before its end"
+        if problem or start is None or end is None:
+            raise CampaignError(str(problem), where=where, expected=expected, remedy="Correct the line.")
+        yield Segment(cells["flight"], cells["pair"], start.isoformat(), end.isoformat())
+
+
+def _utc(text: str) -> datetime | None:
+    """Return a time in UTC; one without time zone is UTC already. None if the text is no time."""
+    try:
+        time = datetime.fromisoformat(text)
+        time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
+    except (ValueError, OverflowError):
+        return None
+    return time if _FIRST_YEAR <= time.year <= _LAST_YEAR else None
+
+
+# ---- config/clocks.tsv: what the clock of a recorder is behind that of its node's log; without the file, nothing
+
+CLOCKS = Path("config/clocks.tsv")
+CLOCK_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
+_FARTHEST_S, _LARGEST_PPM = Decimal(5_000_000_000), Decimal(1000)
+_EXPECTED = "flight, node, seconds to add to the recorder's time, ppm by which it runs slow, standard deviation in s"
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a node's recorder in one flight, against that of the node's log.
+
+    Attributes
+    ----------
+    offset_ns
+        To be added to the recorder's times, at its first pulse.
+    drift_ppm
+        By which more is to be added for every second since.
+    std_s
+        Standard deviation of the offset; None: nobody knows.
+    """
+
+    flight: str
+    node: str
+    offset_ns: int = 0
+    drift_ppm: float = 0.0
+    std_s: float | None = None
+
+    def utc(self, times: "NDArray[np.datetime64]") -> "NDArray[np.datetime64]":
+        """Return times of a recorder as the log's clock has them.
+
+        Parameters
+        ----------
+        times
+            (pulse,) datetime64[ns], ascending, the first of the recording first.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> times = np.array(["2025-01-01T00:00:00", "2025-01-01T00:01:40"], "datetime64[ns]")
+        >>> (Clock("f01", "uav1", offset_ns=10**9, drift_ppm=10.0).utc(times) - times).astype(int).tolist()
+        [1000000000, 1001000000]
+        """
+        if not times.size:
+            return times
+        elapsed_ns = (times - times[0]).astype("int64")
+        further_ns = self.offset_ns + (elapsed_ns * (self.drift_ppm * 1e-6)).round().astype("int64")
+        shifted: NDArray[np.datetime64] = times + further_ns.astype("timedelta64[ns]")
+        return shifted
+
+
+def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[Clock]:
+    """Yield the lines of a clocks.tsv; none where there is no such file.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, node, offset_s, drift_ppm, std_s, which the last two may leave empty.
+    flights
+        Those of flights.tsv.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    if not path.is_file():
+        return
+    nodes = {flight.name: flight.participants for flight in flights}
+    told: set[tuple[str, str]] = set()
+    for where, cells in table_rows(path, CLOCK_COLUMNS, remedy="Write one line per flight and node."):
+        flight, node = cells["flight"], cells["node"]
+        problem = ""
+        if flight not in nodes:
+            problem = f"flight {quoted(flight)} is not in {FLIGHTS}"
+        elif node not in nodes[flight]:
+            problem = f"flight {flight} has no node {quoted(node)}"
+        elif (flight, node) in told:
+            problem = f"flight {flight}, node {node} a second time"
+        if problem:
+            raise CampaignError(problem, where=where, expected=_EXPECTED, remedy="Correct the line.")
+        told.add((flight, node))
+        offset = _number(cells, "offset_s", where, most=_FARTHEST_S) or Decimal(0)
+        drift = _number(cells, "drift_ppm", where, most=_LARGEST_PPM) or Decimal(0)
+        std = _number(cells, "std_s", where, most=_FARTHEST_S)
+        offset_ns = int((offset * 1_000_000_000).to_integral_value())
+        yield Clock(flight, node, offset_ns, float(drift), None if std is None else float(abs(std)))
+
+
+def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> Decimal | None:
+    """Return a cell as it is written, to all of its digits; None where it is empty."""
+    if not cells[name]:
+        return None
+    try:
+        value = Decimal(cells[name])
+    except InvalidOperation:
+        value = Decimal("nan")
+    if value.is_finite() and -most <= value <= most:
+        return value
+    raise CampaignError(
+        f"{name} {quoted(cells[name])}",
+        where=where,
+        expected=f"a number between -{most} and {most}, or nothing",
+        remedy="Correct the line; `apertura align` writes it.",
+    )

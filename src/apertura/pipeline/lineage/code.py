@@ -34,7 +34,7 @@ _READS = "apertura.formats.reading"
 _FOCUSES = frozenset(
     {
         "apertura.core.focus.tiles",
-        "apertura.methods.autofocus.candidates",
+        "apertura.methods.autofocus.patches",
         "apertura.methods.synchronisation.scene_alignment",
     }
 )

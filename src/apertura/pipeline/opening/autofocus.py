@@ -1,18 +1,30 @@
-"""Whether and how the tracks of an open flight are refined, before anything is looked for."""
+"""Refined tracks: whether a flight is refined, and which tracks its images take their antennas from."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
-from apertura.core.planning.autofocus import decide_autofocus
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.planning.decisions import decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.core.quality.budget import NodePositions
+from apertura.core.quality.path_errors import Effect
 from apertura.methods.autofocus.inputs import TrackErrors
-from apertura.methods.autofocus.space_variance import SpaceVariance, space_variance
+from apertura.methods.autofocus.one_phase import SpaceVariance, space_variance
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.budget import paths_to_middle, positions_loss_db
+from apertura.pipeline.opening.acquisition import Acquisition
 from apertura.pipeline.opening.pair import OpenPair
+from apertura.pipeline.opening.plan import paths_to_middle, positions_loss_db
 from apertura.pipeline.opening.scene import OpenScene
+from apertura.pipeline.store import manifest_of, open_stage
+
+# ---- Whether and how the tracks of an open flight are refined, before anything is looked for -----------------------
 
 ASSUMED_STD_M = 0.02
 """Error of positions in each axis where a refinement is asked for and nobody said: that of a fair RTK solution."""
@@ -95,3 +107,123 @@ def _stated(known: NodePositions) -> tuple[float, float, float]:
     """Return the errors of a node's log, east, north, up."""
     east, north, up = (max(one, LEAST_STD_M) for one in known.std_m or (ASSUMED_STD_M,) * 3)
     return east, north, up
+
+
+# ---- Tracks as refined: where images take the places of their antennas from, and the only place where that is
+# decided
+
+_QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better")
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedTrack:
+    """What step `refine` found of a flight.
+
+    Attributes
+    ----------
+    stage
+        `refined_track`, from which images inherit.
+    correction
+        Of the flight's nodes and pairs, seconds from `began`; None where images are formed from the logs as they are.
+    began
+        Zero of the correction's clock, UTC.
+    """
+
+    stage: xr.Dataset
+    correction: TrackCorrection | None
+    began: np.datetime64
+
+    @classmethod
+    def of(cls, stage: xr.Dataset) -> "RefinedTrack":
+        """Return what a stage says."""
+        time, nodes = stage.time.values, stage.attrs["nodes"]
+        if not stage.attrs["accepted"] or not len(time):
+            return cls(stage, None, np.datetime64(0, "ns"))
+        moved_m = dict(zip(nodes, stage.correction.values, strict=True))
+        further_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
+        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, further_m), time[0])
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Whether tracks were to be refined, why, and what became of it; if so, how."""
+        became = {"autofocus": f"; {self.stage.attrs['why']}"}
+        made = self.stage.attrs["decisions"].items()
+        return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
+
+    def report(self, pair: str) -> dict[str, Any]:
+        """Return what image.json says of a pair's tracks."""
+        told = self.stage.attrs
+        made = {name: f"{one['value']}: {one['reason']}" for name, one in told["decisions"].items()}
+        return {
+            "decision": made["autofocus"],
+            **({"method": made["autofocus_method"]} if "autofocus_method" in made else {}),
+            "accepted": told["accepted"],
+            "why": told["why"],
+            **{name: told["report"][name] for name in _QUOTED if name in told["report"]},
+            **({} if self.correction is None else _sizes_cm(self.correction, pair)),
+        }
+
+    def pair(self, logged: OpenPair) -> OpenPair:
+        """Return an open pair as images are formed from it; its errors are those that the refinement leaves."""
+        if self.correction is None:
+            return logged
+        aperture, further_m = self._moved(self.correction, logged)
+        history = None if logged.history is None else logged.history.moved(aperture, further_m)
+        left = self.stage.attrs["left"]
+        return replace(logged, aperture=aperture, history=history, left=Effect(**left) if left else None)
+
+    def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
+        """Return the range profiles of a pair as images are formed from them."""
+        return profiles if self.correction is None else profiles.moved(*self._moved(self.correction, logged))
+
+    def node(self, logged: Acquisition) -> Acquisition:
+        """Return a node with its log corrected."""
+        if self.correction is None:
+            return logged
+        moved_m = self.correction.at(logged.name, _seconds(logged.track.time.values - self.began))
+        return replace(logged, track=logged.track.assign(position=logged.track.position + moved_m))
+
+    def _moved(self, correction: TrackCorrection, logged: OpenPair) -> tuple[Aperture, NDArray[np.float64]]:
+        """Return the phase centres of a pair, and by how much paths of its echoes are longer than with the logs."""
+        time_s = clock_s(logged, self.began)
+        aperture = correction.aperture(logged.aperture, logged.name, time_s)
+        return aperture, correction.longer_m(logged.name, time_s, logged.sidelink_m)
+
+
+def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
+    """Return what step `refine` wrote of a flight."""
+    return RefinedTrack.of(open_stage(campaign.stage("refined_track", flight), "refined_track"))
+
+
+def expected_track(
+    campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene
+) -> tuple[list[OpenPair], tuple[Decision, ...]]:
+    """Return the pairs of a flight as they are or will be imaged; whether and how their tracks are refined, and why.
+
+    Before step `refine` ran, the pairs are those of the logs, whatever was decided.
+    """
+    if manifest_of(campaign.stage("refined_track", pairs[0].flight)).is_file():
+        track = open_refined(campaign, pairs[0].flight)
+        return [track.pair(pair) for pair in pairs], track.decisions
+    return list(pairs), autofocus_of(campaign, pairs, scene)
+
+
+def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
+    """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
+    return pair.time_s + float(_seconds(pair.began - began))
+
+
+def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
+    """Return how far the nodes of a pair were moved, or by how much its echoes lie further, rms."""
+    if pair in correction.further_m:
+        return {"further_rms_cm": _rms_cm(correction.further_m[pair][:, None])}
+    nodes = dict.fromkeys(pair.split("-"))
+    return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
+
+
+def _rms_cm(moved_m: NDArray[np.float64]) -> float:
+    return round(100 * float(np.sqrt((moved_m**2).sum(axis=-1).mean())), 2)
+
+
+def _seconds(span: Any) -> Any:
+    return span / np.timedelta64(1, "s")

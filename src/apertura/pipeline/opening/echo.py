@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags.raised import Flags
-from apertura.core.echo.association import Association
-from apertura.core.echo.association_edges import tag_jitter_s
+from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.missing_pulses import missing_flags
 from apertura.core.echo.pulse_filter import cut_pulses
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
@@ -23,8 +21,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
 from apertura.pipeline.opening.node_log import Times
-from apertura.pipeline.opening.positions import Placed, place
-from apertura.pipeline.opening.segments import keep_segments
+from apertura.pipeline.opening.positions import Placed, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
 
 Complexes = NDArray[np.complex64]

@@ -1,7 +1,8 @@
-"""A pair, opened once: from its echo, or before that is formed from what the flight logs promise."""
+"""A pair, opened once: its pulses, its antennas' beams, its echo, or what the flight logs promise of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,24 +10,239 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.antenna.beam import Beams
+from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
+from apertura.common.provenance import sha256_file
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.illumination import Illumination, illuminate
+from apertura.core.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, sampled_cut
+from apertura.core.echo.association import missing_flags
 from apertura.core.echo.compression import window_weights
+from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.imaging.stages import phase_history_of
+from apertura.core.geometry.geodesy import LOCAL
+from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import Effect
+from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform
-from apertura.pipeline.opening.antennas import beams_of, body_axes
+from apertura.pipeline.config import CONFIG, Antenna, SampledWaveform
 from apertura.pipeline.opening.node_log import raw_log, shortest_wave
-from apertura.pipeline.opening.positions import position_error
-from apertura.pipeline.opening.recorded import recorded_echo
-from apertura.pipeline.opening.scene import Flown
-from apertura.pipeline.opening.segments import inside_segments, keep_segments
+from apertura.pipeline.opening.positions import inside_segments, keep_segments, place, position_error, stated_error
+from apertura.pipeline.opening.reading import read_history
+from apertura.pipeline.opening.scene import Flown, OpenScene
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.store import manifest_of, open_stage
+
+# ---- Antennas of a pair: from what the config states of them to the beams that weigh its pulses --------------------
+
+_STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
+_POINTS = 33
+
+
+def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
+    """Return what an echo stage holds of the bodies' attitude: radar_tx, radar_rx → (pulse, axis, body)."""
+    return {point: echo[name].values for point, name in _STAGED.items() if name in echo}
+
+
+def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float64]]) -> Beams | None:
+    """Return the beams of a pair; None where its antennas are isotropic.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    axes
+        radar_tx, radar_rx → (pulse, axis, body), forward, right and down of the body in the frame of the pixels.
+    """
+    stated = campaign.antennas(pair)
+    if not stated:
+        return None
+    patterns = campaign.pattern_files(pair)
+    files = {point: patterns.get(f"nodes.{node}.antennas.{point}.pattern") for point, (node, _) in stated.items()}
+    found = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
+    return Beams(found.get("radar_tx"), found.get("radar_rx"))
+
+
+def pattern_digests(campaign: Campaign, pair: str) -> dict[str, str]:
+    """Return key of the config → sha256 of each sampled pattern of a pair's antennas, for provenance."""
+    return {key: sha256_file(path) for key, path in campaign.pattern_files(pair).items()}
+
+
+def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> Beam:
+    if antenna.beamwidth_deg is None:
+        if pattern is None:
+            raise TypeError("an antenna has a beamwidth or a pattern")
+        sampled = read_beam_pattern(pattern)
+        cuts = tuple(sampled_cut(*samples, cutoff_db=antenna.cutoff_db) for samples in sampled)
+    else:
+        widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
+        azimuth, elevation = (
+            gaussian_cut(width, cutoff_db=antenna.cutoff_db, limit_rad=limit) for width, limit in widths
+        )
+        cuts = azimuth, elevation
+    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1])
+
+
+def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
+    """Return what image.json says of a pair's antennas: what was stated, and how many pulses see the scene."""
+    stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
+    if illumination is None or not stated:
+        return {}
+    return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
+
+
+def lit(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams | None,
+    scene: OpenScene,
+    aperture: Aperture,
+) -> Illumination | None:
+    """Return how many pulses see each point of the scene; None without beams.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    beams
+        Of the pair.
+    scene
+        The campaign's.
+    aperture
+        Of the pair.
+
+    Raises
+    ------
+    CampaignError
+        If no pulse sees anything of the scene.
+    """
+    if beams is None:
+        return None
+    points = scene.grid.sample_points(_POINTS, scene.level.height_m)
+    illumination = illuminate(beams, aperture, points.reshape(-1, 3))
+    if illumination.unseen == 1:
+        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
+    return illumination
+
+
+def _refuse(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams,
+    middle_m: NDArray[np.float64],
+    aperture: Aperture,
+) -> None:
+    """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
+    stated = campaign.antennas(pair)
+    keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
+    legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
+    for point, (node, _) in stated.items():
+        beam, place = legs[point]
+        if beam is None:
+            continue
+        azimuth, elevation = beam.angles(place, middle_m[None])[..., 0]
+        off = np.degrees(np.arccos(np.cos(azimuth) * np.cos(elevation)))
+        best = int(off.argmin())
+        side, up, *ends = np.degrees([azimuth[best], elevation[best], beam.azimuth_rad[-1], beam.elevation_rad[-1]])
+        lines.append(
+            f"{off[best]:.0f}° from the boresight of {node}'s {point} at best: azimuth {side:+.0f}°, elevation "
+            f"{up:+.0f}°, while its pattern ends at {ends[0]:.0f}° and {ends[1]:.0f}°"
+        )
+    raise CampaignError(
+        f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
+        where=f"config/config.yaml: {', '.join(keys)}",
+        expected="a scene that both antennas of some pulse see",
+        remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
+        "log's yaw (clockwise from north) and scene.bounds_m.",
+    )
+
+
+# ---- The echo of a recorder that hands over transfer functions, as it lies in raw/; its positions may lie in a log
+
+
+def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
+    """Return the echo of a pair as a recorder wrote it, at the times of its log's clock.
+
+    Raises
+    ------
+    CampaignError
+        If positions travel neither with the samples nor in a flight log, or do in both; or if the scene is in another
+        frame than theirs.
+    """
+    tx, rx = pair.split("-")
+    history = read_history(campaign, flight, rx, pair=pair)
+    history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
+    logged, placed = campaign.logged(flight, tx), "tx_position" in history
+    if logged == placed:
+        found = "positions both with the samples and in a flight log" if logged else "samples without positions"
+        expected = "positions of one source: phase history with positions, or a flight log raw/<flight>/<node>.track.*"
+        where, remedy = (
+            campaign.history_files(flight, rx)[0],
+            "Take one away." if logged else "Copy the flight log there.",
+        )
+        raise CampaignError(found, where, expected, remedy)
+    if logged:
+        return _placed_by_logs(campaign, flight, (tx, rx), history)
+    _check_frame(campaign.settings.scene.crs, history.attrs["frame"])
+    nodes = campaign.settings.nodes
+    known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
+    return history.assign_attrs(positions=known)
+
+
+def _check_frame(crs: str, frame: str) -> None:
+    local = frame == LOCAL
+    if local != (crs == LOCAL):
+        raise CampaignError(
+            f"{crs} for phase history with positions {'in metres of a frame of its own' if local else 'on Earth'}",
+            where=f"{CONFIG}: scene.crs",
+            expected=LOCAL if local else "an EPSG code, or auto",
+            remedy="Correct scene.crs.",
+        )
+
+
+def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:
+    """Return phase history at the antennas' places, without the pulses that have none.
+
+    The path of the receiving node beyond geometry (docs/theory.md, eq. 3) comes off the delay that samples are referred
+    to: no sample changes.
+    """
+    wave_m = shortest_wave(history.frequency.values)
+    logs = {node: raw_log(campaign, flight, node, wave_m) for node in nodes}
+    tx, rx = (logs[node] for node in nodes)
+    placed = place(tx, rx, history.time.values)
+    history = history.isel(pulse=placed.good)
+    at = history.time.values
+    offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S
+    beams = {"tx_axes": (tx, tx.settings.antennas.radar_tx), "rx_axes": (rx, rx.settings.antennas.radar_rx)}
+    axes: dict[str, Any] = {
+        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, (log, beam) in beams.items() if beam
+    }
+    left_out = {**history.attrs.get("dropped", {}), **placed.reasons}
+    counts: dict[str, Any] = {"used": len(at), "dropped": sum(left_out.values()), "reasons": left_out}
+    antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
+    lasting_s = history.attrs.get("sweep_used_s", 0.0)
+    missing = missing_flags(at.astype("datetime64[ns]").astype("int64"))
+    moved = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
+    return history.assign(
+        reference_delay=history.reference_delay - offset_s,
+        path_limit=history.path_limit - offset_s * SPEED_OF_LIGHT_M_S,
+        tx_position=(("pulse", "axis"), antennas[0]),
+        rx_position=(("pulse", "axis"), antennas[1]),
+        **axes,
+    ).assign_attrs(
+        frame=tx.track.attrs["frame"],
+        flags=Flags.merged(history.attrs["flags"], placed.flags, moved, missing),
+        positions=placed.report,
+        pulses=counts,
+        stated_offset_m=rx.settings.path_offset_m.radar,
+        time_tags={"std_s": rx.settings.time_tag_std_s},
+    )
+
+
+# ---- A pair, opened once: from its echo, or before that is formed from what the flight logs promise ----------------
 
 
 @dataclass(frozen=True, eq=False)

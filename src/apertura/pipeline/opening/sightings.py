@@ -9,10 +9,9 @@ from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.methods.autofocus.inputs import ReferencePoint, Sighting, TrackErrors
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.autofocus import errors_of
+from apertura.pipeline.opening.autofocus import clock_s, errors_of
 from apertura.pipeline.opening.pair import OpenPair
 from apertura.pipeline.opening.plan import weighing
-from apertura.pipeline.opening.refined import clock_s
 from apertura.pipeline.opening.scene import OpenScene
 
 

@@ -10,11 +10,43 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
-from apertura.core.echo.framing import Framing
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.trigger import Framing
 from apertura.formats.npy import read_npy
+from apertura.formats.recordings.sample_file import SampleFile
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
+
+# ---- Whether the band of a waveform can be had of real samples -----------------------------------------------------
+
+
+def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) -> None:
+    """Raise CampaignError if real samples are mixed so that a subcarrier and mirror image meet, or prefixes are short.
+
+    Parameters
+    ----------
+    samples
+        Of a recording; complex ones are never wrong.
+    numerology
+        Of the symbol.
+    where
+        The recording, for the message.
+    """
+    mixing = samples.layout.mixing
+    if mixing is None:
+        return
+    low_hz, high_hz = (float(numerology.frequency_hz[end]) - numerology.carrier_hz for end in (0, -1))
+    problem = mixing.problem(low_hz, high_hz, numerology.prefix_samples)
+    if problem:
+        raise CampaignError(
+            problem,
+            where=where,
+            expected="apertura:if_hz and waveform such that the whole band lies inside one Nyquist zone",
+            remedy="Correct apertura:if_hz (where baseband zero lies, before aliasing) or the waveform.",
+        )
+
+
+# ---- What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol ------------
 
 MOST_SYMBOLS = 1 << 24
 """Code symbols of a waveform."""

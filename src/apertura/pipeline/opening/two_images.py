@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
-from apertura.core.imaging.stages import aperture_of
+from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Looks
 from apertura.methods.interferometry.comparison import Ground
-from apertura.methods.interferometry.level import Known
+from apertura.methods.interferometry.heights import Known
 from apertura.methods.interferometry.sensitivity import Legs, Sensitivity, sensitivity
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
-from apertura.pipeline.opening.layer import opened_layer
+from apertura.pipeline.opening.images import opened_layer
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from apertura.common.atomic import remove
 from apertura.common.errors import CampaignError, shown
-from apertura.common.lock import hold
 from apertura.common.paths import inside
+from apertura.common.processes import hold
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import read_manifest

@@ -3,9 +3,8 @@
 import time
 from collections import Counter
 
-from apertura.common.lock import holder
+from apertura.common.processes import INTERRUPTED, holder
 from apertura.common.progress import RUN
-from apertura.common.signals import INTERRUPTED
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.runs.expectation import Outlook
 from apertura.pipeline.runs.failure import failures

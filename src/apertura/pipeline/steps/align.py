@@ -10,13 +10,12 @@ from apertura.common.paths import inside
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point
-from apertura.methods.synchronisation.clock_drift import with_drift
+from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, with_drift
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CLOCK_COLUMNS, CLOCKS, CONFIG
-from apertura.pipeline.opening.ground import Ground
-from apertura.pipeline.opening.unaligned import Unaligned, unaligned
+from apertura.pipeline.opening.acquisition import Unaligned, unaligned
+from apertura.pipeline.opening.scene import Ground
 
 NEAR_S = 5.0
 """How far a clock that tells UTC is thought to be off."""

@@ -13,7 +13,7 @@ from apertura.common.provenance import canonical_json, chained_sha256
 from apertura.core.echo.calibration import estimate_path_offset, reflector_history
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
-from apertura.core.imaging.stages import Rows
+from apertura.core.imaging.range_profiles import Rows
 from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Calibration

@@ -10,13 +10,13 @@ from rasterio import Affine
 from apertura.common.atomic import replacement
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
-from apertura.core.imaging.stages import aperture_of
+from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import COVERAGE
 from apertura.formats.export.coverage import Covered, feature_collection, write_coverage
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.layer import averaged, opened_layer
+from apertura.pipeline.opening.images import averaged, opened_layer
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_stage, record_files

@@ -14,8 +14,7 @@ from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, ned_axes
 from apertura.formats.export import PHASE_HISTORY
-from apertura.formats.export.cphd import write_cphd
-from apertura.formats.export.cphd_collection import Collection
+from apertura.formats.export.cphd import Collection, write_cphd
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene

@@ -1,6 +1,6 @@
 """Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -9,22 +9,206 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from apertura.common.contracts import STAGES, Window
-from apertura.common.cube_variables import MEASURED, RASTERS
+from apertura.common.contracts import MEASURED, QUOTED, RASTERS, STAGES, Window
 from apertura.common.documents import undamaged
-from apertura.core.combination.clutter import clutter_reduction_db
-from apertura.core.combination.sums import coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.core.combination.sums import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.core.quality.measures import survey
 from apertura.core.scene.grid import SceneGrid
+from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.agreement import agreement_of, agreement_report
+from apertura.pipeline.opening.images import agreement_of, agreement_report
 from apertura.pipeline.opening.results import assessment_of
 from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps.cube_labels import Images, labels, reference_flights
-from apertura.pipeline.steps.cube_phases import compared, shared_band, window_of, write_phase
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import create, finish, open_array, open_stage, writing
+
+# ---- What the cube says of each flight and pair: names, time, view, quality ----------------------------------------
+
+Images = Mapping[tuple[str, str], xr.Dataset]
+"""Flight and pair → stage `image`."""
+
+_TEXTS = np.dtypes.StringDType()
+
+
+def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], pairs: Sequence[str]) -> xr.Dataset:
+    """Return coordinates flight, pair, time and what pairs and flights are compared with; values of every image.
+
+    Parameters
+    ----------
+    images
+        Those that were formed.
+    assessed
+        Flight → what step `assess` wrote of it.
+    pairs
+        Every pair of the campaign.
+    """
+    values = {name: _filled(dtype, (len(assessed), len(pairs))) for name, (_, dtype, _, _) in QUOTED.items()}
+    for place, (flight, one) in enumerate(assessed.items()):
+        for pair in pairs:
+            if (flight, pair) in images:
+                told = _quoted(images[flight, pair], one, pair)
+                for name, value in told.items():
+                    if value is not None:
+                        values[name][place, pairs.index(pair)] = value
+    return xr.Dataset(
+        {name: (QUOTED[name][0], array) for name, array in values.items()},
+        coords={
+            "flight": ("flight", np.array([*assessed], _TEXTS)),
+            "pair": ("pair", np.array(pairs, _TEXTS)),
+            "time": ("flight", np.array([_middle(images, flight) for flight in assessed]), {"standard_name": "time"}),
+            "reference_pair": ("flight", np.array([one["reference"] for one in assessed.values()], _TEXTS)),
+            "reference_flight": ("pair", np.array([*reference_flights(images, pairs).values()], _TEXTS)),
+        },
+    )
+
+
+def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
+    """Return pair → the first flight that flew it."""
+    return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
+
+
+def _filled(dtype: str, shape: tuple[int, int]) -> Any:
+    return np.full(shape, "", _TEXTS) if dtype == "T" else np.full(shape, np.nan)
+
+
+def _middle(images: Images, flight: str) -> Any:
+    """Return the middle of the pulses of all pairs of a flight, UTC."""
+    views = [image.attrs["quality"]["view"] for (name, _), image in images.items() if name == flight]
+    ends = np.array([view[end] for view in views for end in ("first_utc", "last_utc")], "datetime64[ns]")
+    return ends.min() + (ends.max() - ends.min()) // 2
+
+
+def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[str, float | str | None]:
+    """Return what an image and its flight's assessment say: name of a row of `QUOTED` → value; None: nothing."""
+    quality = image.attrs["quality"]
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # phase history tells none
+    return {
+        "heading": view["heading_deg"],
+        "look_direction": view["look_deg"],
+        "incidence": view["incidence_deg"],
+        "bistatic_angle": view["bistatic_angle_deg"],
+        "range": view["range_m"],
+        "height": view["height_m"],
+        "centre_frequency": view["centre_hz"],
+        "bandwidth": view["band_hz"],
+        "resolution_cell": focus["cell_m"],
+        "loss": focus.get("loss_db"),
+        "numerical_error": quality["numerical_error_db"],
+        "entropy": quality["entropy"],
+        "noise_floor": quality["noise_floor_db"],
+        "pulses_used": pulses.get("used"),
+        "pulses_dropped": pulses.get("dropped"),
+        "peak": quality["brightest"]["amplitude"],
+        "phase_removed": assessed["fusion"]["phases_rad"].get(pair),
+        "verdict": focus["verdict"],
+        "flags": ",".join(sorted({*image.attrs["flags"], *assessed["pairs"][pair]["flags"]})),
+    }
+
+
+# ---- Coherence and phase between the images of a cube: a flight's pairs, and a pair's flights ----------------------
+
+_TILES_AT_ONCE = 4
+"""Along a side: tiles are read with a margin, and what they share is read once."""
+
+Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
+"""'pair' or 'flight' → image, by flight and pair → the image it is compared with."""
+
+
+def compared(images: Images, references: Mapping[str, str], first_flights: Mapping[str, str]) -> Compared:
+    """Return which images are compared: each with its flight's reference pair, and with its pair's first flight.
+
+    Parameters
+    ----------
+    images
+        Those that were formed.
+    references
+        Flight → its reference pair.
+    first_flights
+        Pair → the flight that others are compared with.
+    """
+    to = {
+        "pair": {(flight, pair): (flight, references[flight]) for flight, pair in images},
+        "flight": {(flight, pair): (first_flights[pair], pair) for flight, pair in images},
+    }
+    return {kind: {one: other for one, other in rows.items() if one != other} for kind, rows in to.items()}
+
+
+def window_of(images: Images, spacing_m: float) -> int:
+    """Return the side (pixels) of the window that coherence is measured in: every image has 16 looks in it."""
+    return max(window_px(_spectrum(image), spacing_m) for image in images.values())
+
+
+def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
+    """Return the most that unchanged ground can show of coherence, docs/theory/interferometry.md, eq. 1a."""
+    carriers = tuple(np.array(image.attrs["quality"]["view"]["carrier_cycles_m"]) for image in (one, other))
+    return common_band((carriers[0], carriers[1]), (_spectrum(one), _spectrum(other)))
+
+
+def write_phase(
+    images: tuple[xr.Dataset, xr.Dataset], arrays: tuple[Any, Any], grid: SceneGrid, *, side: int, window: int
+) -> tuple[float, float]:
+    """Write coherence and phase of two images tile by tile; return looks, and the coherence of chance.
+
+    Parameters
+    ----------
+    images
+        An image and the one it is compared with.
+    arrays
+        Of coherence and phase, (y, x) float32; a tile that one of the images does not hold is not written.
+    grid
+        Of all.
+    side, window
+        Of a tile, and of the window, pixels.
+
+    Returns
+    -------
+    tuple
+        NaN of images without a tile in common.
+    """
+    shares: list[float] = []
+    for block in grid.tiles(_TILES_AT_ONCE * side):
+        wide = _widened(block, window // 2, grid.shape)
+        first, second = (image.image[wide].values for image in images)
+        if not (np.isfinite(first) & np.isfinite(second)).any():
+            continue
+        for tile in _inside(grid, block, side):
+            around = _widened(tile, window // 2, grid.shape)
+            part = _against(around, wide)
+            magnitude, phase, looks = coherence(first[part], second[part], window=window)
+            middle = _against(tile, around)
+            if np.isfinite(magnitude[middle]).any():
+                shares.append(1 / looks)
+                for array, values in zip(arrays, (magnitude, phase), strict=True):
+                    array[tile] = values[middle]
+    looks = 1 / float(np.mean(shares)) if shares else float("nan")
+    return looks, chance(looks) if shares else looks
+
+
+def _spectrum(image: xr.Dataset) -> Any:
+    return np.array(image.attrs["quality"]["focus"]["spectrum_cycles2_m2"])
+
+
+def _inside(grid: SceneGrid, block: Window, side: int) -> Iterator[Window]:
+    for rows, columns in grid[block].tiles(side):
+        top, left = block[0].start, block[1].start
+        yield slice(rows.start + top, rows.stop + top), slice(columns.start + left, columns.stop + left)
+
+
+def _widened(window: Window, by: int, shape: tuple[int, int]) -> Window:
+    rows, columns = (
+        slice(max(0, part.start - by), min(size, part.stop + by)) for part, size in zip(window, shape, strict=True)
+    )
+    return rows, columns
+
+
+def _against(window: Window, whole: Window) -> Window:
+    """Return a window counted from where another begins."""
+    rows, columns = (slice(part.start - of.start, part.stop - of.start) for part, of in zip(window, whole, strict=True))
+    return rows, columns
+
+
+# ---- Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images
 
 _PHASE = "coherence", "phase"
 

@@ -12,7 +12,7 @@ from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.echo import PairEcho, pair_echo
-from apertura.pipeline.opening.recorded import recorded_echo
+from apertura.pipeline.opening.pair import recorded_echo
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.steps.calibration import calibrated, calibration_spec
 from apertura.pipeline.steps.stamping import stamped

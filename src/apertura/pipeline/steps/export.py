@@ -12,8 +12,7 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.flags.raised import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
-from apertura.core.quality.fused import Amplitude
-from apertura.core.quality.measures import Raster, survey
+from apertura.core.quality.measures import Amplitude, Raster, survey
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import write_exports

@@ -16,16 +16,14 @@ from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.certify import certified, measures
 from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.view import view_report
 from apertura.core.quality.budget import expected
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.antennas import antennas_report, pattern_digests
-from apertura.pipeline.opening.budget import arithmetic_line, budget_of
-from apertura.pipeline.opening.pair import OpenPair, open_pair
-from apertura.pipeline.opening.plan import plan_pair
-from apertura.pipeline.opening.refined import RefinedTrack, open_refined
+from apertura.pipeline.opening.autofocus import RefinedTrack, open_refined
+from apertura.pipeline.opening.pair import OpenPair, antennas_report, open_pair, pattern_digests
+from apertura.pipeline.opening.plan import arithmetic_line, budget_of, plan_pair
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing

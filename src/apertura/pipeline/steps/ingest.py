@@ -50,7 +50,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
 
 def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
     """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
-    from apertura.core.echo.continuous import trigger_captures
+    from apertura.core.echo.trigger import trigger_captures
 
     waveform, described = campaign.settings.waveform, recording.framing or {}
     if not isinstance(waveform, SampledWaveform):

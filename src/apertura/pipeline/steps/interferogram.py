@@ -11,9 +11,8 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.formats.export import write_exports
-from apertura.methods.interferometry.comparison import Compared, compared
-from apertura.methods.interferometry.flags import raised
-from apertura.methods.interferometry.level import Level
+from apertura.methods.interferometry.comparison import Compared, compared, raised
+from apertura.methods.interferometry.heights import Level
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import INTERFEROMETRY, result_of
 from apertura.pipeline.opening.scene import open_scene

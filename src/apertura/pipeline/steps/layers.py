@@ -15,7 +15,7 @@ from apertura.common.provenance import Provenance
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.imaging.noise import PLACES, noise_power
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.lattice import BLOCK_PX
 from apertura.core.scene.looks import Looks
@@ -25,8 +25,7 @@ from apertura.formats.export import write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.antennas import pattern_digests
-from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import tags_of

@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import merged
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
-from apertura.core.imaging.stages import aperture_of, phase_history_of
+from apertura.core.imaging.range_profiles import (
+    GUARD_SAMPLES,
+    RangeWindow,
+    aperture_of,
+    phase_history_of,
+    range_compress,
+)
 from apertura.core.scene.clearance import check_antennas
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.antennas import pattern_digests
-from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import stamped

@@ -9,19 +9,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.provenance import merged
-from apertura.core.geometry.track_correction import TrackCorrection
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Decision
-from apertura.methods.autofocus.candidates import Candidates
-from apertura.methods.autofocus.inputs import Sighting
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.inputs import Refinement, Sighting
+from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
 from apertura.methods.autofocus.refine import refine as refine_tracks
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.antennas import pattern_digests
 from apertura.pipeline.opening.autofocus import autofocus_of
-from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.opening.sightings import Seen, seen
 from apertura.pipeline.steps.stamping import stamped

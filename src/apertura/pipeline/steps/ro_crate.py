@@ -10,8 +10,7 @@ from apertura.common.environment import lock_sha256, software
 from apertura.common.paths import inside, shipped
 from apertura.common.provenance import sha256_text
 from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.catalog.crate import crate_document
-from apertura.formats.catalog.run import Job, Listed, Run
+from apertura.formats.catalog.crate import Job, Listed, Run, crate_document
 from apertura.formats.catalog.stac import RECORDED
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result

@@ -16,9 +16,7 @@ from apertura.common.environment import lock_sha256, software
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.formats.catalog import CATALOG
-from apertura.formats.catalog.assets import asset_of, told_by
-from apertura.formats.catalog.fields import Acquisition, projection
-from apertura.formats.catalog.stac import Image, catalog_files, instant
+from apertura.formats.catalog.stac import Acquisition, Image, asset_of, catalog_files, instant, projection, told_by
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of

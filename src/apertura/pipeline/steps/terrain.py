@@ -11,8 +11,7 @@ from apertura.core.scene.dem import height_range
 from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.ground import Ground
-from apertura.pipeline.opening.scene import OpenScene, settled_scene
+from apertura.pipeline.opening.scene import Ground, OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, open_array, resume, writing
 

@@ -5,7 +5,7 @@ A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a re
 products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
-from apertura.pipeline.store.blocks import blocks_of_rows, write_blocks
+from apertura.pipeline.store.chunks import blocks_of_rows, write_blocks
 from apertura.pipeline.store.manifest import (
     damaged_files,
     manifest_of,
@@ -16,8 +16,16 @@ from apertura.pipeline.store.manifest import (
     remake,
     save_document,
 )
-from apertura.pipeline.store.progress import finish, sharing, writing
-from apertura.pipeline.store.resuming import create, mark_rewritten, missing, open_array, resume
+from apertura.pipeline.store.progress import (
+    create,
+    finish,
+    mark_rewritten,
+    missing,
+    open_array,
+    resume,
+    sharing,
+    writing,
+)
 from apertura.pipeline.store.stages import open_stage, save_stage
 
 __all__ = [

@@ -15,16 +15,15 @@ from apertura.core.focus.engines import load_engine, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
-from apertura.core.imaging.stages import profiles_of
+from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.search import Search
-from apertura.core.quality.error_bound import error_bound
-from apertura.core.quality.error_check import Brightness, random_pixels
+from apertura.core.planning.planner import Search
+from apertura.core.quality.error_check import Brightness, error_bound, random_pixels
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import STUDY, result_of
+from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import asked_accuracy, job_of, plan_job
-from apertura.pipeline.opening.refined import open_refined
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.store import open_stage, record_files
 from apertura.views.chart.interactive import write_page

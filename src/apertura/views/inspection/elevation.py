@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, shown
 from apertura.common.raster import opened_raster
-from apertura.core.scene.dem import MOST_POSTS
-from apertura.core.scene.dem_file import open_dem
+from apertura.core.scene.dem import MOST_POSTS, open_dem
 from apertura.views.inspection.report import Report
 
 if TYPE_CHECKING:

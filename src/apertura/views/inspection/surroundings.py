@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_args
 
+from apertura.common.documents import validated
 from apertura.common.errors import CampaignError
-from apertura.common.validation import validated
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, TimeSystem
 from apertura.pipeline.config import CLOCKS, CONFIG, read_settings
-from apertura.pipeline.config.log import Log
+from apertura.pipeline.config.nodes import Log
 
 NODE = "<node>"
 """Stands for a name that nobody has given."""

@@ -16,14 +16,14 @@ from apertura.common.provenance import Provenance
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.geodesy import map_from_frame
 from apertura.core.imaging.certify import CUT_REACH_M
-from apertura.core.imaging.stages import aperture_of, profiles_of
+from apertura.core.imaging.range_profiles import aperture_of, profiles_of
 from apertura.core.quality.point_targets import cut_through, find_peak, line_through
 from apertura.formats.export.coverage import footprint
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.refined import open_refined
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.coverage import crs_name, few_looks
 from apertura.pipeline.steps.stamping import tags_of

@@ -14,7 +14,7 @@ from apertura.common.raster import opened_raster
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.layer import averaged
+from apertura.pipeline.opening.images import averaged
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_listed, open_stage, read_manifest, record_files

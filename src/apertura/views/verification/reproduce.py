@@ -6,8 +6,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from apertura.common.errors import CampaignError, shown
-from apertura.common.lock import holder
 from apertura.common.paths import inside
+from apertura.common.processes import holder
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import on_demand, results_of
 from apertura.pipeline.lineage.inputs import with_inputs

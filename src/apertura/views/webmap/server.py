@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
-from apertura.common.signals import Interrupted
+from apertura.common.processes import Interrupted
 from apertura.views.webmap.page import FILES, SHELL
 from apertura.views.webmap.policy import headers_of
 from apertura.views.webmap.requests import LOOPBACK, WINDOW, UnsatisfiableRangeError, asked_bytes, asked_file, own_host

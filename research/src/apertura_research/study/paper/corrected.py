@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from apertura.core.echo.captures import correct_clock
 from apertura.core.echo.clock import estimate_clock
 from apertura.core.echo.demodulate import Numerology
-from apertura.core.echo.resampling import correct_clock
 from apertura.core.echo.sidelink import METHODS, divide
 from apertura.simulation.impairments import Clock, Impairments, Timing, UniformPhase
 from apertura.simulation.synthesis import samples

@@ -11,7 +11,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.transfer import transfer_by_code
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.imaging.stages import phase_history_of
+from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.results import OpenCampaign, open_campaign

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.quality.fused import Amplitude
+from apertura.core.quality.measures import Amplitude
 from apertura.core.quality.point_targets import Cut, cut_through, find_peak
 from apertura.simulation.experiments import GAP_M, SEGMENT_M
 from apertura_research.study.paper.claims import Claim, compare, require

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.core.focus.engines import native
 from apertura.core.focus.engines.native_tables import Tables
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.methods.autofocus.inputs import Sighting
 from apertura_research.study.refinement.cases import PROBES_M, Case
 from apertura_research.study.refinement.scenes import GRID

@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import TrackErrors
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.inputs import Refinement, TrackErrors
 from apertura.methods.autofocus.refine import refine
 from apertura_research.study.refinement.cases import Case, case
 from apertura_research.study.refinement.measures import UNCORRECTED, judge
@@ -104,7 +103,7 @@ def said_of(found: Refinement) -> str:
     Examples
     --------
     >>> import numpy as np
-    >>> from apertura.core.geometry.track_correction import TrackCorrection
+    >>> from apertura.core.geometry.phase_centres import TrackCorrection
     >>> nothing = TrackCorrection(np.zeros(1), {})
     >>> said_of(Refinement(nothing, {}, True, "", flags={"prior_inconsistent": "twice as large"}))
     'accepted with a flag'

@@ -12,10 +12,9 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from apertura.core.focus.engines import native
-from apertura.core.geometry.track_correction import TrackCorrection
+from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
-from apertura.methods.autofocus.inputs import Sighting
-from apertura.methods.autofocus.outcome import Refinement
+from apertura.methods.autofocus.inputs import Refinement, Sighting
 from apertura.views.chart.png import save_png
 from apertura_research.study.refinement.cases import Case
 from apertura_research.study.refinement.flights import NODES

@@ -1,4 +1,4 @@
-"""What the GPU engine is predicted to do: how exactly, and at what cost: the seconds are not measured."""
+"""What the GPU engine is predicted to do, from its sizes and error bounds; its seconds are not timed."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -6,19 +6,43 @@ from typing import Any
 
 import numpy as np
 
-from apertura.core.focus.engines.cuda_constants import (
-    DEGREE,
-    FARTHEST,
-    FLOAT32_ERROR,
-    FLOAT32_RMS,
-    LAST_ORDER,
-    LAST_TERM,
-    SIDE,
-)
 from apertura.core.focus.engines.engine import Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.native_binding import KERNEL
 from apertura.core.focus.engines.native_prediction import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
 from apertura.core.focus.engines.native_tables import design_table, ratio
 from apertura.core.focus.job import Job
+
+# ---- Sizes and error bounds of the GPU's kernel, which its prediction counts with too ------------------------------
+#
+# Errors are of one leg's path. D is the largest distance of a pixel from the middle of its patch, s as in
+# docs/theory/engine.md, (8).
+
+SIDE = KERNEL.patch_side
+"""Pixels along a patch, which one block of threads sums; tiles begin at multiples of it."""
+
+TAPS = KERNEL.taps
+"""Of a table's filters."""
+
+DEGREE = 2
+"""Of the polynomials in a cell: linear ones would spare two look-ups of six, and need tables 1.7 times as fine."""
+
+CHUNK = 64
+"""Pulses that a patch looks at together, and whose sum is float32; their sums add up in float64."""
+
+LAST_ORDER, LAST_TERM = 6, 21 / 1024
+"""The first order of √(1 + s) that (8) neglects, and its coefficient: at most that over 1 − |s| is neglected."""
+
+FARTHEST = 0.5
+"""Largest |s| of which the series is asked at all."""
+
+FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
+"""Of D: what float32 makes (8) err by, at worst and in the RMS of 20 000 random pixels at each of five ranges."""
+
+DOUBT = 2.0**20
+"""Cells across a patch beyond which float32 could not tell one from the next."""
+
+
+# ---- What the GPU engine is predicted to do: how exactly, and at what cost: the seconds are not measured -----------
 
 _WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
 _FLOAT32_RAD = 2e-6  # tables and their look-ups, as native

@@ -14,11 +14,17 @@ from pydantic import Field
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.engine import EngineOptions, checked_pixels
-from apertura.core.focus.engines.native_beams import weights_of
-from apertura.core.focus.engines.native_binding import INSTRUCTION_SETS, available, call, instruction_set
-from apertura.core.focus.engines.native_constants import KERNEL
+from apertura.core.focus.engines.native_binding import (
+    INSTRUCTION_SETS,
+    KERNEL,
+    ApertureJob,
+    TableJob,
+    available,
+    call,
+    instruction_set,
+    weights_of,
+)
 from apertura.core.focus.engines.native_prediction import candidates
-from apertura.core.focus.engines.native_structs import ApertureJob, TableJob
 from apertura.core.focus.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table
 from apertura.core.focus.inputs import Profiles
 

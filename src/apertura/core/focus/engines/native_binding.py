@@ -1,18 +1,193 @@
-"""The compiled library: where it lies, what it takes, and which instruction set it uses.
-
-Bound with ctypes: the GIL is released during a call, and one wheel serves every Python version. The library says how
-its structs are laid out; where that differs from the mirrors here it is refused when it is loaded.
-"""
+"""The compiled library: where it lies, the structures it takes, its sizes and error bounds, its instruction sets."""
 
 import ctypes
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted, shown
-from apertura.core.focus.engines.native_structs import STRUCTS
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.geometry.sector import Sector
+
+# ---- Sizes and error bounds of the compiled kernel, each once in Python as in native/bounds.hpp once in C++ --------
+#
+# The engine may not be compiled where a plan is made, so they are not read from the library; a test compares the two.
+
+
+@dataclass(frozen=True)
+class KernelConstants:
+    """What the kernel is built on.
+
+    D is the largest distance of a block from its patch's origin, δ of a pixel from its block's centre, R the range;
+    errors are of one leg's path, in the unit of D, δ and R.
+
+    Attributes
+    ----------
+    patch_side, block_side
+        Pixels along a patch, whose paths are series about its origin, and along a block, of one polynomial.
+    batch
+        Pulses whose paths are computed together: phase centres are padded to a multiple of it.
+    taps
+        Of a table's filters.
+    window
+        Table cells that one look-up can reach; tables have as many empty cells at both ends.
+    echo_taps, echo_degree
+        Samples that make an echo at a single place, and the degree of the polynomials that weigh them
+        (docs/theory/autofocus.md, "What pulses add").
+    window_margin
+        Cells: a path lies up to ½ beyond the cell it is rounded to, the rest is what float32 may err.
+    fifth_order
+        Of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, with room for
+        higher orders.
+    third_order
+        Of δ³/R²: 1/(3√3).
+    shared_curvature_error
+        Of Dδ²/R², where all blocks of a patch share one curvature: three terms of 1/(3√3).
+    own_curvature_error
+        Of D²δ²/R³, where each has its own: six terms of 1/8, of which all but a tenth is in the block's curvature.
+    curvature_span
+        Second-order terms move a pixel of a block by at most 1.5² their coefficients; twice that bounds all blocks.
+    weight_change, weight_curvature
+        Of the beam's peak: how much antenna weights may differ between the nodes of a patch, first and second
+        difference, to be taken as a polynomial.
+    sector_bend
+        Of the width of a sector's edge: how much a pixel's place in it may bend inside a block to be taken as linear.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Paths", "Look-ups" and "Antennas".
+    """
+
+    patch_side: int = 16
+    block_side: int = 4
+    batch: int = 8
+    taps: int = 16
+    window: int = 16
+    echo_taps: int = 8
+    echo_degree: int = 4
+    window_margin: float = 0.51
+    fifth_order: float = 0.14
+    third_order: float = 0.19
+    shared_curvature_error: float = 0.58
+    own_curvature_error: float = 0.075
+    curvature_span: float = 4.5
+    weight_change: float = 0.12
+    weight_curvature: float = 0.025
+    sector_bend: float = 0.002
+
+
+KERNEL = KernelConstants()
+
+
+# ---- What the compiled library takes, field by field as in native/job.hpp and native/tree_job.hpp ------------------
+
+_pointer = ctypes.c_void_p
+_int64 = ctypes.c_int64
+_double = ctypes.c_double
+
+TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
+TREE_TERMS, TREE_MORE, TREE_WEIGHTS = 21, 4, 16
+"""As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
+a leaf; pixels along a tile; taps that align a pulse; pulses that stand for those of a leaf, at most."""
+
+
+class BeamJob(ctypes.Structure):
+    """native/job.hpp, BeamJob."""
+
+    _fields_ = [
+        ("axes", _pointer),
+        ("gain", _pointer * 2),
+        ("count", _int64 * 2),
+        ("first_rad", _double * 2),
+        ("samples_per_rad", _double * 2),
+        ("peak", _double),
+    ]
+
+
+class SectorJob(ctypes.Structure):
+    """native/job.hpp, SectorJob."""
+
+    _fields_ = [("axis", _pointer * 2), *((name, _double) for name in ("centre", "inner", "outer"))]
+
+
+class ApertureJob(ctypes.Structure):
+    """native/job.hpp, ApertureJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("cells", "transmitter", "receiver", "first_path", "pixels")),
+        *((name, _pointer) for name in ("image", "counts")),
+        *((name, _int64) for name in ("pulses", "padded", "width", "rows", "columns")),
+        *((name, _double) for name in ("cells_per_metre", "radians_per_cell", "tolerance_rad")),
+        *((name, ctypes.c_int32) for name in ("degree", "phase_polynomial", "wide_sum")),
+        ("phase_coefficients", ctypes.c_float * 9),
+        ("beam", ctypes.POINTER(BeamJob) * 2),
+        ("sector", ctypes.POINTER(SectorJob)),
+    ]
+
+
+class TableJob(ctypes.Structure):
+    """native/job.hpp, TableJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "taps", "lead", "carrier", "turn", "cells")),
+        *((name, _int64) for name in ("pulses", "length", "width", "up", "down", "steps", "margin", "used")),
+        ("degree", ctypes.c_int32),
+    ]
+
+
+class EchoJob(ctypes.Structure):
+    """native/job.hpp, EchoJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "taps", "transmitter", "receiver", "start", "weight", "pixels")),
+        *((name, _pointer) for name in ("edges", "columns", "sums", "objective", "slopes")),
+        *((name, _int64) for name in ("pulses", "length", "count", "blocks", "width", "weight_step")),
+        *((name, _double) for name in ("samples_per_metre", "turns_per_metre")),
+    ]
+
+
+class TreeTile(ctypes.Structure):
+    """native/tree_job.hpp, TreeTile."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
+        ("centre", _double * 3),
+        ("rest", _double),
+        ("first_path", _double),
+        *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "samples", "top")),
+    ]
+
+
+class TreeJob(ctypes.Structure):
+    """native/tree_job.hpp, TreeJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "rough", "track")),
+        *((name, _pointer) for name in ("taps", "delay", "presum", "curve", "supports", "places", "spread", "mix")),
+        ("tiles", _pointer),
+        *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
+        *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
+        ("sizes", _int64 * TREE_LEVELS),
+        *((name, _double) for name in ("step", "wavenumber", "band", "smooth")),
+        ("phase_coefficients", ctypes.c_float * 9),
+    ]
+
+
+STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TreeTile, TreeJob)
+"""All of them."""
+
+
+# ---- The compiled library: where it lies, what it takes, and which instruction set it uses -------------------------
+#
+# Bound with ctypes: the GIL is released during a call, and one wheel serves every Python version. The library says
+# how its structs are laid out; where that differs from the mirrors here it is refused when it is loaded.
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
@@ -196,3 +371,67 @@ def _load(path: Path) -> ctypes.CDLL:
 
 def _lines(function: Callable[[], bytes]) -> list[list[str]]:
     return [line.split() for line in function().decode().splitlines()]
+
+
+# ---- Beams and sectors as the compiled engine reads them -----------------------------------------------------------
+
+Held = list[NDArray[np.generic]]
+"""Arrays that a struct points into: they must live as long as it is used."""
+
+
+def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, Held]:
+    """Return the pointers `beam` and `sector` of an `ApertureJob`, and what they point into.
+
+    Parameters
+    ----------
+    beams
+        Over as many pulses.
+    pulses, padded
+        Of the tables, without and with those that fill a batch.
+
+    Raises
+    ------
+    ValueError
+        If a beam or the sector is of other pulses.
+    """
+    beams = beams or Beams()
+    pointers, held = (ctypes.POINTER(BeamJob) * 2)(), Held()
+    for leg, beam in enumerate((beams.transmit, beams.receive)):
+        if beam is not None:
+            job, arrays = _beam(beam, pulses, padded)
+            pointers[leg] = ctypes.pointer(job)
+            held += arrays
+    if beams.sector is None:
+        return pointers, None, held
+    sector, arrays = _sector(beams.sector, pulses, padded)
+    return pointers, ctypes.pointer(sector), held + arrays
+
+
+def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, Held]:
+    if len(beam.axes) != pulses:
+        raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+    axes = np.pad(beam.axes, [(0, padded - pulses), (0, 0), (0, 0)], mode="edge")
+    axes = np.ascontiguousarray(np.moveaxis(axes, 0, -1), np.float64)
+    angles = (beam.azimuth_rad, beam.elevation_rad)
+    gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
+    job = BeamJob(
+        axes.ctypes.data,
+        (ctypes.c_void_p * 2)(*(gain.ctypes.data for gain in gains)),
+        (ctypes.c_int64 * 2)(*(gain.size for gain in gains)),
+        (ctypes.c_double * 2)(*(angle[0] for angle in angles)),
+        (ctypes.c_double * 2)(*((angle.size - 1) / (angle[-1] - angle[0]) for angle in angles)),
+        float(np.prod([np.abs(gain).max() for gain in gains])),
+    )
+    return job, [axes, *gains]
+
+
+def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, Held]:
+    if len(sector.tx_axis) != pulses:
+        raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
+    filling = [(0, padded - pulses), (0, 0)]
+    axes = [
+        np.ascontiguousarray(np.pad(axis, filling, mode="edge").T, np.float64)
+        for axis in (sector.tx_axis, sector.rx_axis)
+    ]
+    pointers = (ctypes.c_void_p * 2)(*(axis.ctypes.data for axis in axes))
+    return SectorJob(pointers, sector.centre, sector.inner, sector.outer), [*axes]

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.focus.engines.native_constants import KERNEL
+from apertura.core.focus.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps
 MARGIN = KERNEL.window  # empty cells at both ends, so that a look-up window may hang over

@@ -19,16 +19,12 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines import native
 from apertura.core.focus.engines.engine import EngineOptions, checked_pixels
-from apertura.core.focus.engines.native_binding import available, instruction_set
-from apertura.core.focus.engines.native_structs import TREE_GROUP, TREE_SIDE
+from apertura.core.focus.engines.native_binding import TREE_GROUP, TREE_SIDE, available, instruction_set
 from apertura.core.focus.engines.native_tables import Tables
-from apertura.core.focus.engines.tree_chunk import Chunk, Task, Tile
-from apertura.core.focus.engines.tree_inputs import LEAST_PIXELS, LEAST_QUARTER_PX, Trees, prepare
+from apertura.core.focus.engines.tree_inputs import LEAST_PIXELS, LEAST_QUARTER_PX, Chunk, Task, Tile, Trees, prepare
+from apertura.core.focus.engines.tree_nodes import DIRECTLY, surfaces_of, windows
 from apertura.core.focus.engines.tree_prediction import candidates
-from apertura.core.focus.engines.tree_sheets import MOST_SHEETS, Relief, Sheets, sheets_for
-from apertura.core.focus.engines.tree_surface import surfaces_of, windows
-from apertura.core.focus.engines.tree_track import subaperture_sizes
-from apertura.core.focus.engines.tree_weights import DIRECTLY
+from apertura.core.focus.engines.tree_view import MOST_SHEETS, Relief, Sheets, sheets_for, subaperture_sizes
 
 __all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 

@@ -1,13 +1,25 @@
-"""Nodes along an axis of a tile: where they lie, how wide a band they hold, and weights that interpolate between them.
+"""What stands for the pixels of a tile: nodes along its axes, the surface through them, polynomials of weights."""
 
-docs/theory/tree.md, "Nodes".
-"""
-
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import reached
+from apertura.core.focus.engines.native_binding import TREE_GROUP, TreeJob, TreeTile, call
+from apertura.core.geometry.aperture import Aperture
+
+# ---- Nodes along an axis of a tile: where they lie, how wide a band they hold, and weights that interpolate between
+# them
+#
+# docs/theory/tree.md, "Nodes".
 
 MOST_NODES = 128
 """Along an axis."""
@@ -167,3 +179,224 @@ def pixel_places(count: int) -> NDArray[np.float64]:
 
 def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sinc(band_rad / np.pi * (a[:, None] - b)))
+
+
+# ---- Tiles of a tree: their sides, and the smooth surface through their pixels -------------------------------------
+
+DEGREE = 6
+"""Of a surface that is no plane."""
+
+_PLANE_M = 2e-5
+_THIN = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Where the pixels of a tile lie.
+
+    Attributes
+    ----------
+    coefficients
+        (degree + 1, degree + 1, 3) float64, metres: of Legendre polynomials along rows and columns, of -1…1 from the
+        first pixel to the last.
+    centre_m
+        (3,) float64, the place at 0, 0.
+    up
+        (3,) float64, unit vector across the surface there.
+    rough_m
+        RMS distance of the pixels from it; infinite if one has no finite place.
+    """
+
+    coefficients: NDArray[np.float64]
+    centre_m: NDArray[np.float64]
+    up: NDArray[np.float64]
+    rough_m: float
+
+
+def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
+    """Yield windows of at most `side_px` pixels a side that share a block of pixels as evenly as whole pixels do.
+
+    Examples
+    --------
+    >>> list(windows((100, 150), 128))
+    [(slice(0, 100, None), slice(0, 75, None)), (slice(0, 100, None), slice(75, 150, None))]
+    """
+    parts = [-(-size // side_px) for size in shape]
+    rows, columns = (
+        [round(n * size / count) for n in range(count + 1)] for size, count in zip(shape, parts, strict=True)
+    )
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            yield slice(top, bottom), slice(left, right)
+
+
+def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surface]:
+    """Return the surfaces through the pixels of tiles: planes where they will do.
+
+    Parameters
+    ----------
+    pixels
+        (y, x, 3) float64, metres, contiguous.
+    parts
+        The tiles.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Surface".
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.arange(40.0), np.arange(30.0))
+    >>> surfaces_of(np.stack([x, y, 0.001 * x * x], -1), [(slice(0, 30), slice(0, 40))])[0].rough_m < 1e-9
+    True
+    """
+    found = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
+    left = list(range(len(parts)))
+    for degree in (1, DEGREE):
+        fitted = [_fit(pixels[parts[number]], degree) for number in left]
+        rests = _rests(pixels, [parts[number] for number in left], fitted)
+        for number, coefficients, rest in zip(left, fitted, rests, strict=True):
+            if np.isfinite(rest):
+                centre = _value(coefficients, 0.0)
+                found[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
+        left = [number for number in left if _PLANE_M < found[number].rough_m < np.inf]
+        if not left:
+            break
+    return found
+
+
+def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Return the coefficients of the surface through some pixels of a tile."""
+    middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
+    (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
+    offsets = pixels[np.ix_(rows, columns)] - middle  # places may be those of the Earth's centre
+    found = np.tensordot(fit_rows, fit_columns @ offsets, 1)
+    found[0, 0] += middle
+    return np.ascontiguousarray(found)
+
+
+def _rests(
+    pixels: NDArray[np.float64], parts: list[Window], surfaces: list[NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Return the mean squared distance of the pixels of tiles from surfaces; NaN where one has no place."""
+    tiles = (TreeTile * len(parts))()
+    for tile, (rows, columns), surface in zip(tiles, parts, surfaces, strict=True):
+        tile.surface, tile.degree = surface.ctypes.data, len(surface) - 1
+        tile.pixels = pixels.ctypes.data + 24 * (rows.start * pixels.shape[1] + columns.start)
+        tile.rows, tile.columns = rows.stop - rows.start, columns.stop - columns.start
+    call("apertura_rest_tree", TreeJob(tiles=ctypes.addressof(tiles), count=len(parts), stride=pixels.shape[1]))
+    return np.array([tile.rest for tile in tiles])
+
+
+@lru_cache(maxsize=64)
+def _fitting(size: int, degree: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return pixels along a side that a surface is fitted to, and the matrix that fits it."""
+    place = np.linspace(-1, 1, size) if size > 1 else np.zeros(1)
+    some: NDArray[np.int64] = np.unique(
+        np.round(np.linspace(0, size - 1, min(size, 4 if degree == 1 else _THIN))).astype(np.int64)
+    )
+    return some, np.asarray(np.linalg.pinv(np.polynomial.legendre.legvander(place[some], degree)))
+
+
+def _value(coefficients: NDArray[np.float64], place: float) -> NDArray[np.float64]:
+    basis = np.polynomial.legendre.legvander(np.array([place]), len(coefficients) - 1)[0]
+    return np.asarray(np.einsum("a,abk,b->k", basis, coefficients, basis))
+
+
+def _across(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector across a surface: that of its linear part."""
+    across = np.cross(coefficients[0, 1], coefficients[1, 0])
+    length = np.linalg.norm(across)
+    return np.asarray(across / length if length else np.array([0.0, 0.0, 1.0]))
+
+
+# ---- Weights of antennas and sectors over the tiles of a tree: a polynomial for each pulse, where that will do
+
+BY_TREE, DIRECTLY, SILENTLY = range(3)
+"""How a group of pulses is taken over a tile: native/tree_job.hpp, TreeWay."""
+
+_TERMS = 4  # of ξ and of η
+_PLACES = np.cos(np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
+_BETWEEN = np.array([-1.0, -0.65, 0.0, 0.65, 1.0])
+_CURVE = 5  # degree of weights over the pulses of a leaf
+_CHECKED = 8  # pulses of which one is looked at between the places
+
+
+def weights_over(
+    beams: Beams, aperture: Aperture, surface: Surface, error_db: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the weight of each pulse over a tile, how groups of pulses are taken, and which cannot be made fewer.
+
+    Parameters
+    ----------
+    beams, aperture
+        Of the same pulses.
+    surface
+        Of the tile.
+    error_db
+        What polynomials may err by, relative to the largest weight.
+
+    Returns
+    -------
+    weights
+        (pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
+    way
+        (group of 64 pulses,) uint8: by tree where polynomials hold, silently where no pulse weighs anything.
+    each
+        (group,) uint8: 1 where weights change from pulse to pulse otherwise than smoothly, so that no pulse can stand
+        for others.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Weights".
+    """
+    at, between, to_terms, terms_between = _matrices()
+    values = beams.weight(aperture, _positions(surface, at))
+    terms = values @ to_terms.T
+    limit = 10 ** (error_db / 20) * 3  # the largest of an error is about three times its RMS
+    groups = -(-len(values) // TREE_GROUP)
+    largest, each = _by_group(values.max(axis=1)), np.zeros(groups, bool)
+    full = len(values) // TREE_GROUP  # of a group not full each pulse goes for itself anyway
+    each[:full] = _jumps(values[: full * TREE_GROUP]) > limit * largest[:full]
+    each[full:] = True
+    # Where weights jump every pulse is looked at: one between two that hold need not.
+    some = np.flatnonzero(each[np.arange(len(values)) // TREE_GROUP] | (np.arange(len(values)) % _CHECKED == 0))
+    error, checked = np.zeros(len(values)), beams[some].weight(aperture[some], _positions(surface, between))
+    error[some] = np.abs(terms[some] @ terms_between.T - checked).max(axis=1)
+    radius_m = np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max(keepdims=True)
+    lit = reached(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
+    # A beam may be narrower than what lies between the places, and end between two of them.
+    whole = _by_group(((values == 0).any(axis=1) & (values != 0).any(axis=1)).astype(float)) == 0
+    holds = whole & (largest > 0) & (_by_group(error) <= limit * largest)
+    way = np.where(lit, np.where(holds, BY_TREE, DIRECTLY), SILENTLY)
+    return np.ascontiguousarray(terms, np.float32), way.astype(np.uint8), each.astype(np.uint8)
+
+
+def _by_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest value of each group of pulses."""
+    return np.asarray(np.maximum.reduceat(values, np.arange(0, len(values), TREE_GROUP)))
+
+
+def _jumps(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much the weights of groups of pulses leave a curve over them, at most: (group,)."""
+    grouped = values.reshape(len(values) // TREE_GROUP, TREE_GROUP, values.shape[1])
+    return np.asarray(np.abs(grouped - _curve() @ (_curve().T @ grouped)).max(axis=(1, 2)))
+
+
+@lru_cache
+def _curve() -> NDArray[np.float64]:
+    basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, TREE_GROUP), _CURVE)
+    return np.asarray(np.linalg.qr(basis)[0])
+
+
+def _positions(surface: Surface, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    basis = np.polynomial.legendre.legvander(places, len(surface.coefficients) - 1)
+    return np.asarray(np.einsum("ia,abk,jb->ijk", basis, surface.coefficients, basis).reshape(-1, 3))
+
+
+@lru_cache
+def _matrices() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return places along an axis, those between them, values → terms, and terms → values between."""
+    powers, between = (np.vander(at, _TERMS, increasing=True) for at in (_PLACES, _BETWEEN))
+    inverse = np.linalg.inv(powers)
+    return _PLACES, _BETWEEN, np.asarray(np.kron(inverse, inverse)), np.asarray(np.kron(between, between))

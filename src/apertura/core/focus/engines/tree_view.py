@@ -1,19 +1,118 @@
-"""How a tree would see a job: numbers of nodes, samples and pulses of some tiles and chunks, before anything is formed.
-
-The same counts as native/tree_plan.hpp makes for every tile, taken at a few.
-"""
+"""How a tree divides a job: leaves of its track, nodes and pulses of tiles and chunks, sheets over rough ground."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.focus.engines.native_structs import TREE_FEWER, TREE_MORE
-from apertura.core.focus.engines.tree_nodes import MOST_NODES, supports
-from apertura.core.focus.engines.tree_surface import Surface
-from apertura.core.focus.engines.tree_track import DEGREES, LEAF, leaf_roughness, leaves_of
+from apertura.common.contracts import Window
+from apertura.core.focus.engines.native_binding import TREE_FEWER, TREE_GROUP, TREE_MORE, TREE_TERMS
+from apertura.core.focus.engines.tree_nodes import MOST_NODES, Surface, nodes, pixel_places, supports, weights
 from apertura.core.geometry.aperture import Aperture
+
+# ---- How pulses are grouped into leaves and larger subapertures of a tree, and how smooth the track over a leaf is
+
+LEAF = TREE_GROUP
+"""Pulses that a leaf makes fewer, and sums at its nodes."""
+
+DEGREES = (5, 9, 14, 20)
+"""Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
+
+_SECOND = 256  # pulses of a subaperture of leaves
+
+
+def subaperture_sizes(chunk: int) -> tuple[int, ...]:
+    """Return the pulses of the subapertures of each level, the largest last.
+
+    Examples
+    --------
+    >>> subaperture_sizes(1024), subaperture_sizes(256), subaperture_sizes(64)
+    ((64, 256, 1024), (64, 256), (64,))
+    """
+    return tuple(sorted({size for size in (LEAF, _SECOND, chunk) if size <= chunk}))
+
+
+def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
+    count = -(-len(places_m) // LEAF)
+    filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
+    return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
+
+
+def stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf,) how far pulses lie from the parabola through the first, middle and last one, metres."""
+    x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
+    to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
+    rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
+    return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
+
+
+def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, term, 3) float64: the track over each leaf as orthonormal polynomials of the pulses' numbers."""
+    return np.asarray(np.einsum("pt,npc->ntc", _polynomials()[0], leaves_m))
+
+
+def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much the legs of pulses leave curves of growing degree through them, along the worst direction.
+
+    Parameters
+    ----------
+    one_m, other_m
+        (leaf, pulse, 3) float64: phase centres of the two antennas, which may share a platform.
+
+    Returns
+    -------
+    ndarray
+        (leaf, curve) float64, metres RMS, of both legs together.
+
+    Examples
+    --------
+    >>> jitter = 1e-3 * np.random.default_rng(1).standard_normal((2, 1, 64, 3))
+    >>> apart, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
+    >>> bool(1.2e-3 < apart < 1.8e-3 < together < 2.4e-3)
+    True
+    """
+    apart = _widest(one_m) + _widest(other_m)
+    return np.asarray(np.sqrt(np.maximum(apart, _widest(one_m + other_m))))
+
+
+def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf, curve) the largest variance along any direction, of what leaves curves of growing degree."""
+    shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
+    terms = tracks(shifted)
+    for number, degree in enumerate(DEGREES):
+        rest = shifted - np.einsum("pt,ntc->npc", _polynomials()[0][:, : degree + 1], terms[:, : degree + 1])
+        widest[:, number] = np.linalg.eigvalsh(np.einsum("npc,npd->ncd", rest, rest) / LEAF)[:, -1]
+    return np.maximum(widest, 0)
+
+
+@cache
+def curve(fewer: int, nodes_db: int) -> NDArray[np.float64]:
+    """Return the polynomials of `tracks` at the pulses that stand for those of a leaf, (pulse, term) float64.
+
+    Examples
+    --------
+    >>> bends = np.linspace(-1, 1, 64)[None, :, None] ** 3 * np.ones(3)
+    >>> smooth = curve(9, -74) @ tracks(bends)[0]
+    >>> bool(np.abs(smooth[:, 0] - nodes(9, -74) ** 3).max() < 1e-12)
+    True
+    """
+    seen = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
+    return np.ascontiguousarray(seen @ _polynomials()[1])
+
+
+@cache
+def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (pulse, term) orthonormal polynomials, and what makes them of Legendre's."""
+    basis, triangle = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), TREE_TERMS - 1))
+    return basis, np.linalg.inv(triangle)
+
+
+# ---- How a tree would see a job: numbers of nodes, samples and pulses of some tiles and chunks, before anything is
+# formed
+#
+# The same counts as native/tree_plan.hpp makes for every tile, taken at a few.
 
 _FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
 _NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
@@ -224,3 +323,147 @@ def counts_of(looks: Looks, *, nodes_db: int, presum_db: float, weighted: bool) 
             followed = np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1
             return Counts(tuple(levels), fewer, float(looks.rough_rad[followed]))
     return Counts(tuple(levels), 0, 0.0)
+
+
+# ---- Ground that no polynomial follows: a tile formed on several sheets, one above the other, and read between them
+#
+# docs/theory/tree.md, "Sheets".
+
+MOST_SHEETS = 32
+
+_TABLE = 8192  # heights between the sheets for which weights are there
+_SAMPLED = 64  # pulses that are looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """How the pixels of a tile lie off its surface.
+
+    Attributes
+    ----------
+    pixels
+        (y, x, 3) float64, their places, metres.
+    up
+        (3,) unit vector along which they leave the surface.
+    off_m
+        (y, x) float64, by how much.
+    aside_m
+        RMS of what they leave it by across that.
+    """
+
+    pixels: NDArray[np.float64]
+    up: NDArray[np.float64]
+    off_m: NDArray[np.float64]
+    aside_m: float
+
+    @classmethod
+    def of(cls, surface: Surface, pixels: NDArray[np.float64]) -> "Relief":
+        """Return that of pixels with places.
+
+        Examples
+        --------
+        >>> flat = np.stack(np.meshgrid(np.arange(3.0), np.arange(2.0), 0.0), -1)[:, :, 0]
+        >>> plane = np.zeros((2, 2, 3))
+        >>> plane[0, 0], plane[0, 1, 0], plane[1, 0, 1] = (1, 0.5, 0), 1, 0.5
+        >>> rough = flat + [[[0, 0, 1], [0, 0, -1], [0, 0, 2]]]
+        >>> abs(Relief.of(Surface(plane, plane[0, 0], np.array([0, 0, 1.0]), 1.0), rough).off_m[0])
+        array([1., 1., 2.])
+        """
+        degree = len(surface.coefficients) - 1
+        along, across = (np.polynomial.legendre.legvander(pixel_places(size), degree) for size in pixels.shape[1::-1])
+        rest = pixels - np.tensordot(across, along @ surface.coefficients, 1)
+        flat = rest.reshape(-1, 3)
+        power, axes = np.linalg.eigh(flat.T @ flat / len(flat))
+        return cls(pixels, axes[:, -1], rest @ axes[:, -1], float(np.sqrt(max(0.0, power[:2].sum()))))
+
+    @property
+    def span_m(self) -> tuple[float, float]:
+        """Middle and half of the heights."""
+        low, high = float(self.off_m.min()), float(self.off_m.max())
+        return (low + high) / 2, (high - low) / 2
+
+    def band_rad(self, aperture: Aperture, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
+        """Return the half width of the band along `up`, rad per half of the heights, against the middle pulse.
+
+        Notes
+        -----
+        Source: docs/theory/tree.md, eq. 11.
+        """
+        corners = self.pixels[[0, 0, -1, -1, self.pixels.shape[0] // 2], [0, -1, 0, -1, self.pixels.shape[1] // 2]]
+        rate = aperture[aperture.sample(_SAMPLED)].path_gradient(corners) @ self.up
+        against = aperture[len(aperture) // 2 : len(aperture) // 2 + 1].path_gradient(corners)[0] @ self.up
+        turns = wavenumber_rad_m * np.abs(rate - against).max() + band_rad_m * np.abs(rate).max()
+        return float(self.span_m[1] * turns)
+
+
+@dataclass(frozen=True, eq=False)
+class Sheets:
+    """Sheets between which a tile is read.
+
+    Attributes
+    ----------
+    relief
+        Of the tile.
+    heights_m
+        (sheet,) float64, above the surface.
+    error_db
+        What reading between them may err by.
+    """
+
+    relief: Relief
+    heights_m: NDArray[np.float64]
+    error_db: int
+
+    @classmethod
+    def of(cls, relief: Relief, band_rad: float, error_db: int) -> "Sheets":
+        """Return as few sheets as hold a band."""
+        middle, half = relief.span_m
+        return cls(relief, middle + half * nodes(sheets_for(band_rad, error_db), error_db), error_db)
+
+    @property
+    def pixels(self) -> NDArray[np.float64]:
+        """Places of the pixels on each sheet, (sheets · y, x, 3) float64, metres."""
+        relief = self.relief
+        moved = (self.heights_m[:, None, None] - relief.off_m)[..., None] * relief.up
+        return np.ascontiguousarray((relief.pixels + moved).reshape(-1, *relief.pixels.shape[1:]))
+
+    @property
+    def windows(self) -> list[Window]:
+        """Each sheet in `pixels`."""
+        rows, columns = self.relief.off_m.shape
+        return [(slice(n * rows, (n + 1) * rows), slice(0, columns)) for n in range(len(self.heights_m))]
+
+    def read(self, images: NDArray[np.complex64], pulse: Aperture, wavenumber_rad_m: float) -> NDArray[np.complex64]:
+        """Return the image at the pixels, (y, x) complex64, from that on `pixels`; `pulse` is the one referred to."""
+        relief, (middle, half) = self.relief, self.relief.span_m
+        place = (np.clip((relief.off_m - middle) / (half or 1.0), -1, 1) + 1) * (_TABLE / 2)
+        number = np.minimum(place.astype(np.int64), _TABLE - 1)
+        part = (place - number).astype(np.float32)
+        table = _weights(len(self.heights_m), self.error_db)
+        legs = []
+        for leg in pulse.legs:
+            away = relief.pixels - leg[0]
+            legs.append((np.einsum("yxk,yxk->yx", away, away), 2 * (away @ relief.up)))
+        image = np.zeros(relief.off_m.shape, np.complex64)
+        for sheet, (height, window) in enumerate(zip(self.heights_m, self.windows, strict=True)):
+            rise = height - relief.off_m
+            further = np.zeros_like(rise)
+            for square, slope in legs:
+                added = rise * (slope + rise)
+                further += added / (np.sqrt(square) + np.sqrt(square + added))
+            turn = (-wavenumber_rad_m * further).astype(np.float32)
+            share = table[sheet, number] * (1 - part) + table[sheet, number + 1] * part
+            image += images[window] * (share * (np.cos(turn) + 1j * np.sin(turn)))
+        return image
+
+
+def sheets_for(band_rad: float, error_db: int) -> int:
+    """Return how many sheets hold a band."""
+    return int(nodes_for(np.array([band_rad]), error_db)[0])
+
+
+@lru_cache(maxsize=64)
+def _weights(count: int, error_db: int) -> NDArray[np.float32]:
+    """Return the weights of sheets at evenly spaced heights, (sheet, height) float32."""
+    at = np.linspace(-1, 1, _TABLE + 1)
+    return np.ascontiguousarray(weights(count, at, error_db, float(supports(error_db)[count])).T, np.float32)

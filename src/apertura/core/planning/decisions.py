@@ -1,5 +1,6 @@
-"""How much of a flight a pixel is integrated over: what the resolution asked for needs, and no more than was flown."""
+"""The simplest model that will do: accuracy, autofocus, ground and integration, each with its reason."""
 
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -7,10 +8,151 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.job import Integration
+from apertura.core.focus.job import Integration, Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import TAPER, Sector, response
 from apertura.core.planning.checks import vertical
+from apertura.core.planning.plan import Decision
+from apertura.core.quality.budget import (
+    ARITHMETIC_BELOW_DB,
+    LEAST_ACCURACY_DB,
+    MOST_ACCURACY_DB,
+    BudgetLine,
+    accuracy_for,
+)
+from apertura.core.scene.terrain import FlatGround
+
+# ---- How exact arithmetic must be: well below what else is known to spoil the image, and no better -----------------
+
+
+def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
+    """Return the numerical error to ask for, and the line of the error budget that it follows from.
+
+    Examples
+    --------
+    >>> from apertura.core.quality.path_errors import Effect
+    >>> decide_accuracy([BudgetLine("positions", "1 cm", Effect(-0.0004, 0, 0))]).reason
+    'auto: 10 dB below positions (1 cm)'
+    """
+    value, stated = accuracy_for(lines), [line for line in lines if line.stated is not None]
+    largest = min(stated, key=lambda line: line.effect.loss_db, default=None)
+    if largest is None or value == MOST_ACCURACY_DB:
+        return Decision("accuracy_db", value, "auto: nothing known spoils the image more, and better shows nowhere")
+    cause = f"{largest.cause} ({largest.stated})"
+    if value == LEAST_ACCURACY_DB:
+        return Decision("accuracy_db", value, f"auto: {cause} spoil the image more, and worse would show")
+    return Decision("accuracy_db", value, f"auto: {ARITHMETIC_BELOW_DB:g} dB below {cause}")
+
+
+# ---- Whether the tracks of a flight are refined by its images: only where errors of position cost more than is
+# borne
+
+BORNE_DB = 0.2
+"""Loss of a peak by errors of position that is borne.
+
+RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band; less than this shows in no image, and is not
+worth a job that reads all pairs of a flight together.
+"""
+
+
+def decide_autofocus(asked: str, loss_db: Mapping[str, float], silent: Collection[str]) -> Decision:
+    """Return whether tracks are refined, on or off, and why.
+
+    Parameters
+    ----------
+    asked
+        auto, on or off.
+    loss_db
+        Pair → what errors of position that somebody stated are expected to cost, 0 or less.
+    silent
+        Nodes of whose errors nobody said anything.
+
+    Examples
+    --------
+    >>> decide_autofocus("auto", {"a-a": -0.1, "a-b": -0.9}, []).reason
+    'auto: errors of position that are stated cost 0.90 dB in a-b, more than the 0.2 dB borne'
+    >>> decide_autofocus("auto", {"a-a": 0.0}, ["a"]).value
+    'off'
+    """
+    if asked != "auto":
+        return Decision("autofocus", asked, "asked for")
+    if silent:
+        missing = f"auto: nobody said how well positions of {' and '.join(silent)} are known"
+        return Decision("autofocus", "off", f"{missing}; state nodes.<node>.position_std_m to have them refined")
+    pair, worst_db = min(loss_db.items(), key=lambda one: one[1])
+    value, than = ("on", "more") if worst_db < -BORNE_DB else ("off", "no more")
+    cost = f"errors of position that are stated cost {-worst_db:.2f} dB in {pair}"
+    return Decision("autofocus", value, f"auto: {cost}, {than} than the {BORNE_DB} dB borne")
+
+
+# ---- The simplest model of the ground that keeps focus and place: a plane, a tilted plane, or the DEM --------------
+
+FOCUS_RAD = 0.4
+SHIFT_PIXELS = 0.5
+
+
+def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processing") -> Decision:
+    """Decide whether a plane, a tilted plane or the DEM stands for the ground.
+
+    Parameters
+    ----------
+    job
+        What is to be imaged.
+    asked
+        What a person asks for; None: the rule decides.
+    where
+        Section of the config that asks, for messages.
+
+    Raises
+    ------
+    CampaignError
+        If a DEM's model is asked for and there is none.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "Terrain": a height that is wrong by δh turns the look angle by δh over the ground
+    range and shifts the pixel by δh·H over it.
+    """
+    chosen = _by_rule(job)
+    if asked is None or asked == chosen.value:
+        return chosen
+    if isinstance(job.terrain.full, FlatGround):
+        raise CampaignError(
+            f"terrain is {asked}",
+            where=f"{where}.terrain",
+            expected="plane or auto: the scene has no DEM",
+            remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
+        )
+    return Decision("terrain", asked, f"asked for; the rule says {chosen.value}: {chosen.reason}")
+
+
+def _by_rule(job: Job) -> Decision:
+    (limit_m, rule), ground = _tolerance(job), job.terrain
+    if isinstance(ground.full, FlatGround):
+        return Decision("terrain", "plane", f"no DEM; height may be wrong by {limit_m:.3g} m: {rule}")
+    if ground.relief_m < limit_m:
+        return Decision("terrain", "plane", f"relief {ground.relief_m:.3g} m; {rule}")
+    off_plane = f"relief {ground.relief_m:.3g} m, {ground.off_plane_m:.3g} m off a tilted plane; {rule}"
+    return Decision("terrain", "tilted_plane" if ground.off_plane_m < limit_m else "dem", off_plane)
+
+
+def _tolerance(job: Job) -> tuple[float, str]:
+    """Return how far heights may be wrong, metres, and why."""
+    apart = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
+    above = apart @ vertical(job.ground_m)
+    ground = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
+    nearest, steepest = float(ground.min()), float((np.abs(above) / ground).max())
+    wobble_m = job.aperture.wobble_m
+    focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))
+    shift_m = SHIFT_PIXELS * job.spacing_m / max(steepest, 1e-9)
+    return min(focus_m, shift_m), (
+        f"wobble {wobble_m:.3f} m rms and ground range from {nearest:.1f} m bear {focus_m:.3g} m (0.4 rad), "
+        f"half a pixel of shift {shift_m:.3g} m"
+    )
+
+
+# ---- How much of a flight a pixel is integrated over: what the resolution asked for needs, and no more than was
+# flown
 
 CHORD = 0.1
 """Of the range to the scene: the way over which directions of flight are taken."""

@@ -1,4 +1,4 @@
-"""What may be wrong with a flight, as geometries to try: each suspicion with the echoes as they would be then."""
+"""What may be wrong with a flight, as geometries to try: each hypothesis with the echoes as they would be then."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +12,11 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.imaging.stages import aperture_of, phase_history_of
+from apertura.core.imaging.range_profiles import aperture_of, phase_history_of
 from apertura.pipeline.opening.acquisition import Acquisition
 from apertura.pipeline.opening.node_log import Times
+
+# ---- What may be wrong with a flight, as geometries to try: each suspicion with the echoes as they would be then
 
 MOST_PULSES = 512
 """Pulses of a pair that suspicions are tried on, evenly spread."""

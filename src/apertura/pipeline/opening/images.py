@@ -1,18 +1,76 @@
-"""How two finished images of a campaign agree, by the bright points that each found in itself."""
+"""Finished images of a campaign opened again: a layer at few places, and how two of them agree."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
 
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.common.raster import opened_raster
 from apertura.core.quality.agreement import Agreement, agreement
 from apertura.core.quality.bright_points import BrightPoint, shows_point
 from apertura.core.quality.measures import Raster
 from apertura.core.scene.grid import SceneGrid
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.store import read_manifest
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+# ---- A layer of a pair, opened as the workflow left it; any raster, read to few places -----------------------------
+
+
+@contextmanager
+def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Iterator[Any]:
+    """Open a GeoTIFF that step `layers` wrote, such as 'mask.tif'.
+
+    Yields
+    ------
+    rasterio.DatasetReader
+        The raster.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there as the step wrote it.
+    """
+    path = campaign.result(flight, pair, file)
+    manifest = campaign.root / campaign.manifest("layers", flight, pair)
+    remedy = f"Delete {manifest} and run the workflow again."
+    if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
+        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
+    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+        yield raster
+
+
+def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
+    """Return a raster averaged to few places, from its overviews.
+
+    Parameters
+    ----------
+    raster
+        Open for reading.
+    dots
+        Places along the longer side, at most.
+
+    Returns
+    -------
+    ndarray
+        (row, column) float32.
+    """
+    fewer = max(1.0, max(raster.shape) / dots)
+    shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
+    values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
+    return values
+
+
+# ---- How two finished images of a campaign agree, by the bright points that each found in itself -------------------
 
 
 def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> Agreement | None:

@@ -1,0 +1,212 @@
+"""Processes of a run: one at a time, apart from the folder's own code, and ended with what they opened closed."""
+
+import fcntl
+import os
+import re
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+from apertura.common.errors import CampaignError, shown
+
+# ---- How a command ends: signals that close what is open, and a status that the run around it hears of -------------
+
+INTERRUPTED = 130
+STATUS_FILE = "APERTURA_STATUS_FILE"
+"""Environment variable: where steps leave the exit status that snakemake does not pass on."""
+
+_ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+class Interrupted(SystemExit):
+    """A signal asked this process to end."""
+
+
+def leave_status(status: int) -> None:
+    """Tell the run that this step belongs to, if any, how the step ended."""
+    if STATUS_FILE in os.environ and status:
+        with suppress(OSError), Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as said:  # on another node
+            said.write(f"{status}\n")
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Turn SIGTERM, SIGINT and SIGHUP into `Interrupted`, so that whatever is open is closed on the way out."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        for other in _ENDING:
+            signal.signal(other, signal.SIG_IGN)
+        raise Interrupted(f"interrupted by {signal.Signals(number).name}")
+
+    before = {number: signal.signal(number, end) for number in _ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+# ---- What a process does before it works for a stranger's folder: it leaves that folder, and so do all that it
+# starts
+#
+# Python and libraries take modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
+# with its cache of pickled code, ``matplotlibrc``). Commands are typed in campaign folders, and Snakemake starts
+# every step in one.
+
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Environment variable: Python then imports nothing from the working folder; ``python -m snakemake`` of a job, too."""
+
+_SEARCHED = ("PATH", "PYTHONPATH")
+_left: list[Path] = []
+
+
+def leave_working_folder() -> None:
+    """Make the package's own folder the working folder, and `isolate`; what was typed is then found by `given`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the working folder is gone.
+    """
+    _left[:] = [Path.cwd()]
+    os.chdir(Path(__file__).parents[1])
+    isolate()
+
+
+def isolate() -> None:
+    """See to it that nothing is imported or started from a working folder: not here, not by any process started here.
+
+    Empty and relative entries of PATH, PYTHONPATH and ``sys.path`` mean whatever folder is the working one: Snakemake
+    adds ``.snakemake/pip-deployments`` itself.
+
+    Examples
+    --------
+    >>> isolate()
+    >>> os.environ["PYTHONSAFEPATH"], all(Path(path).is_absolute() for path in sys.path)
+    ('1', True)
+    """
+    os.environ[SAFE_PATH] = "1"
+    for name in _SEARCHED:
+        if name in os.environ:
+            os.environ[name] = os.pathsep.join(filter(_is_absolute, os.environ[name].split(os.pathsep)))
+    sys.path[:] = filter(_is_absolute, sys.path)
+
+
+def _is_absolute(path: str) -> bool:
+    return Path(path).is_absolute()
+
+
+def given(path: Path) -> Path:
+    """Return a path that a person typed as an absolute one: it counts from where the command was started.
+
+    Examples
+    --------
+    >>> given(Path("campaign")) == Path.cwd() / "campaign"
+    True
+    """
+    return started() / path
+
+
+def started() -> Path:
+    """Return the folder that the command was started in."""
+    return _left[0] if _left else Path.cwd()
+
+
+def as_typed(text: object) -> str:
+    """Return a path, or a message with paths, as a person would type them where the command was started.
+
+    Examples
+    --------
+    >>> as_typed(Path.cwd() / "campaign" / "results"), as_typed(f"{Path.cwd()}/a: no such file")
+    ('campaign/results', 'a: no such file')
+    """
+    folder = str(started())
+    return str(text) if folder == os.sep else re.sub(rf"(?<![\w./-]){re.escape(folder)}{os.sep}", "", str(text))
+
+
+# ---- One run of a campaign at a time: a kernel lock that dies with its process, and says who holds it --------------
+
+_LOCK = Path("results/.run.lock")
+_TRIES, _BETWEEN_S = 20, 0.02
+
+
+def hold(root: Path) -> IO[str]:
+    """Hold a campaign folder until the file returned is closed, or its process ends.
+
+    Raises
+    ------
+    CampaignError
+        If another process holds it: which, on which machine, since when.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder, hold(Path(folder)):
+    ...     hold(Path(folder))
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: ...: another run holds this campaign: process ...; expected ...
+    """
+    path = root / _LOCK
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.open("a+", encoding="utf-8")
+    try:
+        _take(lock)
+    except BlockingIOError:
+        held = _said(lock)
+        lock.close()
+        raise CampaignError(
+            f"another run holds this campaign: {held}",
+            where=root,
+            expected="one run at a time",
+            remedy="Wait until it ends, or end it.",
+        ) from None
+    lock.truncate(0)
+    lock.write(f"process {os.getpid()} on {socket.gethostname()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC\n")
+    lock.flush()
+    return lock
+
+
+def holder(root: Path) -> str | None:
+    """Return who holds a campaign folder: process, machine, since when; None if nobody does.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder, hold(Path(folder)):
+    ...     holder(Path(folder))
+    'process ... on ... since ... UTC'
+    """
+    try:
+        with (root / _LOCK).open(encoding="utf-8") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return _said(lock)
+    except FileNotFoundError:
+        pass
+    return None
+
+
+def _take(lock: IO[str]) -> None:
+    """Take the lock; whoever only asks who holds it has it for an instant, and is waited for."""
+    for attempt in range(_TRIES):
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if attempt == _TRIES - 1:
+                raise
+            time.sleep(_BETWEEN_S)
+
+
+def _said(lock: IO[str]) -> str:
+    lock.seek(0)
+    return shown(lock.read(200).strip() or "one that has just begun", 200)
