@@ -17,7 +17,7 @@ from apertura.core.focus.engines.engine import Setting
 from apertura.core.imaging.certify import certified
 from apertura.core.imaging.formation import Formation
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.planner import Search, make_plan
+from apertura.core.planning.planner import SettingSearch, make_plan
 from apertura.core.quality.error_check import error_bound
 
 TILE_PX = 32
@@ -41,7 +41,7 @@ def judged(seeds: range, *, pixels: int, pulses: int) -> Iterator[Judged]:
         drawn = draw(generator, pixels=pixels, pulses=pulses)
         plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
         exact = np.asarray(reference.form(drawn.history, drawn.grid.positions(0.0)) / pulses)
-        others = [one for one in Search(drawn.job).settings(pulses) if one.engine != "reference"]
+        others = [one for one in SettingSearch(drawn.job).settings(pulses) if one.engine != "reference"]
         other = others[generator.integers(len(others))]
         for one in (plan, replace(plan, setting=other, presum=None)):
             yield _judge(drawn, one, exact, seed)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from apertura.core.echo.dechirp import Sweep
+from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.scene import open_scene
@@ -38,7 +38,7 @@ BAND = 2.2e9, 400e6
 
 def fmcw(root: Path, iq: str) -> np.ndarray:
     """Write the campaign of a sweep; return where targets are, easting and northing."""
-    sweep = Sweep(*BAND, 20e-6, 25e6, iq)
+    sweep = FrequencySweep(*BAND, 20e-6, 25e6, iq)
     nodes = {"uav1": (0.0, -20.0, 10.0)}
     asked = {"speed_m_s": SPEED_M_S, "half_width_m": HALF_M, "spacing_m": SPACING_M}
     flight = FmcwFlight(sweep, PRF_HZ, PULSES, nodes, TARGETS, **asked)

@@ -16,7 +16,7 @@ from campaigns import Drawn, draw
 from apertura.core.focus.engines import load_engine, numba, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.planner import Search, make_plan
+from apertura.core.planning.planner import SettingSearch, make_plan
 from apertura.core.quality.measures import numerical_error
 
 
@@ -64,7 +64,7 @@ def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
         if reached[-1] > drawn.accuracy_db:
             mine.append(Runner(drawn, better))
             reached.append(error_db(mine[-1]))
-    every = Search(drawn.job).settings(len(drawn.job.aperture))
+    every = SettingSearch(drawn.job).settings(len(drawn.job.aperture))
     every = [s for s in every if s.engine == "native"] or [s for s in every if s.engine == "numba"]
     others = [Runner(drawn, setting) for setting in every]
     met = [runner for runner in others if error_db(runner) <= drawn.accuracy_db]

@@ -12,7 +12,7 @@ from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.names import PHASE_HISTORIES, TRACKS
 from apertura.formats.reading import read_track
 from apertura.formats.recordings.sample_file import EDGE, SETTLING, SampleLayout
-from apertura.formats.recordings.sigmf import Capture, Collection, Framing, Global
+from apertura.formats.recordings.sigmf import Capture, Global, SigmfCollection, SigmfFraming
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.config import Flight, PulseWaveform, read_flights, read_segments
@@ -39,7 +39,7 @@ def required(after):
 
 @pytest.mark.parametrize(
     ("model", "after"),
-    [(Global, "Global object:"), (Capture, "Each of the captures:"), (Collection, "### Collections")],
+    [(Global, "Global object:"), (Capture, "Each of the captures:"), (SigmfCollection, "### Collections")],
 )
 def test_every_key_of_sigmf_that_is_read_is_told_and_no_other(model, after):
     read = {field.alias: field.is_required() for field in model.model_fields.values()}
@@ -48,7 +48,7 @@ def test_every_key_of_sigmf_that_is_read_is_told_and_no_other(model, after):
 
 
 def test_every_key_of_framing_is_told():
-    assert names("A frame is preamble") == list(Framing.model_fields)
+    assert names("A frame is preamble") == list(SigmfFraming.model_fields)
 
 
 def test_the_datatypes_that_are_told_are_those_that_are_read():

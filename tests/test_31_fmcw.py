@@ -8,14 +8,14 @@ import pytest
 from folders import complaint
 from scipy.io import savemat, wavfile
 
-from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.phase_histories.fmcw import trigger_starts
 from apertura.formats.reading import read_phase_history
 from apertura.simulation.fmcw import beat_signal
 
 pytestmark = pytest.mark.usefixtures("reader")
 
-COFFEE = Sweep(2.26e9, 330e6, 20e-3, 44_100.0)
+COFFEE = FrequencySweep(2.26e9, 330e6, 20e-3, 44_100.0)
 """The sweep of MIT's coffee-can radar."""
 
 BEGAN = np.datetime64("2025-05-14T09:30", "ns")

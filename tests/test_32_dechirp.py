@@ -7,10 +7,10 @@ import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import window_weights
-from apertura.core.echo.dechirp import Sweep, sweep_motion_flags, transfer_of
+from apertura.core.echo.dechirp import FrequencySweep, sweep_motion_flags, transfer_of
 from apertura.simulation.fmcw import beat_signal
 
-FAST = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+FAST = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
 
 
 def beats(sweep, path_m, start_s=(0.0,)):
@@ -90,7 +90,7 @@ def test_what_is_moved_ahead_leaves_and_does_not_come_in_at_the_other_end():
 
 
 def test_an_echo_that_half_of_the_sweep_is_past_is_beyond_the_limit():
-    short = Sweep(2.2e9, 4e6, 2e-6, 25e6)
+    short = FrequencySweep(2.2e9, 4e6, 2e-6, 25e6)
     assert short.path_limit_m == pytest.approx(SPEED_OF_LIGHT_M_S * 1e-6)
     whole, half = (abs(gathered(against_truth(short, path_m))) for path_m in (3.0, short.path_limit_m))
     assert half == pytest.approx(whole / 2, abs=0.1)
@@ -116,7 +116,7 @@ def test_motion_within_a_sweep_is_flagged_beyond_a_sixteenth_of_a_wave(sweep_s, 
 
 @pytest.mark.parametrize("bandwidth_hz", [200e6, -200e6])
 def test_motion_within_a_sweep_moves_the_envelope_as_stated_and_leaves_the_phase(bandwidth_hz):
-    slow = Sweep(2.4e9 - bandwidth_hz / 2, bandwidth_hz, 5e-3, 100e3, iq="complex")
+    slow = FrequencySweep(2.4e9 - bandwidth_hz / 2, bandwidth_hz, 5e-3, 100e3, iq="complex")
     rate_m_s, path_m = 10.0, 60.0
     middle = slow.middle_s
     beat = beat_signal(slow, np.zeros(1), [lambda time: path_m + rate_m_s * (time - middle)], [1.0])

@@ -17,7 +17,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines import cuda, load_engine
 from apertura.core.focus.engines.cuda_prediction import FARTHEST, FLOAT32_ERROR, LAST_ORDER, LAST_TERM, candidates
 from apertura.core.focus.engines.engine import Setting
-from apertura.core.planning.planner import Search
+from apertura.core.planning.planner import SettingSearch
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallba
     settings = list(candidates(job, pulses=300, asked={}))
     assert min(setting.seconds for setting in settings) > 10 * double_sum.seconds
     assert min(setting.error_db for setting in settings) < -100
-    last = Search(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))
+    last = SettingSearch(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))
     assert [setting.engine for setting in last] == ["reference"]
 
 

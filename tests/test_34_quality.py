@@ -5,7 +5,7 @@ import pytest
 
 from apertura.core.quality.error_check import Brightness, Certificate, error_bound, random_pixels
 from apertura.core.quality.measures import coherence_factor, numerical_error, survey
-from apertura.core.quality.point_targets import Patch, cut_through, find_peak
+from apertura.core.quality.point_targets import BandLimitedPatch, cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 
 
@@ -86,7 +86,7 @@ def test_the_patch_is_exact_between_pixels_although_the_carrier_folds():
     def scene(y, x):
         return np.exp(-((y - 31.3) ** 2 + (x - 30.6) ** 2) / 18) * np.exp(1j * (2.8 * y - 2.6 * x))
 
-    patch = Patch(scene(y, x).astype(np.complex64), 32, 32)
+    patch = BandLimitedPatch(scene(y, x).astype(np.complex64), 32, 32)
     rows, columns = np.array([31.37, 29.1]), np.array([30.52, 33.8])
     np.testing.assert_allclose(patch.at(rows, columns), scene(rows, columns), atol=1e-5)
 

@@ -18,7 +18,7 @@ from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import NodePrior, Prior, Sighting, TrackErrors
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.solve import Gauge, minimal
-from apertura.methods.autofocus.speckle import Ground, refined_by_speckle, tiles
+from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)
@@ -57,7 +57,9 @@ def seen(seed, ahead_m=4.7):
 
 
 def ground_of(sightings):
-    return Ground.of([Blocks.of(one, KNOTS_S) for one in sightings], tiles(sightings, GRID, GROUND, lasting_s=1.0))
+    return SpeckleTiles.of(
+        [Blocks.of(one, KNOTS_S) for one in sightings], tiles(sightings, GRID, GROUND, lasting_s=1.0)
+    )
 
 
 @pytest.mark.slow

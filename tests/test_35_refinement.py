@@ -21,7 +21,7 @@ from apertura.methods.autofocus.evidence import range_shifts
 from apertura.methods.autofocus.inputs import NodePrior, Prior, ReferencePoint, TrackErrors
 from apertura.methods.autofocus.objective import Sharpness
 from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places
-from apertura.methods.autofocus.refine import Search, refine
+from apertura.methods.autofocus.refine import TrackSearch, refine
 from apertura.methods.autofocus.solve import effects
 from apertura.pipeline.config import Node
 
@@ -65,7 +65,7 @@ def two_centimetres():
 
 
 def searched(one):
-    return Search.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
+    return TrackSearch.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.interferometry.comparison import Ground, compared, raised
+from apertura.methods.interferometry.comparison import AssumedGround, compared, raised
 from apertura.methods.interferometry.heights import Known, Level, level, levelled, placed
 from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
 from apertura.methods.interferometry.unwrapping import Unwrapped, contradictions, unwrap
@@ -70,7 +70,7 @@ def sensed(first, second):
 
 def ground_of(told, known=()):
     shift_px = np.stack([-told.shift[..., 1], told.shift[..., 0]], -1) / SPACING_M
-    return Ground(np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE), bool), told, shift_px, known)
+    return AssumedGround(np.zeros((SIDE, SIDE)), np.ones((SIDE, SIDE), bool), told, shift_px, known)
 
 
 def ramp_m(east, north):

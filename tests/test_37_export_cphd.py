@@ -10,7 +10,7 @@ from folders import edit_config, make_images, settle_ground
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.formats.export.cphd import Collection, write_cphd
+from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.reading import read_phase_history
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
@@ -137,7 +137,7 @@ def collection(pulses=6, **changes):
     parts = {"time": time, "tx_m": track, "rx_m": track, "frequency_hz": frequency, "path_limit_m": limit_m}
     ground = {"point_m": place, "origin_m": place, "axes": np.stack([east, north, -down])}
     rest = {"area_m": (-5.0, -5.0, 5.0, 5.0), "spacing_m": 0.5, "parameters": {}}
-    return Collection("c f01 a-a", "a-a", **(parts | ground | rest | changes))
+    return CphdCollection("c f01 a-a", "a-a", **(parts | ground | rest | changes))
 
 
 def noise(count):

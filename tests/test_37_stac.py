@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import (
     EXTENSIONS,
-    Acquisition,
+    AcquisitionTime,
     Image,
     asset_of,
     catalog_files,
@@ -26,7 +26,7 @@ from apertura.formats.catalog.validation import document_problem, stac_problems
 from apertura.formats.export.cog import write_slc
 
 START = datetime(2025, 5, 14, 9, 30, tzinfo=UTC)
-FLOWN = Acquisition(START, START + timedelta(seconds=15), 1.4e9, 4e8)
+FLOWN = AcquisitionTime(START, START + timedelta(seconds=15), 1.4e9, 4e8)
 SQUARE = {"type": "Polygon", "coordinates": [[[9, 48], [9.1, 48], [9.1, 48.1], [9, 48.1], [9, 48]]]}
 PLACE = Affine(0.5, 0, 500000, 0, -0.5, 100)
 WKT = CRS("EPSG:32632").to_wkt()
@@ -180,14 +180,14 @@ def test_a_campaign_without_a_place_has_items_without_geometry_and_no_collection
 
 
 def test_a_frequency_between_the_letters_is_stated_without_the_extension(slc):
-    document = item(slc, acquisition=Acquisition(START, START, 0.7e9, 1e8))
+    document = item(slc, acquisition=AcquisitionTime(START, START, 0.7e9, 1e8))
     assert document["properties"]["sar:center_frequency"] == 0.7
     assert EXTENSIONS["sar"] not in document["stac_extensions"]
     assert document_problem(document) is None
 
 
 def test_times_of_a_recording_without_a_clock_say_so(slc):
-    counted = Acquisition(instant(0), instant(10**9), 9.6e9, 6e8)
+    counted = AcquisitionTime(instant(0), instant(10**9), 9.6e9, 6e8)
     assert item(slc, acquisition=counted)["properties"]["apertura:clock"].startswith("none:")
     assert "apertura:clock" not in item(slc)["properties"]
 

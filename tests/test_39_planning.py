@@ -15,7 +15,7 @@ from apertura.core.echo.compression import window_weights
 from apertura.core.focus.engines import load_engine, native, reference
 from apertura.core.focus.engines.native_prediction import path_variants, view_of
 from apertura.core.focus.inputs import Profiles
-from apertura.core.planning.planner import Search, make_plan
+from apertura.core.planning.planner import SettingSearch, make_plan
 from apertura.core.quality.measures import numerical_error
 
 
@@ -61,7 +61,7 @@ def test_measured_errors_lie_from_3_5_db_below_to_1_5_db_above_the_predicted(see
     job, places = draws[0].job, draws[0].grid.positions(0.0)
     exact = np.concatenate([reference.form(drawn.history, places[::5, ::5]).ravel() for drawn in draws])
     for asked in SETTINGS:
-        setting = Search(job, options=asked).settings(len(job.aperture))[0]
+        setting = SettingSearch(job, options=asked).settings(len(job.aperture))[0]
         images = [formed(drawn, setting, drawn.profiles)[::5, ::5].ravel() for drawn in draws]
         error = numerical_error(np.concatenate(images).astype(np.complex64), exact).rms_db
         assert setting.error_db - 3.5 <= error <= setting.error_db + 1.5, setting.line
@@ -206,7 +206,7 @@ def test_which_path_variants_native_takes_is_predicted(spacing_m, range_m, way, 
 @compiled
 def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
     coarse = planning_job(ground_m=20 * ground_points(), spacing_m=0.35)
-    offered = Search(coarse).settings(len(coarse.aperture))
+    offered = SettingSearch(coarse).settings(len(coarse.aperture))
     cheapest = next(setting for setting in offered if setting.engine == "native" and setting.error_db < -50)
     fine = next(s for s in offered if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
     assert cheapest.options["oversampling"] < 6
@@ -217,7 +217,7 @@ def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
 def test_what_costs_no_more_is_made_more_exact():
     """Of settings within 5 % of the time, the most exact: an estimate of the content may be wrong by some dB."""
     planned = plan(-50.0)
-    within = [s for s in Search(planning_job()).settings(300) if s.seconds <= planned.setting.seconds]
+    within = [s for s in SettingSearch(planning_job()).settings(300) if s.seconds <= planned.setting.seconds]
     assert planned.setting.error_db == min(setting.error_db for setting in within)
     cheapest = next(s for s in within if s.error_db <= -56)
     assert planned.setting.seconds <= 1.05 * cheapest.seconds

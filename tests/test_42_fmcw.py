@@ -10,7 +10,7 @@ import yaml
 from folders import ROOT, complaint, edit_config, run_steps
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.quality.point_targets import find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
@@ -20,7 +20,7 @@ from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 
-FAST = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+FAST = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
 """400 MHz about 2.4 GHz in 20 µs: gamma 2e13 Hz/s, real beats to 12.5 MHz, which are 187 m of path."""
 
 NEAR = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
@@ -150,7 +150,7 @@ def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
 
 
 def test_sweeps_so_slow_that_the_antenna_moves_are_flagged(tmp_path):
-    slow = replace(FLIGHT, sweep=Sweep(2.2e9, 400e6, 8e-3, 100e3), sweeps=120)
+    slow = replace(FLIGHT, sweep=FrequencySweep(2.2e9, 400e6, 8e-3, 100e3), sweeps=120)
     campaign = Campaign.load(written(tmp_path, slow))
     flags = recorded_echo(campaign, "f01", "uav1-uav1").attrs["flags"]
     assert set(flags) == {"sweep_motion"}

@@ -13,7 +13,7 @@ from apertura.core.focus.engines import load_engine, reference
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import numerical_error
-from apertura.core.quality.point_targets import Patch, find_peak
+from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.steps import echo
@@ -54,7 +54,7 @@ def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
     assert len(truth) == 4
     for target in truth:
         row, column = map(float, grid.pixel_of(target["x"], target["y"]))
-        mono, bistatic = (Patch(image, round(row), round(column)).at(row, column) for image in cube)
+        mono, bistatic = (BandLimitedPatch(image, round(row), round(column)).at(row, column) for image in cube)
         assert abs(np.angle(mono * np.conj(bistatic))) < 0.1
 
 

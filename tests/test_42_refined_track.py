@@ -26,7 +26,7 @@ from apertura.pipeline.opening.diagnosis import evidence_of, seen_from
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.sightings import Seen, reference_points
+from apertura.pipeline.opening.sightings import RefinementInputs, reference_points
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.steps import echo, image, profile, refine, scene
 from apertura.pipeline.steps.stamping import stamped
@@ -123,7 +123,7 @@ def write_track(campaign, began, correction, *, accepted=True, flags=None):
     std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
     report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
     found = Refinement(correction, std_m, accepted, "as told", report, flags or {})
-    given = Seen(tuple(sightings), {}, (), began)
+    given = RefinementInputs(tuple(sightings), {}, (), began)
     stage = refine.refined_stage(found, FOUND, given, opened)
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
 

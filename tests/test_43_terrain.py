@@ -20,7 +20,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of, plan_pair
-from apertura.pipeline.opening.scene import Ground, expected_scene, open_scene, settled_scene
+from apertura.pipeline.opening.scene import ConfiguredGround, expected_scene, open_scene, settled_scene
 from apertura.pipeline.steps import profile, scene, terrain
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
@@ -269,7 +269,7 @@ def test_a_scene_much_longer_than_wide_lies_at_the_mean_of_its_dem(tiny):
     middle = Campaign.load(tiny).settings.scene.bounds_m
     asked = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
     strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100))
-    assert Ground.of(asked, {"dem": tiny / asked.dem}, crs=strip.crs).level(strip).height_m == 623.0
+    assert ConfiguredGround.of(asked, {"dem": tiny / asked.dem}, crs=strip.crs).level(strip).height_m == 623.0
 
 
 def test_a_void_undeclared_is_no_height_on_earth(tiny):

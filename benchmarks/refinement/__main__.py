@@ -24,7 +24,7 @@ from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import NodePrior, Prior, Refinement
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.refine import refine
-from apertura.methods.autofocus.speckle import Ground, refined_by_speckle, tiles
+from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")
@@ -43,7 +43,7 @@ def by_speckle(one: Case) -> Refinement:
     prior = Prior({node: NodePrior.of(errors, knots_s, np.eye(3)) for node, errors in one.errors.items()})
     pairs = [Blocks.of(sighting, knots_s) for sighting in one.sightings]
     found = tiles(one.sightings, GRID, FlatGround(0.0), lasting_s=lasting_s)
-    return refined_by_speckle(Ground.of(pairs, found), prior, knots_s)
+    return refined_by_speckle(SpeckleTiles.of(pairs, found), prior, knots_s)
 
 
 def left(_: Case) -> Refinement:

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.io import savemat, wavfile
 
 from apertura.common.errors import CampaignError
-from apertura.core.echo.dechirp import Sweep
+from apertura.core.echo.dechirp import FrequencySweep
 from apertura.formats.phase_histories.fmcw import cut_sweeps, joined_sweeps, read_beat_npy, sweeps_of
 from apertura.formats.phase_histories.fmcw_fields import read_beat_fields, read_wav
 
-SWEEP = Sweep(2.26e9, 330e6, 1e-3, 44_100.0)
+SWEEP = FrequencySweep(2.26e9, 330e6, 1e-3, 44_100.0)
 DESCRIBED = {
     **asdict(SWEEP),
     "prf_hz": 500.0,

@@ -15,7 +15,7 @@ from rasterio.transform import from_origin
 from scipy.io import savemat
 
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.formats.export.cphd import Collection, write_cphd
+from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.phase_histories.pulson import MESSAGE
 from apertura.pipeline.config.template import config_template, flights_template
 from apertura.simulation import preset
@@ -300,7 +300,7 @@ def cphd() -> list[bytes]:
     parts = RECORDED["time"].astype("datetime64[ns]"), RECORDED["tx_position"], RECORDED["rx_position"]
     files = []
     for limit_m in (np.inf, 5000.0):
-        collection = Collection(
+        collection = CphdCollection(
             "c f01 a-b",
             "a-b",
             *parts,

@@ -13,7 +13,7 @@ from apertura.common.code_imports import PACKAGE, built_from, import_closure, wi
 _READ_BYTES = 1 << 20
 
 
-class Stage(Protocol):
+class StampedStage(Protocol):
     """What `apertura.pipeline.steps.stamping.stamp` has stamped: its attributes say where it comes from."""
 
     @property
@@ -45,7 +45,7 @@ class Provenance:
     def of(
         cls,
         modules: Sequence[str],
-        parents: Sequence[Stage] | Mapping[str, Stage] = (),
+        parents: Sequence[StampedStage] | Mapping[str, StampedStage] = (),
         *,
         settings: Mapping[str, Any] | None = None,
         inputs: Mapping[str, str] | None = None,

@@ -14,7 +14,7 @@ from apertura.pipeline.config import (
     FLIGHTS,
     SEGMENTS,
     Antenna,
-    Clock,
+    ClockRow,
     Flight,
     Node,
     Segment,
@@ -41,7 +41,7 @@ class Campaign(RawFolder):
 
     flights: tuple[Flight, ...]
     segments: tuple[Segment, ...] = ()
-    clocks: tuple[Clock, ...] = ()
+    clocks: tuple[ClockRow, ...] = ()
 
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
@@ -136,9 +136,9 @@ class Campaign(RawFolder):
             own.setdefault((segment.flight, segment.pair), []).append((segment.start, segment.end))
         return own
 
-    def clock(self, flight: str, node: str) -> Clock:
+    def clock(self, flight: str, node: str) -> ClockRow:
         """Return how a node's recorder stands to its log in a flight."""
-        return self._clocks.get((flight, node), Clock(flight, node))
+        return self._clocks.get((flight, node), ClockRow(flight, node))
 
     def node(self, flight: str, node: str) -> Node:
         """Return the settings of a node as they hold in a flight: what clocks.tsv says of its tags goes first."""
@@ -146,7 +146,7 @@ class Campaign(RawFolder):
         return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
 
     @cached_property
-    def _clocks(self) -> dict[tuple[str, str], Clock]:
+    def _clocks(self) -> dict[tuple[str, str], ClockRow]:
         return {(clock.flight, clock.node): clock for clock in self.clocks}
 
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.echo.dechirp import Sweep
+from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ class FmcwFlight:
         East and north of the middle of the scene, metres from the origin.
     """
 
-    sweep: Sweep
+    sweep: FrequencySweep
     prf_hz: float
     sweeps: int
     nodes: Mapping[str, Place]
@@ -146,7 +146,7 @@ def _write_log(path: Path, flight: FmcwFlight, node: str, epoch_s: Floats) -> No
 
 
 def beat_signal(
-    sweep: Sweep, start_s: Floats, paths: Sequence[Callable[[Floats], Floats]], amplitudes: Sequence[float]
+    sweep: FrequencySweep, start_s: Floats, paths: Sequence[Callable[[Floats], Floats]], amplitudes: Sequence[float]
 ) -> NDArray[np.number]:
     """Return what is recorded of some echoes, sample by sample.
 
@@ -173,7 +173,7 @@ def beat_signal(
     Examples
     --------
     >>> import numpy as np
-    >>> sweep = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+    >>> sweep = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
     >>> beat_signal(sweep, np.zeros(1), [lambda t: np.full_like(t, 60.0)], [1.0]).shape
     (1, 500)
     """
@@ -189,6 +189,6 @@ def beat_signal(
     return total.conj() if sweep.iq == "conjugate" else total
 
 
-def _phase(sweep: Sweep, time_s: Floats) -> Floats:
+def _phase(sweep: FrequencySweep, time_s: Floats) -> Floats:
     """Return the phase of the sweep, radians, a time after it began."""
     return 2 * np.pi * (sweep.start_hz * time_s + sweep.slope_hz_s * time_s**2 / 2)

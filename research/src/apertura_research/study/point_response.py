@@ -59,7 +59,7 @@ def phase_history(
     return PhaseHistory(transfer, frequency_hz, weight, np.zeros(len(transfer)), aperture)
 
 
-def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:
+def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.OversampledTables:
     """Return range tables that cover some metres around every target, (target, 3) float64, for `numba.form`."""
     path_m = history.aperture.path(targets_m)
     step_m, length = range_step(history.frequency_hz, oversampling=2.0)
@@ -77,7 +77,7 @@ def range_tables(history: PhaseHistory, targets_m: Floats) -> numba.Tables:
     return numba.prepare(Profiles(samples, start_m, step_m, centre_hz, oversampling, history.aperture))
 
 
-def undisturbed_tables(scene: PaperScene, *, window: str = "none") -> numba.Tables:
+def undisturbed_tables(scene: PaperScene, *, window: str = "none") -> numba.OversampledTables:
     """Return the range tables of a scene with nothing wrong and without noise."""
     history = phase_history(scene, receive_undisturbed(scene), window=window)
     return range_tables(history, scene.scatterers.position_m)
@@ -95,13 +95,13 @@ def random_pixels(generator: Generator) -> Floats:
     return np.column_stack([along_m, across_m, np.zeros(256)])[None]
 
 
-def mean_image(tables: numba.Tables, pixels_m: Floats) -> Complexes:
+def mean_image(tables: numba.OversampledTables, pixels_m: Floats) -> Complexes:
     """Return the image at (y, x, 3) pixels, per pulse."""
     return np.asarray(numba.form(tables, pixels_m) / len(tables.start_m), np.complex64)
 
 
 def find_peaks(
-    tables: numba.Tables, targets_m: Floats, *, reach_m: tuple[float, float] = REACH_M
+    tables: numba.OversampledTables, targets_m: Floats, *, reach_m: tuple[float, float] = REACH_M
 ) -> tuple[Floats, Floats]:
     """Return positions (target, 3) and magnitudes (target,) of the maxima near each target.
 
@@ -112,7 +112,7 @@ def find_peaks(
     return np.stack([position for position, _ in peaks]), np.array([level for _, level in peaks])
 
 
-def _find_peak(tables: numba.Tables, target_m: Floats, reach_m: tuple[float, float]) -> tuple[Floats, float]:
+def _find_peak(tables: numba.OversampledTables, target_m: Floats, reach_m: tuple[float, float]) -> tuple[Floats, float]:
     def level(along_m: Floats, across_m: Floats) -> Floats:
         return np.abs(mean_image(tables, np.stack([along_m, across_m, np.full_like(along_m, target_m[2])], axis=-1)))
 

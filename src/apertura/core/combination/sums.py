@@ -68,7 +68,7 @@ LEAST_COHERENCE = 0.5
 
 
 @dataclass(frozen=True)
-class Fusion:
+class CoherentSum:
     """What the coherent sum holds.
 
     Attributes
@@ -94,7 +94,7 @@ class Fusion:
 
 def choose_fusion(
     reference: str, found: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
-) -> Fusion:
+) -> CoherentSum:
     """Return which pairs add coherently to the reference.
 
     Parameters
@@ -129,7 +129,7 @@ def choose_fusion(
                 left_out[pair] = f"{line}; processing.fusion.align_phase takes it off"
             else:
                 phases[pair], why[pair] = 0.0, line
-    return Fusion(phases, left_out, why)
+    return CoherentSum(phases, left_out, why)
 
 
 # ---- What the pairs of one flight add up to ------------------------------------------------------------------------

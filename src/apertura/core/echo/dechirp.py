@@ -26,7 +26,7 @@ _FASTEST = 95.0
 
 
 @dataclass(frozen=True)
-class Sweep:
+class FrequencySweep:
     """A linear sweep of frequency, and how its echoes are mixed and sampled.
 
     Attributes
@@ -48,7 +48,7 @@ class Sweep:
 
     Examples
     --------
-    >>> sweep = Sweep(2.2e9, 400e6, 20e-6, 25e6)
+    >>> sweep = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
     >>> sweep.samples, round(sweep.path_limit_m, 1)
     (500, 187.4)
     """
@@ -115,7 +115,7 @@ class Sweep:
 
 
 def transfer_of(
-    beat: NDArray[np.number], sweep: Sweep, *, late_s: NDArray[np.float64] | None = None, deskewed: bool = True
+    beat: NDArray[np.number], sweep: FrequencySweep, *, late_s: NDArray[np.float64] | None = None, deskewed: bool = True
 ) -> NDArray[np.complex64]:
     """Return the transfer functions that beat signals are samples of, without residual video phase.
 
@@ -143,7 +143,7 @@ def transfer_of(
     Examples
     --------
     >>> import numpy as np
-    >>> sweep = Sweep(1e9, 200e6, 1e-3, 2e6, iq="complex")
+    >>> sweep = FrequencySweep(1e9, 200e6, 1e-3, 2e6, iq="complex")
     >>> t, tau = np.arange(2000) / 2e6, 2e-7
     >>> beat = np.exp(-2j * np.pi * (1e9 + 2e11 * t) * tau + 1j * np.pi * 2e11 * tau**2)
     >>> ratio = transfer_of(beat[None], sweep)[0] * np.exp(2j * np.pi * sweep.frequency_hz * tau)

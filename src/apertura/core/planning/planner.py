@@ -32,7 +32,7 @@ _TILE_S = 4.0e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class SettingSearch:
     """What every choice of a setting looks at.
 
     Attributes
@@ -208,7 +208,7 @@ def make_plan(
     terrain = decide_terrain(job, asked=asked.get("terrain"), where=where)
     if job.patches_on is not None:
         job = replace(job, patches_m=job.patches_on(job.terrain.called(str(terrain.value))))
-    search = Search(job, asked.get("engine"), asked.get("engine_options", {}), asked.get("pulse_blocks"), where)
+    search = SettingSearch(job, asked.get("engine"), asked.get("engine_options", {}), asked.get("pulse_blocks"), where)
     every_pulse = search.cheapest(len(job.aperture), accuracy_db - MARGIN_DB)
     presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, asked.get("presum"))
     antennas, missed = decide_antennas(job.beams, job.illumination)
@@ -248,7 +248,7 @@ def make_plan(
 
 
 def _decide_presum(
-    search: Search, every_pulse: Setting, accuracy_db: float, asked: int | None
+    search: SettingSearch, every_pulse: Setting, accuracy_db: float, asked: int | None
 ) -> tuple[Decision, Presum | None, Setting]:
     """Return the decision, the low-pass sum over pulses, and the setting with it."""
     job, pulses = search.job, len(search.job.aperture)

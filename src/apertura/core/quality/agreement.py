@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.quality.bright_points import BrightPoint, common_shift
-from apertura.core.quality.measures import Raster
-from apertura.core.quality.point_targets import Patch
+from apertura.core.quality.measures import BlockRaster
+from apertura.core.quality.point_targets import BandLimitedPatch
 
 REACH_M = 4.0
 """Shifts between two images up to this, or a dozen cells, are looked for."""
@@ -75,7 +75,7 @@ class Agreement:
 
 
 def agreement(
-    images: tuple[Raster, Raster],
+    images: tuple[BlockRaster, BlockRaster],
     points: tuple[Sequence[BrightPoint], Sequence[BrightPoint]],
     *,
     spacing_m: float,
@@ -144,11 +144,11 @@ def agreement(
     )
 
 
-def _between(images: tuple[Raster, Raster], first: BrightPoint, second: BrightPoint) -> list[complex]:
+def _between(images: tuple[BlockRaster, BlockRaster], first: BrightPoint, second: BrightPoint) -> list[complex]:
     """Return both images halfway between their peaks."""
     row, column = (first.row + second.row) / 2, (first.column + second.column) / 2
     return [
-        complex(Patch(image, round(row), round(column), point.carrier).at(row, column))
+        complex(BandLimitedPatch(image, round(row), round(column), point.carrier).at(row, column))
         for image, point in zip(images, (first, second), strict=True)
     ]
 

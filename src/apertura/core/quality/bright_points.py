@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
-from apertura.core.quality.measures import Raster
+from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
 MOST_POINTS = 16
@@ -41,7 +41,7 @@ class BrightPoint:
     carrier: tuple[float, float] | None = None
 
 
-def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:
+def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:
     """Return the brightest local maxima that stand apart, brightest first.
 
     Parameters
@@ -76,7 +76,7 @@ def bright_points(image: Raster, windows: Iterable[Window], *, apart_px: int) ->
     return [_bright_point(image, row, column) for _, row, column in kept]
 
 
-def shows_point(image: Raster, row: int, column: int, *, reach: int) -> bool:
+def shows_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
     """Return whether an image has a pixel 10 dB above what lies about it within `reach` pixels of a place.
 
     Examples
@@ -95,7 +95,7 @@ def shows_point(image: Raster, row: int, column: int, *, reach: int) -> bool:
     return bool(here.size and here.max() ** 2 > _SHOWN * np.median(about.astype(np.float64) ** 2) / np.log(2))
 
 
-def _bright_point(image: Raster, row: int, column: int) -> BrightPoint:
+def _bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
     peak = find_peak(image, row, column)
     about = tuple(slice(max(0, at - PATCH_PX // 2), at + PATCH_PX // 2) for at in (row, column))
     power = np.abs(np.nan_to_num(np.asarray(image[about[0], about[1]]))).astype(np.float64) ** 2

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
-from apertura.core.quality.measures import Raster
+from apertura.core.quality.measures import BlockRaster
 
 # ---- How far an image is from the exact sum: estimated from drawn pixels, with an upper bound at 95 % confidence
 
@@ -145,7 +145,7 @@ class Brightness:
     pixels: int
 
     @classmethod
-    def of(cls, image: Raster, windows: Sequence[Window]) -> "Brightness":
+    def of(cls, image: BlockRaster, windows: Sequence[Window]) -> "Brightness":
         """Return that of a (y, x) complex image, tile by tile; NaN counts as dark."""
         sums = []
         for window in windows:
@@ -180,7 +180,7 @@ class Brightness:
         return np.asarray((level**2 / self.power.sum() + level / self.level.sum()) / 2)
 
     def draw(
-        self, image: Raster, windows: Sequence[Window], count: int, generator: np.random.Generator
+        self, image: BlockRaster, windows: Sequence[Window], count: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
         """Return pixels drawn by their brightness, (count, 2) int64; none of an image that is dark everywhere."""
         if not (count and self.power.any()):
@@ -221,7 +221,7 @@ class Certificate:
     pixels: NDArray[np.int64]
     exact: NDArray[np.complex128]
 
-    def failing(self, image: Raster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
+    def failing(self, image: BlockRaster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
         """Return (tiles without a drawn pixel, tiles worse than asked); both empty when all tiles pass.
 
         A tile is worse when the mean squared difference at its pixels exceeds the accuracy times `power`, the mean
@@ -240,7 +240,7 @@ class Certificate:
         return (empty if worse else []), worse
 
     def error(
-        self, image: Raster, brightness: Brightness, bright: NDArray[np.int64], exact: NDArray[np.complex128]
+        self, image: BlockRaster, brightness: Brightness, bright: NDArray[np.int64], exact: NDArray[np.complex128]
     ) -> ErrorBound:
         """Return the error of the whole image, from its random pixels and `bright` ones drawn by `brightness`.
 
@@ -258,7 +258,7 @@ def _inside(pixels: NDArray[np.int64], window: Window) -> NDArray[np.bool_]:
     return np.asarray(((pixels >= first) & (pixels < last)).all(axis=1))
 
 
-def values_at(image: Raster, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
+def values_at(image: BlockRaster, pixels: NDArray[np.int64]) -> NDArray[np.complex64]:
     """Return an image at (pixel, 2) rows and columns, 0 where no pulse made it; each block of it is read once."""
     values, blocks = np.empty(len(pixels), np.complex64), pixels // _BLOCK_PX
     for block in np.unique(blocks, axis=0):

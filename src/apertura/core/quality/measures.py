@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 # ---- How good an image is as a whole: numerical error, entropy, coherence, noise floor -----------------------------
 
 
-class Raster(Protocol):
+class BlockRaster(Protocol):
     """A 2-D array that gives numpy blocks: numpy or zarr."""
 
     @property
@@ -99,7 +99,7 @@ class Survey:
 _BINS_PER_DB, _LOWEST_DB, _HIGHEST_DB = 100, -300, 300
 
 
-def survey(image: Raster, windows: Iterable[tuple[slice, slice]]) -> Survey:
+def survey(image: BlockRaster, windows: Iterable[tuple[slice, slice]]) -> Survey:
     """Return entropy, noise floor and peak of an image, one window at a time.
 
     Parameters
@@ -205,7 +205,7 @@ class Amplitude:
     array([[3.+0.j]], dtype=complex64)
     """
 
-    power: Raster
+    power: BlockRaster
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apertura.core.quality.measures import Raster
+from apertura.core.quality.measures import BlockRaster
 
 PATCH_PX = 64
 
@@ -14,7 +14,7 @@ _REFINEMENTS = 7
 """From one pixel to a grid of 6e-5 pixel in steps of four."""
 
 
-class Patch:
+class BandLimitedPatch:
     """A square of an image as the band-limited function it samples.
 
     Parameters
@@ -34,7 +34,7 @@ class Patch:
     real and imaginary parts would not do: the carrier turns by more than a radian per pixel.
     """
 
-    def __init__(self, image: Raster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
+    def __init__(self, image: BlockRaster, row: int, column: int, carrier: tuple[float, float] | None = None) -> None:
         rows, columns = (_span(at, size) for at, size in zip((row, column), image.shape, strict=True))
         self._first = np.array([rows.start, columns.start], np.float64)
         square = np.nan_to_num(np.asarray(image[rows, columns])).astype(np.complex128)
@@ -83,7 +83,7 @@ class Peak:
     value: complex
 
 
-def find_peak(image: Raster, row: int, column: int) -> Peak:
+def find_peak(image: BlockRaster, row: int, column: int) -> Peak:
     """Return the maximum of the interpolated magnitude near a pixel.
 
     Parameters
@@ -101,7 +101,7 @@ def find_peak(image: Raster, row: int, column: int) -> Peak:
     >>> round(peak.row, 1), round(peak.column, 1)
     (30.3, 33.6)
     """
-    patch = Patch(image, row, column)
+    patch = BandLimitedPatch(image, row, column)
     at, _ = locate_maximum(lambda *pixels: np.abs(patch.at(*pixels)), (row, column), (1.0, 1.0), rounds=_REFINEMENTS)
     return Peak(*at, complex(patch.at(*at)))
 
@@ -162,7 +162,7 @@ class Cut:
 
 
 def cut_through(
-    image: Raster,
+    image: BlockRaster,
     peak: Peak,
     *,
     direction: tuple[float, float],
@@ -210,7 +210,7 @@ def cut_through(
 
 
 def line_through(
-    image: Raster, peak: Peak, *, direction: tuple[float, float], spacing_m: float, reach_m: float
+    image: BlockRaster, peak: Peak, *, direction: tuple[float, float], spacing_m: float, reach_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return distances from a peak along a line, metres, and the power there, (sample,) float64 each.
 
@@ -223,7 +223,7 @@ def line_through(
     >>> along_m.size, round(float(along_m[-1]), 6), power[along_m.size // 2].round(3), power[-1].round(3)
     (513, 0.8, np.float64(1.0), np.float64(0.0))
     """
-    patch = Patch(image, round(peak.row), round(peak.column))
+    patch = BandLimitedPatch(image, round(peak.row), round(peak.column))
     reach = min(reach_m, (PATCH_PX // 2 - 1) * spacing_m)
     along = np.linspace(-reach, reach, 1 + 2 * int(np.ceil(32 * reach / spacing_m)))
     east, north = np.array(direction) / np.hypot(*direction)

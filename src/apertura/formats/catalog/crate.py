@@ -34,7 +34,7 @@ class Listed:
 
 
 @dataclass(frozen=True)
-class Job:
+class CrateJob:
     """One rule that ran, once.
 
     Attributes
@@ -71,7 +71,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Run:
+class CrateRun:
     """What a crate tells.
 
     Attributes
@@ -94,7 +94,7 @@ class Run:
     recorded_until: str
     software: Mapping[str, str]
     lock_sha256: str
-    jobs: Sequence[Job]
+    jobs: Sequence[CrateJob]
     inputs: Sequence[Listed]
     workflow: Sequence[Listed]
 
@@ -122,15 +122,16 @@ _LICENCE = "#licence"
 _RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
 
 
-def crate_document(run: Run) -> dict[str, Any]:
+def crate_document(run: CrateRun) -> dict[str, Any]:
     """Return the metadata document of a run; the same run gives the same document.
 
     Examples
     --------
     >>> image = Listed("f01/a-b/db.tif", "0" * 64, 10)
-    >>> job = Job("export", ["f01", "a-b"], "apertura step export f01 a-b", "1" * 64, {}, [], [image])
+    >>> job = CrateJob("export", ["f01", "a-b"], "apertura step export f01 a-b", "1" * 64, {}, [], [image])
     >>> rules = [Listed(WORKFLOW, "2" * 64, 10)]
-    >>> run = Run("tandem", "2025-05-14T09:30:00Z", {"apertura": "1", "snakemake": "9"}, "3" * 64, [job], [], rules)
+    >>> versions = {"apertura": "1", "snakemake": "9"}
+    >>> run = CrateRun("tandem", "2025-05-14T09:30:00Z", versions, "3" * 64, [job], [], rules)
     >>> told = {entity["@id"]: entity for entity in crate_document(run)["@graph"]}
     >>> told["#job/export/f01/a-b"]["result"], told["f01/a-b/db.tif"]["sha256"][:4]
     ({'@id': 'f01/a-b/db.tif'}, '0000')
@@ -159,7 +160,7 @@ def input_id(name: str) -> str:
     return f"#input/{quote(name)}"
 
 
-def _root(run: Run, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     about = (
         f"Images of the campaign {run.campaign}, with every step from its recordings to them. Recordings and config "
         "are named by hash and lie in the folder above. Actions have no times and datePublished is when the last pulse "
@@ -178,7 +179,7 @@ def _root(run: Run, parts: Sequence[str], actions: Sequence[Mapping[str, Any]]) 
     }
 
 
-def _software(run: Run) -> Iterator[dict[str, Any]]:
+def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
     for uri, name in _PROFILES.items():
         yield {"@id": uri, "@type": "CreativeWork", "name": name, "version": uri.rpartition("/")[2]}
     yield {
@@ -199,7 +200,7 @@ def _software(run: Run) -> Iterator[dict[str, Any]]:
     yield {"@id": "#snakemake", "@type": "ComputerLanguage", "name": "Snakemake", "version": run.software["snakemake"]}
 
 
-def _steps(run: Run) -> Iterator[dict[str, Any]]:
+def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
     """Yield the workflow, its steps, and the tools that they are: one for each rule and code that ran."""
     tools: dict[str, dict[str, str]] = {}
     for job in run.jobs:
@@ -231,7 +232,7 @@ def _steps(run: Run) -> Iterator[dict[str, Any]]:
             }
 
 
-def _jobs(run: Run) -> Iterator[dict[str, Any]]:
+def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
     """Yield every action, and the parameters that actions share."""
     made = [_id(file) for job in run.jobs for file in job.files if file.name.endswith(".manifest.json")]
     all_of_it = {
@@ -276,7 +277,7 @@ def _jobs(run: Run) -> Iterator[dict[str, Any]]:
         }
 
 
-def _data(run: Run) -> tuple[list[str], list[dict[str, Any]]]:
+def _data(run: CrateRun) -> tuple[list[str], list[dict[str, Any]]]:
     """Return what lies directly in the root, and all files and stages of the results."""
     stages: dict[str, list[str]] = {}
     tops, entities = [], []
@@ -313,7 +314,7 @@ def _parameter(name: str, value: object) -> dict[str, Any]:
     }
 
 
-def _tool(job: Job) -> str:
+def _tool(job: CrateJob) -> str:
     return f"#tool/{job.rule}/{job.code_sha256[:16]}"
 
 

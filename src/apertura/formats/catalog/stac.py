@@ -45,7 +45,7 @@ _NO_CLOCK = "none: the recording carries no time of day, so times count pulses f
 
 
 @dataclass(frozen=True)
-class Acquisition:
+class AcquisitionTime:
     """When an image was recorded, and on which frequencies.
 
     Attributes
@@ -79,13 +79,14 @@ class Acquisition:
         }
 
     @classmethod
-    def together(cls, parts: Sequence["Acquisition"]) -> "Acquisition":
+    def together(cls, parts: Sequence["AcquisitionTime"]) -> "AcquisitionTime":
         """Return that of a sum: from the first pulse to the last, over all frequencies.
 
         Examples
         --------
         >>> day = [datetime(2025, 5, 14, hour, tzinfo=UTC) for hour in range(4)]
-        >>> both = Acquisition.together([Acquisition(*day[:2], 1.3e9, 2e8), Acquisition(*day[1:3], 1.5e9, 2e8)])
+        >>> low, high = AcquisitionTime(*day[:2], 1.3e9, 2e8), AcquisitionTime(*day[1:3], 1.5e9, 2e8)
+        >>> both = AcquisitionTime.together([low, high])
         >>> both.end.hour, both.centre_hz, both.bandwidth_hz
         (2, 1400000000.0, 400000000.0)
         """
@@ -163,7 +164,7 @@ _ROLES_OF_TYPE: Mapping[str, tuple[str, ...]] = {".tif": ("data",), ".qml": ("st
 
 
 @dataclass(frozen=True)
-class Told:
+class FileFacts:
     """What a file says of itself.
 
     Attributes
@@ -203,7 +204,7 @@ def media_type(name: str) -> str:
     return MEDIA_TYPES.get(Path(name).suffix, UNKNOWN_TYPE)
 
 
-def told_by(path: Path) -> Told:
+def told_by(path: Path) -> FileFacts:
     """Return what a file says of itself; of a GeoTIFF its bands and what it was made from.
 
     Raises
@@ -212,14 +213,14 @@ def told_by(path: Path) -> Told:
         If it is called a GeoTIFF and cannot be opened as one.
     """
     if path.suffix != ".tif":
-        return Told(path.name)
+        return FileFacts(path.name)
     expected, remedy = "a GeoTIFF of the workflow", "Delete the manifest beside it and run the workflow again."
     try:
         with opened_raster(path, expected=expected, remedy=remedy) as raster:
             bands = [_band(raster, number) for number in range(raster.count)]
             told = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
             inputs = {str(name): str(digest) for name, digest in told.items()}
-            return Told(raster.descriptions[0] or path.name, bands, inputs)
+            return FileFacts(raster.descriptions[0] or path.name, bands, inputs)
     except (ValueError, AttributeError) as error:
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
 
@@ -238,7 +239,7 @@ def _band(raster: Any, number: int) -> dict[str, Any]:
     return band
 
 
-def asset_of(path: Path, href: str, *, sha256: str, told: Told) -> pystac.Asset:
+def asset_of(path: Path, href: str, *, sha256: str, told: FileFacts) -> pystac.Asset:
     """Return the asset of a file.
 
     Parameters
@@ -296,7 +297,7 @@ class Image:
     name: str
     title: str
     geometry: Mapping[str, Any] | None
-    acquisition: Acquisition
+    acquisition: AcquisitionTime
     properties: Mapping[str, Any]
     assets: Mapping[str, pystac.Asset] = field(default_factory=dict)
     inputs: Mapping[str, str] = field(default_factory=dict)
@@ -322,7 +323,7 @@ def item_of(image: Image, root: str) -> pystac.Item:
     --------
     >>> from datetime import timedelta
     >>> start = datetime(2025, 5, 14, 9, tzinfo=UTC)
-    >>> flown = Acquisition(start, start + timedelta(seconds=20), 1.4e9, 4e8)
+    >>> flown = AcquisitionTime(start, start + timedelta(seconds=20), 1.4e9, 4e8)
     >>> square = {"type": "Polygon", "coordinates": [[[9, 48], [9.1, 48], [9.1, 48.1], [9, 48.1], [9, 48]]]}
     >>> item = item_of(Image("f01", "a-b", "a scene", square, flown, {}), "../../..")
     >>> item.id, item.bbox, item.datetime.isoformat(), item.properties["sar:frequency_band"]

@@ -28,7 +28,7 @@ BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster unt
 Pixels = NDArray[Any]
 
 
-class Raster(Protocol):
+class NorthUpRaster(Protocol):
     """A 2-D array with row 0 in the north: numpy, dask, zarr or xarray."""
 
     @property
@@ -67,7 +67,7 @@ POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 
 
 def write_slc(
-    path: Path, image: Raster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the complex image as it is, carrier kept, as a CFloat32 COG.
 
@@ -114,14 +114,14 @@ def write_slc(
 
 
 def write_power(
-    path: Path, image: Raster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write |image|² as a float32 COG; overviews average the power. Parameters and errors as `write_slc`."""
     write_cog(path, image, POWER, transform=transform, crs=crs, tags=tags, title=title, value=power)
 
 
 def write_magnitude(
-    path: Path, image: Raster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write a real raster of magnitudes as a float32 COG. Parameters and errors as `write_slc`."""
     write_cog(path, image, MAGNITUDE, transform=transform, crs=crs, tags=tags, title=title)
@@ -129,7 +129,7 @@ def write_magnitude(
 
 def write_cog(
     path: Path,
-    image: Raster,
+    image: NorthUpRaster,
     band: Band,
     *,
     transform: Affine,
@@ -167,7 +167,7 @@ def write_cog(
             check_written(temporary, checksum, words)
 
 
-def size_of(image: Raster, band: Band) -> int:
+def size_of(image: NorthUpRaster, band: Band) -> int:
     """Return the bytes of the pixels of a file."""
     return int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
 
@@ -192,7 +192,7 @@ def complex_only(image: Pixels) -> Pixels:
     return image
 
 
-def placed(image: Raster, transform: Affine, crs: str) -> dict[str, Any]:
+def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
     """Return size and georeference as rasterio names them."""
     if len(image.shape) != 2:
         raise ContractError(f"image to export has shape {image.shape}, not (y, x)")

@@ -32,7 +32,7 @@ _RECORD = (
 
 
 @dataclass(frozen=True, eq=False)
-class Collection:
+class CphdCollection:
     """What a pair recorded, without its samples.
 
     Attributes
@@ -152,7 +152,7 @@ _NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _CHANNEL = "1"
 
 
-def write_cphd(path: Path, collection: Collection, blocks: Iterable[NDArray[np.complex64]]) -> None:
+def write_cphd(path: Path, collection: CphdCollection, blocks: Iterable[NDArray[np.complex64]]) -> None:
     """Write a CPHD file, beside and renamed.
 
     Parameters
@@ -162,8 +162,8 @@ def write_cphd(path: Path, collection: Collection, blocks: Iterable[NDArray[np.c
     collection
         All but the samples.
     blocks
-        Transfer functions referred to `Collection.reference_delay_s`, (pulse, subcarrier) complex64, some pulses at a
-        time, in order.
+        Transfer functions referred to `CphdCollection.reference_delay_s`, (pulse, subcarrier) complex64, some pulses
+        at a time, in order.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def write_cphd(path: Path, collection: Collection, blocks: Iterable[NDArray[np.c
             raise ValueError(f"{written} pulses: must be {len(pulses)}")
 
 
-def _document(collection: Collection, pulses: NDArray[Any]) -> Any:
+def _document(collection: CphdCollection, pulses: NDArray[Any]) -> Any:
     """Return the XML, whose reference geometry sarkit works out."""
     from lxml import etree
     from sarkit import cphd
@@ -210,7 +210,7 @@ def _document(collection: Collection, pulses: NDArray[Any]) -> Any:
     return tree
 
 
-def _identity(collection: Collection) -> dict[str, Any]:
+def _identity(collection: CphdCollection) -> dict[str, Any]:
     tx, rx = collection.pair.split("-")
     return {
         "CollectorName": rx,
@@ -224,7 +224,7 @@ def _identity(collection: Collection) -> dict[str, Any]:
     }
 
 
-def _overall(collection: Collection, pulses: NDArray[Any]) -> dict[str, Any]:
+def _overall(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]:
     first, last = collection.swath_s
     began: datetime = collection.start.astype("datetime64[us]").item()
     return {
@@ -236,7 +236,7 @@ def _overall(collection: Collection, pulses: NDArray[Any]) -> dict[str, Any]:
     }
 
 
-def _scene(collection: Collection) -> dict[str, Any]:
+def _scene(collection: CphdCollection) -> dict[str, Any]:
     west, south, east, north = collection.area_m
     corners = [(west, south), (west, north), (east, north), (east, south)]  # clockwise
     places = [collection.origin_m + np.array(corner) @ collection.axes[:2] for corner in corners]
@@ -255,7 +255,7 @@ def _scene(collection: Collection) -> dict[str, Any]:
     }
 
 
-def _sizes(collection: Collection, pulses: NDArray[Any]) -> dict[str, Any]:
+def _sizes(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]:
     return {
         "SignalArrayFormat": "CF8",
         "NumBytesPVP": pulses.itemsize,
@@ -273,7 +273,7 @@ def _sizes(collection: Collection, pulses: NDArray[Any]) -> dict[str, Any]:
     }
 
 
-def _channel(collection: Collection, pulses: NDArray[Any]) -> dict[str, Any]:
+def _channel(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]:
     (first, last), frequency = collection.swath_s, collection.frequency_hz
     parameters = {
         "Identifier": _CHANNEL,
@@ -302,7 +302,7 @@ def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
     return {**fields, **({"AddedPVP": added} if added else {})}
 
 
-def _dwell(collection: Collection) -> dict[str, Any]:
+def _dwell(collection: CphdCollection) -> dict[str, Any]:
     """Return when and how long a place of the scene is seen: by all pulses."""
     seen = collection.seen_s
     return {

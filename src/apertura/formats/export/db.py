@@ -14,8 +14,8 @@ from apertura.formats.export.cog import (
     BLOCK,
     POWER,
     Band,
+    NorthUpRaster,
     Pixels,
-    Raster,
     described,
     fill,
     finish,
@@ -30,7 +30,7 @@ DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
 
 
 def write_db(
-    path: Path, image: Raster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write 20 log10 |image| as a float32 COG whose overviews are the dB of averaged power.
 

@@ -11,7 +11,7 @@ from rasterio import Affine
 from rasterio.transform import array_bounds
 
 from apertura.common.atomic import replacement
-from apertura.formats.export.cog import Band, Raster, placed, write_cog
+from apertura.formats.export.cog import Band, NorthUpRaster, placed, write_cog
 from apertura.formats.export.map_layout import DPI, PICTURE_DOTS, MapLayout
 from apertura.formats.export.quicklook import crs_name, footer
 
@@ -30,28 +30,28 @@ _PANELS = (  # key, words, colours, their ends
 
 
 def write_phase(
-    path: Path, phase_rad: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, phase_rad: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the wrapped phase, (y, x) float32 rad; overviews take single pixels. Else as `write_height`."""
     write_cog(path, phase_rad, PHASE, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_coherence(
-    path: Path, magnitude: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, magnitude: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write coherence as estimated, (y, x) float32, 0 to 1. Else as `write_height`."""
     write_cog(path, magnitude, COHERENCE, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_unwrapped(
-    path: Path, phase_rad: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, phase_rad: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the phase that height alone has, (y, x) float32 rad. Else as `write_height`."""
     write_cog(path, phase_rad, UNWRAPPED, transform=transform, crs=crs, tags=tags, title=title)
 
 
 def write_height(
-    path: Path, height_m: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, height_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write heights, (y, x) float32 metres, NaN where none is told. Else as `apertura.formats.export.cog.write_slc`.
 
@@ -70,7 +70,7 @@ def write_height(
 
 
 def write_height_std(
-    path: Path, std_m: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, std_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the standard deviation of heights, (y, x) float32 metres. Else as `write_height`."""
     write_cog(path, std_m, HEIGHT_STD, transform=transform, crs=crs, tags=tags, title=title)

@@ -7,7 +7,7 @@ import numpy as np
 from rasterio import Affine
 
 from apertura.common.errors import ContractError
-from apertura.formats.export.cog import Band, Pixels, Raster, write_cog
+from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, write_cog
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
 """Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
@@ -36,7 +36,7 @@ NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: rel
 
 
 def write_incidence(
-    path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the incidence angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
     check = _only("float32")
@@ -44,7 +44,7 @@ def write_incidence(
 
 
 def write_bistatic_angle(
-    path: Path, angle_deg: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
     check = _only("float32")
@@ -52,7 +52,7 @@ def write_bistatic_angle(
 
 
 def write_mask(
-    path: Path, bits: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, bits: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write where the image is in shadow or layover, (y, x) uint8 sums of `SHADOW` and `LAYOVER`, or `OUTSIDE`.
 
@@ -74,14 +74,14 @@ def write_mask(
 
 
 def write_looks(
-    path: Path, looks: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, looks: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `cog.write_slc`."""
     write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 
 def write_nesz(
-    path: Path, noise_db: Raster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path, noise_db: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`."""
     write_cog(path, noise_db, NESZ, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))

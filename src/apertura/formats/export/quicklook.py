@@ -13,7 +13,7 @@ from rasterio import Affine
 from rasterio.transform import array_bounds
 
 from apertura.common.atomic import replacement
-from apertura.formats.export.cog import Raster, placed, power
+from apertura.formats.export.cog import NorthUpRaster, placed, power
 from apertura.formats.export.db import decibels
 from apertura.formats.export.map_layout import DPI, PICTURE_DOTS, MapLayout, Marker
 from apertura.formats.export.writing import READ
@@ -21,7 +21,7 @@ from apertura.formats.export.writing import READ
 
 def write_quicklook(
     path: Path,
-    image: Raster,
+    image: NorthUpRaster,
     *,
     transform: Affine,
     crs: str,
@@ -139,7 +139,7 @@ def _focus_words(tags: Mapping[str, str]) -> list[str]:
     return [f"focus: {focus['verdict']}{loss}"]
 
 
-def shrink(image: Raster, most: int) -> tuple[NDArray[np.float64], int]:
+def shrink(image: NorthUpRaster, most: int) -> tuple[NDArray[np.float64], int]:
     """Return the mean power of square groups of pixels, so few that neither side exceeds `most`.
 
     Parameters

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.core.echo.dechirp import Sweep, transfer_of
+from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
 from apertura.formats.times import utc_times
@@ -117,9 +117,9 @@ def sweeps_of(path: Path, found: Mapping[str, NDArray[Any]]) -> Sweeps:
     return Sweeps(path, found["beat"], _times(found["time"], path) if "time" in found else None)
 
 
-def sweep_of(described: Mapping[str, Any]) -> Sweep:
+def sweep_of(described: Mapping[str, Any]) -> FrequencySweep:
     """Return what section `waveform` says of the sweep."""
-    return Sweep(**{field.name: described[field.name] for field in fields(Sweep)})
+    return FrequencySweep(**{field.name: described[field.name] for field in fields(FrequencySweep)})
 
 
 def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
@@ -179,7 +179,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     )
 
 
-def _check(one: Sweeps, sweep: Sweep) -> None:
+def _check(one: Sweeps, sweep: FrequencySweep) -> None:
     beat = one.beat
     if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.whole or not len(beat):
         raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.whole} samples", one.path)
@@ -332,7 +332,7 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
     return at
 
 
-def _whole(starts: NDArray[np.float64], sweep: Sweep, count: int) -> NDArray[np.bool_]:
+def _whole(starts: NDArray[np.float64], sweep: FrequencySweep, count: int) -> NDArray[np.bool_]:
     """Return which sweeps end before the next trigger and the file do."""
     ends = np.ceil(starts).astype(np.int64) + sweep.whole
     following = np.append(np.ceil(starts[1:]), count)

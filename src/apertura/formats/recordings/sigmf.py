@@ -50,7 +50,7 @@ FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_. ()-]{0,199}$
 Frequency = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
-class Framing(BaseModel):
+class SigmfFraming(BaseModel):
     """What was sent before each symbol."""
 
     preamble: str = Field(min_length=1, max_length=200)
@@ -70,7 +70,7 @@ class Global(BaseModel):
     num_channels: int = Field(1, alias="core:num_channels", ge=1, le=64, strict=True)
     sha512: str | None = Field(None, alias="core:sha512", pattern="^[0-9a-fA-F]{128}$")
     channels: list[ChannelName] | None = Field(None, alias="apertura:channels")
-    framing: Framing | None = Field(None, alias="apertura:framing")
+    framing: SigmfFraming | None = Field(None, alias="apertura:framing")
     if_hz: Frequency | None = Field(None, alias="apertura:if_hz")
     dataset: FileName | None = Field(None, alias="core:dataset")
     trailing_bytes: Count = Field(0, alias="core:trailing_bytes")
@@ -193,7 +193,7 @@ class _Stream(BaseModel):
     sha512: Annotated[str, Field(alias="hash", pattern="^[0-9a-fA-F]{128}$")]
 
 
-class Collection(BaseModel):
+class SigmfCollection(BaseModel):
     """The collection object."""
 
     version: str = Field(alias="core:version")
@@ -242,11 +242,11 @@ def check_listed(meta_path: Path) -> None:
                 )
 
 
-def _collections(folder: Path) -> Iterator[tuple[Path, Collection]]:
+def _collections(folder: Path) -> Iterator[tuple[Path, SigmfCollection]]:
     for found in sorted(folder.glob(f"*{_SUFFIX}")):
         path = inside(folder, found.name, where=folder)
         document = read_json(path, expected=_A_COLLECTION, remedy=_CORRECT_IT)
-        collection = of_sigmf(TypeAdapter(Collection), document.get("collection"), path, "collection")
+        collection = of_sigmf(TypeAdapter(SigmfCollection), document.get("collection"), path, "collection")
         listed = {stream.name for stream in collection.streams}
         for node, name in collection.nodes.items():
             if name not in listed:

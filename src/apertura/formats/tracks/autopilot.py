@@ -23,7 +23,7 @@ _MOST_AGREE = 0.9
 
 
 @dataclass(frozen=True)
-class Clock:
+class BootClock:
     """The autopilot's clock against UTC: UTC = origin + offset_s + rate·boot_s, when it heard of epochs.
 
     Attributes
@@ -46,7 +46,7 @@ class Clock:
 
         Examples
         --------
-        >>> clock = Clock(np.datetime64("2025-05-14T09:30:00", "ns"), 0.0, 1.0, 0.1)
+        >>> clock = BootClock(np.datetime64("2025-05-14T09:30:00", "ns"), 0.0, 1.0, 0.1)
         >>> str(clock.utc(np.array([1.1]))[0])
         '2025-05-14T09:30:01.200000000'
         """
@@ -60,7 +60,7 @@ class Clock:
 
 def clock_of(
     boot_s: Floats, time_utc: NDArray[np.datetime64], *, delay_s: float, where: Path
-) -> tuple[Clock, NDArray[np.bool_]]:
+) -> tuple[BootClock, NDArray[np.bool_]]:
     """Return the autopilot's clock against UTC, and which epochs agree with it: a line through what most say.
 
     Parameters
@@ -108,7 +108,7 @@ def clock_of(
             "Cut the log where the receiver corrects its time, or take another source (nodes.<node>.log.body).",
         )
     slope, middle = (float(one) for one in line)
-    return Clock(origin, middle - slope * zero, 1 + slope, delay_s), agree
+    return BootClock(origin, middle - slope * zero, 1 + slope, delay_s), agree
 
 
 # ---- A receiver's positions against its own velocities, which come of Doppler shifts: two words on the same motion

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.budget import noise_loss
-from apertura.methods.autofocus.objective import Blocks, PatchEcho, Seen, Tracks
+from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
 from apertura.methods.autofocus.solve import Problem, State
 
@@ -219,12 +219,12 @@ class Evidence:
         }
 
 
-def gains_db(before: Sequence[Sequence[Seen]], after: Sequence[Sequence[Seen]]) -> Floats:
+def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[PatchImage]]) -> Floats:
     """Return (pair, patch) float64, dB by which the contrast Σ|I|⁴/(Σ|I|²)² has grown.
 
     Examples
     --------
-    >>> gains_db([[Seen(1.0, 0.1, 9.0)]], [[Seen(1.0, 0.2, 9.0)]]).round(2)
+    >>> gains_db([[PatchImage(1.0, 0.1, 9.0)]], [[PatchImage(1.0, 0.2, 9.0)]]).round(2)
     array([[3.01]])
     """
     ratio = [[b.contrast / a.contrast for a, b in zip(*both, strict=True)] for both in zip(before, after, strict=True)]

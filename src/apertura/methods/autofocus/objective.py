@@ -236,7 +236,7 @@ _SIDELOBES = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PatchImage:
     """A patch as one pair sees it now.
 
     Attributes
@@ -254,7 +254,7 @@ class Seen:
     ratio: float
 
     @classmethod
-    def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "Seen":
+    def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "PatchImage":
         """Return what the image of a patch, (pixel,), shows beside others whose brightest pixel has so much power."""
         power = np.abs(image).astype(np.float64) ** 2
         energy = max(float(power.sum()), 1e-300)
@@ -292,7 +292,7 @@ class Sharpness:
     pairs: Sequence[Blocks]
     cached: Sequence[Sequence[Contribution]]
     reference: Tracks
-    seen: Sequence[Sequence[Seen]]
+    seen: Sequence[Sequence[PatchImage]]
     used: NDArray[np.bool_]
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
@@ -321,7 +321,7 @@ def phases(patch: Contribution, moved: Tracks) -> Floats:
     return patch.wavenumber * path
 
 
-def _patch(patch: Contribution, now: Seen, moved: Tracks) -> tuple[float, Floats]:
+def _patch(patch: Contribution, now: PatchImage, moved: Tracks) -> tuple[float, Floats]:
     """Return the value of a patch and its derivative by the phase of each block."""
     turn = np.exp(1j * phases(patch, moved)).astype(np.complex64)
     image = patch.values @ turn

@@ -13,7 +13,7 @@ from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
 from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, MOST_RATIO, gains_db
 from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
-from apertura.methods.autofocus.objective import Seen
+from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, affordable, bandwidth_hz
 
@@ -163,10 +163,10 @@ class _Pair:
         centred = phase - phase.mean()
         return np.asarray(centred - moves @ (moves.T @ centred))
 
-    def seen(self, phase: Floats | None = None) -> list[Seen]:
+    def seen(self, phase: Floats | None = None) -> list[PatchImage]:
         """Return what the patches show with blocks turned; as the logs have them by default."""
         turn = np.exp(1j * (np.zeros(len(self.time_s)) if phase is None else phase)).astype(np.complex64)
-        return [Seen.of(patch @ turn) for patch in self.cached]
+        return [PatchImage.of(patch @ turn) for patch in self.cached]
 
 
 def _edges(time_s: Floats, block_s: float) -> NDArray[np.int64]:

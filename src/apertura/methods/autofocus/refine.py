@@ -12,7 +12,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.evidence import MOST_APART, MOST_RATIO, Evidence, gains_db, range_shifts, remaining
 from apertura.methods.autofocus.inputs import NodePrior, Prior, ReferencePoint, Refinement, Sighting, TrackErrors
-from apertura.methods.autofocus.objective import Blocks, PatchEcho, Seen, Tracks
+from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
 from apertura.methods.autofocus.patches import (
     LEAST_PATCHES,
     MOST_VALUES,
@@ -23,7 +23,7 @@ from apertura.methods.autofocus.patches import (
     patch_at,
 )
 from apertura.methods.autofocus.solve import Gauge, Problem, State, effects, find_gauge, prominent
-from apertura.methods.autofocus.speckle import Ground, refined_by_speckle, tiles
+from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 # ---- The image tied down where sharpness leaves it free: pairs to each other, and all to points whose places are
 # known
@@ -141,7 +141,7 @@ def _place(blocks: Blocks, echo: PatchEcho, tracks: Tracks, modes: Tracks, axes:
     moved = blocks.moves(tracks)
     patch = blocks.contribution(echo, moved)
     image = patch.values.sum(axis=1)
-    ratio = Seen.of(image).ratio
+    ratio = PatchImage.of(image).ratio
     if ratio < _LEAST_RATIO:
         return None
     modes_of = {node: blocks.average_of(modes[node]) for node in moved}
@@ -214,7 +214,7 @@ def refine(
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps what it found; images are formed without it.
     """
-    search = Search.begin(sightings, grid, terrain, errors)
+    search = TrackSearch.begin(sightings, grid, terrain, errors)
     if len(search.problem.patches) < LEAST_PATCHES:
         found = search.by_speckle(grid, terrain, errors)
         return found if found is not None and found.accepted else search.found.refused(errors, found)
@@ -227,7 +227,7 @@ def refine(
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class TrackSearch:
     """The problem, and what its patches show from the logs."""
 
     problem: Problem
@@ -238,7 +238,7 @@ class Search:
     @classmethod
     def begin(
         cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
-    ) -> "Search":
+    ) -> "TrackSearch":
         """Return the problem of a flight, as its logs have it."""
         found = Candidates.of(sightings, grid, terrain, errors)
         knots_s = _knots(sightings, errors)
@@ -329,7 +329,7 @@ class Search:
         found = tiles([blocks.sighting for blocks in problem.pairs], grid, terrain, lasting_s=lasting_s)
         pixels = sum(len(tile.patch.pixels_m) for tile in found)
         every = 1 + pixels * len(problem.knots_s) * len(problem.pairs) // MOST_VALUES
-        return refined_by_speckle(Ground.of(problem.pairs, found[::every]), problem.prior, problem.knots_s)
+        return refined_by_speckle(SpeckleTiles.of(problem.pairs, found[::every]), problem.prior, problem.knots_s)
 
 
 def _knots(sightings: Sequence[Sighting], errors: Mapping[str, TrackErrors]) -> Floats:

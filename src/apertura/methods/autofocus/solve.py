@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.methods.autofocus.inputs import Prior
-from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, Seen, Sharpness, Tracks, phases
+from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, PatchImage, Sharpness, Tracks, phases
 from apertura.methods.autofocus.patches import Patch
 
 # ---- What sharpness does not see of the tracks and yet moves the image: held where the log has it ------------------
@@ -233,7 +233,7 @@ class Problem:
             state = self.state(minimal(sharpness, self.prior, self.gauge, state.unknowns))
         return state
 
-    def value(self, state: "State", used: Bools, weights: Sequence[Sequence[Seen]]) -> float:
+    def value(self, state: "State", used: Bools, weights: Sequence[Sequence[PatchImage]]) -> float:
         """Return what is to be small, with the weights and energies of another state."""
         value, _ = Sharpness(self.pairs, state.cached, state.tracks, weights, used)(state.tracks)
         return value + 0.5 * float(state.unknowns @ state.unknowns)
@@ -263,12 +263,12 @@ class State:
         return [[patch.values.sum(axis=1) for patch in patches] for patches in self.cached]
 
     @cached_property
-    def seen(self) -> list[list[Seen]]:
+    def seen(self) -> list[list[PatchImage]]:
         """Pair → patch → what it shows."""
         seen = []
         for images in self.images:
             brightest = max((float(np.abs(image).max()) ** 2 for image in images), default=0.0)
-            seen.append([Seen.of(image, brightest) for image in images])
+            seen.append([PatchImage.of(image, brightest) for image in images])
         return seen
 
     def of(self, patches: Sequence[int]) -> "State":

@@ -32,7 +32,7 @@ _STEPS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Tile:
+class SpeckleTile:
     """A square of the ground.
 
     Attributes
@@ -47,7 +47,7 @@ class Tile:
     sides_m: Floats
 
 
-def tiles(sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, lasting_s: float) -> list[Tile]:
+def tiles(sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, lasting_s: float) -> list[SpeckleTile]:
     """Return squares that share out the scene without gaps, their pixels as fine as the sharpest pair needs.
 
     Parameters
@@ -113,7 +113,9 @@ def tile_side_m(place_m: Floats, sightings: Sequence[Sighting], *, lasting_s: fl
     return max(sides)
 
 
-def _tile(corner: Floats, size: Floats, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain) -> Tile:
+def _tile(
+    corner: Floats, size: Floats, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain
+) -> SpeckleTile:
     """Return a tile of the grid from its corner and size, both in pixels (row, column)."""
     place, below, right = (
         terrain.positions_at(grid, *(corner + size * np.array(part) - 0.5)) for part in ((0.5, 0.5), (1, 0.5), (0.5, 1))
@@ -131,7 +133,7 @@ def _tile(corner: Floats, size: Floats, sightings: Sequence[Sighting], grid: Sce
         for start, step, count in zip(corner, size, counts, strict=True)
     )
     pixels = terrain.positions_at(grid, *np.meshgrid(rows, columns, indexing="ij"))
-    return Tile(Patch(place, pixels.reshape(-1, 3)), sides_m)
+    return SpeckleTile(Patch(place, pixels.reshape(-1, 3)), sides_m)
 
 
 # ---- What two pairs see alike: the same spatial frequencies of the ground, at different times, speckle or not ------
@@ -164,7 +166,7 @@ class Alike:
     seen: tuple[Contribution, Contribution]
 
     @classmethod
-    def of(cls, tile: Tile, first: Contribution, second: Contribution) -> "Alike":
+    def of(cls, tile: SpeckleTile, first: Contribution, second: Contribution) -> "Alike":
         """Return what a tile's contributions to two pairs have in common, from the tracks that they were cached at."""
         powers = np.stack([np.abs(one.values.sum(axis=1)).astype(np.float64) ** 2 for one in (first, second)])
         energy = np.maximum(powers.sum(axis=1), 1e-300)
@@ -188,7 +190,7 @@ class Alike:
         return complex(by_first.sum()), [by_first, second * (first @ self.product)]
 
 
-def _overlap(tile: Tile, first: Contribution, second: Contribution) -> NDArray[np.float32]:
+def _overlap(tile: SpeckleTile, first: Contribution, second: Contribution) -> NDArray[np.float32]:
     """Return (block, block) float32: 1 where both look at a tile along one line, 0 from a resolvable angle on."""
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
@@ -197,7 +199,7 @@ def _overlap(tile: Tile, first: Contribution, second: Contribution) -> NDArray[n
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class SpeckleAgreement:
     """-w |Σ n·γ|: how far the images of two pairs agree on all tiles, but for one phase.
 
     Attributes
@@ -251,7 +253,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class SpeckleTiles:
     """The scene in tiles, as all pairs of a flight see it.
 
     Attributes
@@ -265,15 +267,15 @@ class Ground:
     """
 
     pairs: Sequence[Blocks]
-    tiles: Sequence[Tile]
+    tiles: Sequence[SpeckleTile]
     echoes: Sequence[Sequence[PatchEcho]]
 
     @classmethod
-    def of(cls, pairs: Sequence[Blocks], tiles: Sequence[Tile]) -> "Ground":
+    def of(cls, pairs: Sequence[Blocks], tiles: Sequence[SpeckleTile]) -> "SpeckleTiles":
         """Return the ground as it was recorded."""
         return cls(pairs, tiles, [blocks.echoes([tile.patch for tile in tiles]) for blocks in pairs])
 
-    def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[Agreement]:
+    def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[SpeckleAgreement]:
         """Return what every two pairs see alike of the tiles used, from corrected tracks: node → (knot, 3), metres."""
         moved = [blocks.moves(tracks) for blocks in self.pairs]
         both = list(combinations(range(len(self.pairs)), 2))
@@ -287,7 +289,7 @@ class Ground:
                 for one, other in both:
                     alike[one, other].append(Alike.of(tile, seen[one], seen[other]))
         return [
-            Agreement((self.pairs[one], self.pairs[other]), self._even(found, one, used), tracks)
+            SpeckleAgreement((self.pairs[one], self.pairs[other]), self._even(found, one, used), tracks)
             for (one, other), found in alike.items()
         ]
 
@@ -360,7 +362,7 @@ class Agreed:
         return f"{grown}: {LEAST_COHERENCE} and {LEAST_GAIN} more than before are needed"
 
 
-def refined_by_speckle(ground: Ground, prior: Prior, knots_s: Floats) -> Refinement:
+def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> Refinement:
     """Return the corrections with which pairs agree on the ground, and whether they are to be believed.
 
     Parameters
@@ -399,13 +401,13 @@ def refined_by_speckle(ground: Ground, prior: Prior, knots_s: Floats) -> Refinem
     return Refinement(correction, std_m, agreed.accepted, agreed.why, report, flags)
 
 
-def _solved(ground: Ground, prior: Prior, used: Bools) -> Floats:
+def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
     """Return the unknowns with which pairs agree best on the tiles used."""
     unknowns = np.zeros(prior.size)
     for _ in range(_STAGES):
         agreements = ground.agreements(prior.tracks(unknowns), used)
 
-        def value(tracks: Tracks, every: Sequence[Agreement] = agreements) -> tuple[float, dict[str, Floats]]:
+        def value(tracks: Tracks, every: Sequence[SpeckleAgreement] = agreements) -> tuple[float, dict[str, Floats]]:
             found = [one(tracks) for one in every]
             return sum(one for one, _ in found), {
                 node: np.sum([by[node] for _, by in found], axis=0) for node in tracks
@@ -415,7 +417,7 @@ def _solved(ground: Ground, prior: Prior, used: Bools) -> Floats:
     return unknowns
 
 
-def _coherence(ground: Ground, prior: Prior, unknowns: Floats, used: Bools) -> tuple[float, float]:
+def _coherence(ground: SpeckleTiles, prior: Prior, unknowns: Floats, used: Bools) -> tuple[float, float]:
     """Return the mean coherence of the tiles used, and the share of their cells that counts."""
     tracks = prior.tracks(unknowns)
     agreements = ground.agreements(tracks, used)

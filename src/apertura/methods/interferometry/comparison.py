@@ -11,7 +11,7 @@ from apertura.methods.interferometry.coherence import chance, formed, unbiased
 from apertura.methods.interferometry.heights import (
     Known,
     Level,
-    Placed,
+    PlacedHeights,
     fits,
     least_coherence,
     level,
@@ -27,7 +27,7 @@ from apertura.methods.interferometry.unwrapping import Unwrapped, unwrap
 
 
 @dataclass(frozen=True)
-class Measured:
+class InterferogramCounts:
     """What was counted on one interferogram.
 
     Attributes
@@ -47,7 +47,7 @@ class Measured:
     residues, loops, jumps, by
         As of `apertura.methods.interferometry.unwrapping.Unwrapped`.
     folded
-        As of `apertura.methods.interferometry.heights.Placed`.
+        As of `apertura.methods.interferometry.heights.PlacedHeights`.
     points
         Points of known height that give the level.
     """
@@ -79,12 +79,12 @@ MOST_FOLDED = 0.01
 """Share of the pixels told whose places several pixels show."""
 
 
-def raised(measured: Measured) -> dict[str, str]:
+def raised(measured: InterferogramCounts) -> dict[str, str]:
     """Return the limits that an interferogram exceeds: flag → what was measured.
 
     Examples
     --------
-    >>> sorted(raised(Measured(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
+    >>> sorted(raised(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
     one, flags = measured, {}
@@ -134,7 +134,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class AssumedGround:
     """What both images assume of each pixel.
 
     Attributes
@@ -177,12 +177,17 @@ class Compared:
 
     panels: Mapping[str, NDArray[np.float32]]
     looks: float
-    measured: Measured
+    measured: InterferogramCounts
     level: Level | None
 
 
 def compared(
-    first: NDArray[np.complex64], second: NDArray[np.complex64], ground: Ground, tiles: Iterable[Window], *, window: int
+    first: NDArray[np.complex64],
+    second: NDArray[np.complex64],
+    ground: AssumedGround,
+    tiles: Iterable[Window],
+    *,
+    window: int,
 ) -> Compared:
     """Return what two images on one grid tell.
 
@@ -204,7 +209,7 @@ def compared(
     >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
     >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
     >>> same = Sensitivity(0 * one, 0 * one, np.zeros((32, 32, 2)), one, 30 * one)
-    >>> flat = Ground(0 * one, one > 0, same, np.zeros((32, 32, 2)))
+    >>> flat = AssumedGround(0 * one, one > 0, same, np.zeros((32, 32, 2)))
     >>> told = compared(image, image, flat, [(slice(0, 32), slice(0, 32))], window=5)
     >>> told.measured.coherent, told.measured.sensitive, bool(np.isnan(told.panels["height"]).all())
     (1024, 0, True)
@@ -240,8 +245,8 @@ def compared(
 
 
 def _placed(
-    ground: Ground, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
-) -> Placed:
+    ground: AssumedGround, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
+) -> PlacedHeights:
     """Return heights at their own places from the phase that height alone has."""
     rise = ground.sensed.height(alone.astype(np.float64))
     std = np.full(rise.shape, np.nan)
@@ -258,14 +263,14 @@ def _measured(
     coherent: NDArray[np.bool_],
     magnitude: NDArray[np.float32],
     by_chance: float,
-) -> Measured:
+) -> InterferogramCounts:
     """Return what the pixels are that both images see plainly."""
     count = int(common.sum())
 
     def middle(values: NDArray[np.floating]) -> float:
         return float(np.median(values[common])) if count else 0.0
 
-    return Measured(
+    return InterferogramCounts(
         common=count,
         coherent=int((common & coherent).sum()),
         sensitive=int((common & sensible(sensed)).sum()),
@@ -277,8 +282,12 @@ def _measured(
 
 
 def _unwrapping(
-    counted: Measured, phase: Unwrapped, alone: NDArray[np.float32], told: Level | None, at_place: Placed
-) -> Measured:
+    counted: InterferogramCounts,
+    phase: Unwrapped,
+    alone: NDArray[np.float32],
+    told: Level | None,
+    at_place: PlacedHeights,
+) -> InterferogramCounts:
     """Return the same with what became of the phase."""
     unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(alone).sum())
     return replace(

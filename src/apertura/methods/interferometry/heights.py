@@ -179,7 +179,7 @@ def sensible(sensed: Sensitivity) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedHeights:
     """Heights at their own places.
 
     Attributes
@@ -197,7 +197,7 @@ class Placed:
     folded: int
 
 
-def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> Placed:
+def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> PlacedHeights:
     """Return heights at the places that they belong to: ground that is higher than assumed shows where it is not.
 
     Parameters
@@ -224,7 +224,7 @@ def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) ->
 
     known = np.isfinite(rise_m)
     if not known.any():
-        return Placed(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
+        return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     moved = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]  # a pixel beside all that are known leads on to them
     place = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
@@ -238,7 +238,7 @@ def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) ->
     found = (apart <= _FOUND_PX) & ~folds
     height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))
     folded = int(((apart > _FOUND_PX) | folds)[np.isfinite(height)].sum())
-    return Placed(np.where(found, height, np.nan), np.where(found, std, np.nan), folded)
+    return PlacedHeights(np.where(found, height, np.nan), np.where(found, std, np.nan), folded)
 
 
 def _covered(to: Floats, area: Floats) -> Floats:

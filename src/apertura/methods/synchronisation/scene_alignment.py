@@ -33,7 +33,7 @@ _BEST = 3  # places of the search that are followed to their tops
 
 
 @dataclass(frozen=True, eq=False)
-class Sharpness:
+class SceneSharpness:
     """How sharp an image of some places is, by offset and path.
 
     Attributes
@@ -54,7 +54,7 @@ class Sharpness:
     places_m: Floats
 
     @classmethod
-    def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "Sharpness":
+    def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
         """Return it for echoes; pulses are compressed once."""
         frequency = echo.frequency_hz
         step_m, length = range_step(frequency, oversampling=_OVERSAMPLING)
@@ -132,7 +132,7 @@ def align_on_scene(
     low, high = plausible_offsets(echo, log, within_s)
     bandwidth_hz = float(echo.frequency_hz[-1] - echo.frequency_hz[0])
     cell_m = SPEED_OF_LIGHT_M_S / (2 * bandwidth_hz)
-    coarse = Sharpness.of(some, log, _coarse(grid, terrain, cell_m))
+    coarse = SceneSharpness.of(some, log, _coarse(grid, terrain, cell_m))
     offsets_s = offset_steps(some, log, low, high)[::2]
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)
     values = np.array([[coarse.value(offset_s, path_m) for path_m in paths_m] for offset_s in offsets_s])
@@ -161,7 +161,9 @@ def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
     return terrain.positions_at(grid, *np.meshgrid(rows, columns, indexing="ij"))
 
 
-def _about(coarse: Sharpness, start: tuple[float, float], grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
+def _about(
+    coarse: SceneSharpness, start: tuple[float, float], grid: SceneGrid, terrain: Terrain, cell_m: float
+) -> Floats:
     """Return fine places about the brightest of an image."""
     image = np.abs(coarse.image(*start))
     down, right = np.unravel_index(int(image.argmax()), image.shape)

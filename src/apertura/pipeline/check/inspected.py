@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from apertura.core.scene.grid import SceneGrid
     from apertura.formats.recordings.recording import Recording
-    from apertura.pipeline.opening.scene import Ground
+    from apertura.pipeline.opening.scene import ConfiguredGround
     from apertura.pipeline.opening.transmitted import Transmitted
 
 T = TypeVar("T")
@@ -207,7 +207,7 @@ class Inspected:
             return None
 
     @property
-    def ground(self) -> "Ground | None":
+    def ground(self) -> "ConfiguredGround | None":
         """The ground as the config states it, opened; None where it cannot be, or nobody knows in which CRS."""
         return self._ground[0]
 
@@ -222,8 +222,8 @@ class Inspected:
         return self._ground[2]
 
     @cached_property
-    def _ground(self) -> "tuple[Ground | None, list[CampaignError], float]":
-        from apertura.pipeline.opening.scene import Ground
+    def _ground(self) -> "tuple[ConfiguredGround | None, list[CampaignError], float]":
+        from apertura.pipeline.opening.scene import ConfiguredGround
 
         flown_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
         asked = self.campaign.settings.scene
@@ -234,7 +234,7 @@ class Inspected:
         if self.crs is None or not all(path.is_file() and path.stat().st_size for path in files.values()):
             return None, [], flown_m
         try:
-            ground = Ground.of(asked, files, crs=self.crs)
+            ground = ConfiguredGround.of(asked, files, crs=self.crs)
             return ground, [], flown_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
         except CampaignError as problem:
             return None, [problem], flown_m

@@ -184,7 +184,7 @@ _EXPECTED = "flight, node, seconds to add to the recorder's time, ppm by which i
 
 
 @dataclass(frozen=True)
-class Clock:
+class ClockRow:
     """The clock of a node's recorder in one flight, against that of the node's log.
 
     Attributes
@@ -215,7 +215,7 @@ class Clock:
         --------
         >>> import numpy as np
         >>> times = np.array(["2025-01-01T00:00:00", "2025-01-01T00:01:40"], "datetime64[ns]")
-        >>> (Clock("f01", "uav1", offset_ns=10**9, drift_ppm=10.0).utc(times) - times).astype(int).tolist()
+        >>> (ClockRow("f01", "uav1", offset_ns=10**9, drift_ppm=10.0).utc(times) - times).astype(int).tolist()
         [1000000000, 1001000000]
         """
         if not times.size:
@@ -226,7 +226,7 @@ class Clock:
         return shifted
 
 
-def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[Clock]:
+def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
     """Yield the lines of a clocks.tsv; none where there is no such file.
 
     Parameters
@@ -261,7 +261,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[Clock]:
         drift = _number(cells, "drift_ppm", where, most=_LARGEST_PPM) or Decimal(0)
         std = _number(cells, "std_s", where, most=_FARTHEST_S)
         offset_ns = int((offset * 1_000_000_000).to_integral_value())
-        yield Clock(flight, node, offset_ns, float(drift), None if std is None else float(abs(std)))
+        yield ClockRow(flight, node, offset_ns, float(drift), None if std is None else float(abs(std)))
 
 
 def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> Decimal | None:

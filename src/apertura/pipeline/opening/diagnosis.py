@@ -36,7 +36,7 @@ _POINTS = ("radar_tx", "radar_rx", "sidelink")
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class PairGeometry:
     """The echo of a pair with what its geometry was made from.
 
     Attributes
@@ -79,14 +79,14 @@ class Suspicion:
     height_m: float = 0.0
 
 
-def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
+def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
     """Return the echo of a pair, weighted by a window, as evidence; give it `some_pulses`."""
     tx, rx = (nodes[name] for name in pair.split("-"))
     time = echo.time.values
-    return Evidence(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
+    return PairGeometry(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
 
 
-def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> list[Evidence]:
+def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> list[PairGeometry]:
     """Return the same echoes with antennas, and sidelinks given back, where other logs of their nodes put them."""
     moved = []
     for one, history in zip(found, _flown(nodes, found), strict=True):
@@ -100,7 +100,7 @@ def some_pulses(echo: xr.Dataset) -> slice:
     return aperture_of(echo).sample(MOST_PULSES)
 
 
-def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
     """Yield everything that is worth a try on a flight, the likeliest first; what its logs cannot tell is left out.
 
     Parameters
@@ -123,7 +123,7 @@ def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> I
     yield from _longer_paths(nodes, found)
 
 
-def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
     groups = [*((name,) for name in nodes), *([tuple(nodes)] if len(nodes) > 1 else [])]
     for shift_s in (sign * size for size in _SHIFTS_S for sign in (-1, 1)):
         for group in groups:
@@ -134,7 +134,7 @@ def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -
                 yield Suspicion(f"the times of {who} are {late}", "time", histories)
 
 
-def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
     for name, node in nodes.items():
         arms = {point: np.array(getattr(node.settings.lever_arms_m, point)) for point in _POINTS}
         if not any(arm.any() for arm in arms.values()):
@@ -155,7 +155,7 @@ def _with_arms(node: Acquisition, arms: Mapping[str, tuple[float, ...]]) -> Acqu
     return replace(node, settings=node.settings.model_copy(update={"lever_arms_m": lever_arms}))
 
 
-def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
     names = list(nodes)
     for i, first in enumerate(names):
         for second in names[i + 1 :]:
@@ -178,7 +178,7 @@ def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
     return replace(node, track=other.track.assign(attitude=(("epoch", "axis"), attitude)))
 
 
-def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -> Iterator[Suspicion]:
+def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
     for place, one in enumerate(found):
         tx, rx = one.pair.split("-")
         cell_m = SPEED_OF_LIGHT_M_S / nodes[tx].numerology.sample_rate_hz
@@ -194,7 +194,7 @@ def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[Evidence]) -
 
 
 def _flown(
-    nodes: Mapping[str, Acquisition], found: Sequence[Evidence], *, shift_s: Mapping[str, float] | None = None
+    nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry], *, shift_s: Mapping[str, float] | None = None
 ) -> tuple[PhaseHistory, ...]:
     """Return the echoes with antennas where other logs, arms or times put them; nothing where a log does not reach."""
     histories = []

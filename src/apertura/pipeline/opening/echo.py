@@ -21,7 +21,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
 from apertura.pipeline.opening.node_log import Times
-from apertura.pipeline.opening.positions import Placed, keep_segments, place
+from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
 
 Complexes = NDArray[np.complex64]
@@ -125,7 +125,7 @@ def pair_echo(
 def _attributes(
     nodes: tuple[Acquisition, Acquisition],
     pulses: Association,
-    placed: Placed,
+    placed: PulsePositions,
     measured: Transfer,
     *,
     at: Times,
@@ -212,7 +212,7 @@ def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
     }
 
 
-def _counted(sent: int, pulses: Association, placed: Placed, measured: Transfer) -> dict[str, Any]:
+def _counted(sent: int, pulses: Association, placed: PulsePositions, measured: Transfer) -> dict[str, Any]:
     """Return how many of the pulses sent are used, how many not, and why."""
     used = int(measured.kept.sum())
     reasons = {

@@ -14,7 +14,7 @@ from apertura.common.provenance import sha256_file
 from apertura.common.raster import opened_raster
 from apertura.core.quality.agreement import Agreement, agreement
 from apertura.core.quality.bright_points import BrightPoint, shows_point
-from apertura.core.quality.measures import Raster
+from apertura.core.quality.measures import BlockRaster
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import read_manifest
@@ -84,7 +84,7 @@ def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> 
 
 
 def agreement_by_focus(
-    images: tuple[Raster, Raster], focus: tuple[Mapping[str, Any], Mapping[str, Any]], grid: SceneGrid
+    images: tuple[BlockRaster, BlockRaster], focus: tuple[Mapping[str, Any], Mapping[str, Any]], grid: SceneGrid
 ) -> Agreement | None:
     """Return how two images on a grid agree, by what `apertura.core.imaging.focus_check.focus_report` says of each."""
     return agreement(

@@ -60,7 +60,7 @@ _LINES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PulsePositions:
     """What the logs say of a pair's pulses.
 
     Attributes
@@ -82,7 +82,7 @@ class Placed:
     report: dict[str, dict[str, Any]]
 
 
-def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
+def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
     """Return which pulses, at the transmitter's tags `at`, both logs of a pair give positions for.
 
     Raises
@@ -110,7 +110,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> Placed:
         | _told(node)
         for leg, node in (("tx", tx), ("rx", rx))
     }
-    return Placed(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
+    return PulsePositions(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
 
 
 def _told(node: NodeLog) -> dict[str, Any]:

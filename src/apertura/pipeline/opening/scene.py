@@ -32,7 +32,7 @@ _BLOCKS = 32
 
 
 @dataclass(frozen=True)
-class Ground:
+class ConfiguredGround:
     """What the config says of the ground: flat at a height, or a DEM; and the files that takes.
 
     Attributes
@@ -53,7 +53,7 @@ class Ground:
     crs: str
 
     @classmethod
-    def of(cls, asked: Scene, files: Mapping[str, Path], *, crs: str) -> "Ground":
+    def of(cls, asked: Scene, files: Mapping[str, Path], *, crs: str) -> "ConfiguredGround":
         """Open what section `scene` names; `files` are those of `Campaign.height_files`."""
         named = files.get("geoid")
         if asked.dem and asked.dem_datum:
@@ -257,11 +257,11 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
         return scene
     if manifest_of(campaign.stage("terrain")).is_file():
         return open_scene(campaign)
-    dem = Ground.of(asked, campaign.height_files(), crs=scene.grid.crs).dem
+    dem = ConfiguredGround.of(asked, campaign.height_files(), crs=scene.grid.crs).dem
     return replace(scene, terrain=UncheckedDem(dem, scene.grid)) if dem else scene
 
 
-def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, Ground, dict[str, str]]:
+def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, ConfiguredGround, dict[str, str]]:
     """Return the grid that is asked for, every `auto` settled from a flight; its ground; and why.
 
     Parameters
@@ -275,7 +275,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
     if crs == "auto":
         crs, chosen["crs"] = utm_crs(_middle(flown())), "UTM zone of the first image flight"
-    ground = Ground.of(asked, campaign.height_files(), crs=crs)
+    ground = ConfiguredGround.of(asked, campaign.height_files(), crs=crs)
     height_m = None
     if bounds == "auto":
         bounds, height_m = _bounds(flown(), ground)
@@ -289,7 +289,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     return grid, ground, chosen | ground.reason
 
 
-def _bounds(flown: Flown, ground: Ground) -> tuple[Bounds, float]:
+def _bounds(flown: Flown, ground: ConfiguredGround) -> tuple[Bounds, float]:
     """Return automatic bounds and the height (m) of the ground under the track that they start from."""
     east, north = map_from_frame(ground.crs, _middle(flown))[:2]
     height_m = ground.height_at(float(east), float(north))
@@ -297,7 +297,7 @@ def _bounds(flown: Flown, ground: Ground) -> tuple[Bounds, float]:
     return auto_bounds(flown.aperture, crs=ground.crs, height_m=height_m, path_limit_m=limit_m), height_m
 
 
-def _spacing(flown: Flown, ground: Ground, bounds: Bounds, height_m: float | None) -> float:
+def _spacing(flown: Flown, ground: ConfiguredGround, bounds: Bounds, height_m: float | None) -> float:
     """Return automatic spacing; on stated bounds the ground's level is taken on pixels made just for that."""
     if height_m is None:
         xmin, ymin, xmax, ymax = bounds

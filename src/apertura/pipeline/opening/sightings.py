@@ -16,7 +16,7 @@ from apertura.pipeline.opening.scene import OpenScene
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RefinementInputs:
     """What the tracks of a flight are refined from.
 
     Attributes
@@ -37,7 +37,7 @@ class Seen:
     began: np.datetime64
 
 
-def seen(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScene) -> Seen:
+def seen(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScene) -> RefinementInputs:
     """Return what the tracks of a flight are refined from.
 
     Parameters
@@ -54,7 +54,7 @@ def seen(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScen
         Sighting(pair.name, profiles, clock_s(pair, began), pair.sidelink_m, weighing(campaign, pair, scene))
         for pair, profiles in pairs.items()
     ]
-    return Seen(tuple(sightings), errors_of(list(pairs)), reference_points(campaign), began)
+    return RefinementInputs(tuple(sightings), errors_of(list(pairs)), reference_points(campaign), began)
 
 
 def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:

@@ -12,7 +12,7 @@ from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Looks
-from apertura.methods.interferometry.comparison import Ground
+from apertura.methods.interferometry.comparison import AssumedGround
 from apertura.methods.interferometry.heights import Known
 from apertura.methods.interferometry.sensitivity import Legs, Sensitivity, sensitivity
 from apertura.pipeline.campaign import Campaign
@@ -42,7 +42,7 @@ class TwoImages:
 
     names: tuple[str, str]
     images: tuple[xr.Dataset, xr.Dataset]
-    ground: Ground
+    ground: AssumedGround
 
 
 def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
@@ -112,13 +112,13 @@ def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
     return plain
 
 
-def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, plain: NDArray[np.bool_]) -> Ground:
+def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, plain: NDArray[np.bool_]) -> AssumedGround:
     """Return what is assumed of the ground, and the points of known height as the images show them."""
     height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
     shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
     known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
-    return Ground(height_m, plain, sensed, shift_px, known)
+    return AssumedGround(height_m, plain, sensed, shift_px, known)
 
 
 def _shown(

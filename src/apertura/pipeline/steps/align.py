@@ -15,7 +15,7 @@ from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CLOCK_COLUMNS, CLOCKS, CONFIG
 from apertura.pipeline.opening.acquisition import Unaligned, unaligned
-from apertura.pipeline.opening.scene import Ground
+from apertura.pipeline.opening.scene import ConfiguredGround
 
 NEAR_S = 5.0
 """How far a clock that tells UTC is thought to be off."""
@@ -149,4 +149,4 @@ def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
         )
     bounds_m, spacing_m = asked.bounds_m, asked.spacing_m
     grid = SceneGrid.from_bounds(asked.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]
-    return grid, Ground.of(asked, campaign.height_files(), crs=asked.crs).level(grid)
+    return grid, ConfiguredGround.of(asked, campaign.height_files(), crs=asked.crs).level(grid)

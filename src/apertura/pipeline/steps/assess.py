@@ -23,7 +23,7 @@ from apertura.pipeline.config import OfdmWaveform, SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import Acquisition, open_acquisition
 from apertura.pipeline.opening.autofocus import open_refined
-from apertura.pipeline.opening.diagnosis import Evidence, Suspicion, evidence_of, seen_from, some_pulses, suspicions
+from apertura.pipeline.opening.diagnosis import PairGeometry, Suspicion, evidence_of, seen_from, some_pulses, suspicions
 from apertura.pipeline.opening.echo import pair_echo
 from apertura.pipeline.opening.images import agreement_of, agreement_report, comparable, shows_points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene, settled_scene
@@ -89,7 +89,7 @@ def hypotheses(
     return [{"what": one.what, "kind": one.kind, "gain_db": round(gain_db, 2)} for gain_db, one in named[:_MOST_NAMED]]
 
 
-def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> Evidence:
+def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
     return evidence_of(nodes, pair, echo.isel(pulse=some_pulses(echo)), window)
 
 
@@ -97,14 +97,14 @@ def _other_echoes(
     campaign: Campaign,
     flight: str,
     nodes: Mapping[str, Acquisition],
-    found: Sequence[Evidence],
+    found: Sequence[PairGeometry],
     *,
     sent: Transmitted,
 ) -> Iterator[Suspicion]:
     """Yield what only another reading of the samples shows: channels swapped, the other end of the band as carrier."""
     calibration = {one.pair: calibrated(campaign, flight, one.pair) for one in found}
 
-    def formed(one: Evidence, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
+    def formed(one: PairGeometry, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
         tx, rx = (nodes[name] for name in one.pair.split("-"))
         echo = pair_echo(tx, rx, sent, campaign.settings.processing, calibration[one.pair])
         some = echo.at(some_pulses(echo.dataset))
@@ -143,7 +143,7 @@ def _around(scene: OpenScene, place: tuple[float, float], cell_m: float) -> Scen
 
 
 def _moved(
-    grid: SceneGrid, place: tuple[float, float], found: Sequence[Evidence], histories: Sequence[Any]
+    grid: SceneGrid, place: tuple[float, float], found: Sequence[PairGeometry], histories: Sequence[Any]
 ) -> tuple[float, float]:
     """Return where a place is expected if the antennas were elsewhere: as far away as they are, on average."""
     rows, columns = [], []

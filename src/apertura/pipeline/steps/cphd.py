@@ -14,7 +14,7 @@ from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, ned_axes
 from apertura.formats.export import PHASE_HISTORY
-from apertura.formats.export.cphd import Collection, write_cphd
+from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
@@ -45,7 +45,7 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
 
 def _collection(
     campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenScene, tags: Mapping[str, str]
-) -> Collection:
+) -> CphdCollection:
     """Return what the file says of the echo; a frame without a place on Earth is put at latitude and longitude 0.
 
     There east, north and up are axes of ECEF, and metres keep their value: only the height is rounded, by 1 nm.
@@ -64,7 +64,7 @@ def _collection(
     corners = [-0.5, -0.5, rows - 0.5, rows - 0.5], [-0.5, columns - 0.5, -0.5, columns - 0.5]
     edges = (ecef(scene.grid.positions_at(*corners, scene.level.height_m)) - origin) @ axes.T
     (west, south), (east, north) = edges[:, :2].min(axis=0), edges[:, :2].max(axis=0)
-    return Collection(
+    return CphdCollection(
         f"{campaign.settings.campaign} {flight} {echo.attrs['pair']}",
         echo.attrs["pair"],
         echo.time.values,
@@ -87,7 +87,7 @@ def _east_north_up(point_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([east, north, -down])
 
 
-def _referred(echo: xr.Dataset, collection: Collection) -> Iterator[NDArray[np.complex64]]:
+def _referred(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
     """Yield the samples with the delay of the reference point taken off, instead of that of the stage."""
     further = collection.reference_delay_s - echo.reference_delay.values
     frequency: Any = echo.frequency.values

@@ -12,7 +12,7 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.flags.raised import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
-from apertura.core.quality.measures import Amplitude, Raster, survey
+from apertura.core.quality.measures import Amplitude, BlockRaster, survey
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import write_exports
@@ -61,7 +61,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     lineage = result_of(campaign, "fused", flight).begin(campaign.root)
     cube = open_stage(campaign.stage("cube"), "cube")
     index = cube.attrs["flights"].index(flight)
-    sums: dict[str, Raster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
+    sums: dict[str, BlockRaster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     folder, grid = campaign.result(flight, "fused"), settled_scene(campaign).grid
@@ -135,7 +135,7 @@ def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dic
 
 
 def _measures(
-    grid: SceneGrid, tile_px: int, sums: Mapping[str, Raster], radiometry: Mapping[str, Radiometry]
+    grid: SceneGrid, tile_px: int, sums: Mapping[str, BlockRaster], radiometry: Mapping[str, Radiometry]
 ) -> dict[str, Any]:
     """Return what the pixels of the sums tell."""
     windows = list(grid.tiles(tile_px))

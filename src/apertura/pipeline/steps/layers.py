@@ -67,7 +67,7 @@ def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
 
 
 @dataclass(frozen=True)
-class Layer:
+class LazyLayer:
     """A raster whose blocks are computed when they are read: tiles of them, by some threads.
 
     Attributes
@@ -106,7 +106,7 @@ class Layer:
         return values
 
 
-def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, Layer]:
+def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, LazyLayer]:
     """Return the layers; `noise` is that of one pulse."""
     grid, terrain = scene.grid, scene.terrain
 
@@ -122,11 +122,11 @@ def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> d
         return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
 
     return {
-        "incidence": Layer(grid, np.float32, incidence, threads),
-        "bistatic_angle": Layer(grid, np.float32, bistatic_angle, threads),
-        "mask": Layer(grid, np.uint8, _mask(scene, looks), threads),
-        "looks": Layer(grid, np.float32, looks.effective, threads),
-        "nesz": Layer(grid, np.float32, nesz, threads),
+        "incidence": LazyLayer(grid, np.float32, incidence, threads),
+        "bistatic_angle": LazyLayer(grid, np.float32, bistatic_angle, threads),
+        "mask": LazyLayer(grid, np.uint8, _mask(scene, looks), threads),
+        "looks": LazyLayer(grid, np.float32, looks.effective, threads),
+        "nesz": LazyLayer(grid, np.float32, nesz, threads),
     }
 
 

@@ -21,7 +21,7 @@ from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import autofocus_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.scene import OpenScene, open_scene
-from apertura.pipeline.opening.sightings import Seen, seen
+from apertura.pipeline.opening.sightings import RefinementInputs, seen
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import open_stage, save_stage
 
@@ -52,7 +52,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     return folder
 
 
-def _searched(given: Seen, scene: OpenScene, method: str) -> Refinement:
+def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
     """Return what images say of the tracks, or of the phases of pulses."""
     sightings, errors = given.sightings, given.errors
     if method == "tracks":
@@ -68,7 +68,9 @@ def _unrefined(nodes: Any) -> Refinement:
     return Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
 
 
-def refined_stage(found: Refinement, decisions: Sequence[Decision], given: Seen | None, scene: OpenScene) -> xr.Dataset:
+def refined_stage(
+    found: Refinement, decisions: Sequence[Decision], given: RefinementInputs | None, scene: OpenScene
+) -> xr.Dataset:
     """Return stage `refined_track`, to be stamped.
 
     Parameters

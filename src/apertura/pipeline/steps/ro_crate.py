@@ -10,7 +10,7 @@ from apertura.common.environment import lock_sha256, software
 from apertura.common.paths import inside, shipped
 from apertura.common.provenance import sha256_text
 from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.catalog.crate import Job, Listed, Run, crate_document
+from apertura.formats.catalog.crate import CrateJob, CrateRun, Listed, crate_document
 from apertura.formats.catalog.stac import RECORDED
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result
@@ -29,7 +29,7 @@ def ro_crate(campaign: Campaign) -> list[Path]:
     made = list(_results(campaign))
     read = {name: sha256 for one in reversed(made) for name, sha256 in one.recorded["sources"].items()}
     known = {**read, **lineage.sources.digests}
-    run = Run(
+    run = CrateRun(
         campaign.settings.campaign,
         _recorded_until(campaign),
         software(),
@@ -71,7 +71,7 @@ def _results(campaign: Campaign) -> Iterator[_Made]:
                 yield _Made(name, where, result, {**recorded, **told, "sources": dict(recorded["sources"])})
 
 
-def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[Job]:
+def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[CrateJob]:
     """Yield every job behind some results; one job makes several.
 
     Parameters
@@ -88,7 +88,7 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
         jobs.setdefault(job_of(one.name, one.where), []).append(one)
     for job, parts in jobs.items():
         doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, known)]
-        yield Job(
+        yield CrateJob(
             job.rule,
             job.where,
             job.command,

@@ -16,7 +16,7 @@ from apertura.common.environment import lock_sha256, software
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.formats.catalog import CATALOG
-from apertura.formats.catalog.stac import Acquisition, Image, asset_of, catalog_files, instant, projection, told_by
+from apertura.formats.catalog.stac import AcquisitionTime, Image, asset_of, catalog_files, instant, projection, told_by
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
@@ -88,7 +88,7 @@ class _Described:
             name,
             f"{self.campaign.settings.campaign} · flight {flight} · {name} sum of {len(pairs)} pairs",
             self._footprint(looks),
-            Acquisition.together([pair.acquisition for pair in pairs]),
+            AcquisitionTime.together([pair.acquisition for pair in pairs]),
             {**told, **self._properties(flight, "fused")},
             *self._assets({path: digest for path, digest in listed.items() if not path.name.startswith(others)}),
             [pair.name for pair in pairs],
@@ -151,13 +151,13 @@ class _Described:
         geometry: dict[str, Any] | None = found["features"][0]["geometry"]
         return geometry if geometry and geometry["coordinates"] else None
 
-    def _acquisition(self, flight: str, pair: str) -> Acquisition:
+    def _acquisition(self, flight: str, pair: str) -> AcquisitionTime:
         echo = open_stage(self.campaign.stage("echo", flight, pair), "echo")
         times, frequency = echo.time.values.astype(np.int64), echo.frequency.values
         span_hz = float(frequency[-1] - frequency[0])
         bandwidth_hz = span_hz * frequency.size / max(frequency.size - 1, 1)
         centre_hz = float(frequency[0] + frequency[-1]) / 2
-        return Acquisition(instant(int(times.min())), instant(int(times.max())), centre_hz, bandwidth_hz)
+        return AcquisitionTime(instant(int(times.min())), instant(int(times.max())), centre_hz, bandwidth_hz)
 
 
 def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:

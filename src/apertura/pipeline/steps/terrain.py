@@ -11,7 +11,7 @@ from apertura.core.scene.dem import height_range
 from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.scene import Ground, OpenScene, settled_scene
+from apertura.pipeline.opening.scene import ConfiguredGround, OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, open_array, resume, writing
 
@@ -26,7 +26,7 @@ def terrain(campaign: Campaign) -> Path:
     """
     lineage = result_of(campaign, "terrain").begin(campaign.root)
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
-    grid, ground = scene.grid, Ground.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
+    grid, ground = scene.grid, ConfiguredGround.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
     if ground.dem is None:
         raise CampaignError(
             "no DEM",
@@ -54,7 +54,7 @@ def terrain(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(campaign: Campaign, scene: OpenScene, ground: Ground, modules: Sequence[str]) -> xr.Dataset:
+def _empty(campaign: Campaign, scene: OpenScene, ground: ConfiguredGround, modules: Sequence[str]) -> xr.Dataset:
     """Return the stamped stage without its heights."""
     return stamped(
         xr.Dataset(

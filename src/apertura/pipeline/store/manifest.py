@@ -33,14 +33,14 @@ def remake(result: Path) -> str:
     return f"Delete {manifest_of(result)} and run the workflow again."
 
 
-class Origin(Protocol):
+class ResultOrigin(Protocol):
     """What a result is being made from, `apertura.pipeline.digests.Lineage`."""
 
     def record(self) -> dict[str, Any]:
         """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
 
 
-def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Origin | None = None) -> None:
+def write_manifest(manifest: Path, files: Mapping[str, str], lineage: ResultOrigin | None = None) -> None:
     """Write the manifest of a result that is complete.
 
     Parameters
@@ -55,7 +55,7 @@ def write_manifest(manifest: Path, files: Mapping[str, str], lineage: Origin | N
     write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
 
 
-def record_files(manifest: Path, files: Sequence[Path], lineage: Origin | None = None) -> None:
+def record_files(manifest: Path, files: Sequence[Path], lineage: ResultOrigin | None = None) -> None:
     """Write the manifest of some files beside or below it."""
     write_manifest(
         manifest, {path.relative_to(manifest.parent).as_posix(): sha256_file(path) for path in sorted(files)}, lineage
@@ -153,7 +153,7 @@ def refuse_others(manifest: Path, expected: Mapping[str, str], present: Mapping[
         )
 
 
-def save_document(path: Path, document: Mapping[str, Any], lineage: Origin | None = None) -> None:
+def save_document(path: Path, document: Mapping[str, Any], lineage: ResultOrigin | None = None) -> None:
     """Write a result that is one JSON document, and its manifest."""
     manifest_of(path).unlink(missing_ok=True)
     write_json(path, document)

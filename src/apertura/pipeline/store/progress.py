@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 from apertura.common.atomic import naming, remove, rename, write_beside
 from apertura.common.contracts import Window
 from apertura.common.provenance import canonical_json, sha256_tree
-from apertura.pipeline.store.manifest import Origin, manifest_of, write_manifest
+from apertura.pipeline.store.manifest import ResultOrigin, manifest_of, write_manifest
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -89,7 +89,7 @@ def _lock_of(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.lock")
 
 
-def finish(wip: Path, folder: Path, *, lineage: Origin | None = None, **attributes: Any) -> None:
+def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **attributes: Any) -> None:
     """Turn work in progress into the finished stage and write its manifest.
 
     Parameters

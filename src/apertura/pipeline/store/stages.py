@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from apertura.common.atomic import naming, remove
 from apertura.common.contracts import check
-from apertura.pipeline.store.manifest import Origin, check_stage
+from apertura.pipeline.store.manifest import ResultOrigin, check_stage
 from apertura.pipeline.store.progress import finish, writing
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def save_stage(
     folder: Path,
     *,
     chunks: Mapping[str, int] | None = None,
-    lineage: Origin | None = None,
+    lineage: ResultOrigin | None = None,
 ) -> None:
     """Write a stage at once: `folder`.wip, rename, manifest.
 

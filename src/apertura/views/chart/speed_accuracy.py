@@ -17,7 +17,7 @@ from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Plan
-from apertura.core.planning.planner import Search
+from apertura.core.planning.planner import SettingSearch
 from apertura.core.quality.error_check import Brightness, error_bound, random_pixels
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import STUDY, result_of
@@ -96,7 +96,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     accuracy_db = float(asked_accuracy(campaign, opened, scene).value)
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
     job = job_of(campaign, opened, scene)
-    plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), Search(job)
+    plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
     points = [
         replace(
@@ -146,7 +146,7 @@ def _part(
     return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - begin, beams)
 
 
-def _settings(search: Search) -> list[Setting]:
+def _settings(search: SettingSearch) -> list[Setting]:
     """Return the settings to measure, cheapest first: of every engine but the reference, which is timed once."""
     return [
         setting

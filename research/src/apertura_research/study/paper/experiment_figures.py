@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.quality.measures import coherence_factor
-from apertura.core.quality.point_targets import Patch, find_peak
+from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.views.chart.png import save_png
 from apertura_research.study.paper.experiments import (
     BISTATIC,
@@ -177,7 +177,9 @@ def _cut_db(images: Images, name: str, east: float, north: float) -> tuple[Float
     peak = find_peak(images.amplitude["coherent"], row, column)
     along_m = np.linspace(-1.5, 1.5, 601)
     steps = along_m / images.spacing_m
-    values = Patch(images.amplitude[name], row, column).at(peak.row - north * steps, peak.column + east * steps)
+    values = BandLimitedPatch(images.amplitude[name], row, column).at(
+        peak.row - north * steps, peak.column + east * steps
+    )
     return along_m, 20 * np.log10(np.maximum(np.abs(values), 1e-6))
 
 

@@ -60,7 +60,7 @@ def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
     return path
 
 
-def _draw_data(axes: Axes, scene: PaperScene, data: numba.Tables, peak: float) -> None:
+def _draw_data(axes: Axes, scene: PaperScene, data: numba.OversampledTables, peak: float) -> None:
     """Draw the profiles on one axis of total path, whatever the path at which each pulse begins."""
     every = max(1, len(data.samples) // _COLUMNS)
     levels = [_level_at(data, pulse) for pulse in range(0, len(data.samples), every)]
@@ -72,7 +72,7 @@ def _draw_data(axes: Axes, scene: PaperScene, data: numba.Tables, peak: float) -
     axes.set_title("(a) Range-compressed data", loc="left")
 
 
-def _level_at(data: numba.Tables, pulse: int) -> Floats:
+def _level_at(data: numba.OversampledTables, pulse: int) -> Floats:
     cell = np.rint((_PATH_M - data.start_m[pulse]) / data.step_m).astype(int)
     inside = (cell >= 0) & (cell < data.samples.shape[1])
     level = np.abs(data.samples[pulse, np.clip(cell, 0, data.samples.shape[1] - 1)])

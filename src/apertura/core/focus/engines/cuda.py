@@ -83,7 +83,7 @@ class Resident:
         return Resident, ()
 
 
-def sum_there(tables: "Tables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
+def sum_there(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
     """Return what `apertura.core.focus.engines.cuda.form` returns, of one or more pixels.
 
     Raises
@@ -108,7 +108,7 @@ def sum_there(tables: "Tables", pixels: NDArray[np.float64], tolerance_rad: floa
         return np.asarray(image.copy_to_host())
 
 
-def _tables_there(cuda: Any, tables: "Tables") -> tuple[Any, ...]:
+def _tables_there(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
     """Return phase centres, starts and cells of all pulses on the device."""
     from apertura.core.focus.engines.cuda_kernels import expand
 
@@ -171,7 +171,7 @@ class Options(EngineOptions):
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class ResidentTables:
     """Profiles, and what they become on the device: polynomials per cell, carrier folded in.
 
     Attributes
@@ -206,14 +206,14 @@ class Tables:
     pulses: slice
     resident: Resident
 
-    def __getitem__(self, pulses: slice) -> "Tables":
+    def __getitem__(self, pulses: slice) -> "ResidentTables":
         """Return the tables of some pulses; they are on the device once."""
         first, last, _ = pulses.indices(self.pulses.stop - self.pulses.start)
         start = self.pulses.start
         return replace(self, pulses=slice(start + first, start + max(first, last)))
 
 
-def prepare(profiles: Profiles, *, oversampling: int = 6) -> Tables:
+def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
     """Return what tables are made from; they are made on the device when the first tile is formed there.
 
     Parameters
@@ -221,7 +221,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> Tables:
     profiles
         Band-limited profiles with eight samples or more beyond the scene at both ends.
     oversampling
-        Table cells per Nyquist cell c/B of total path; `Tables.error_db` predicts what that errs by.
+        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` predicts what that errs by.
 
     Returns
     -------
@@ -240,7 +240,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> Tables:
     samples, start_m, places = profiles.for_tables()
     wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
     design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=DEGREE)
-    return Tables(
+    return ResidentTables(
         samples=samples,
         places_m=np.ascontiguousarray(np.stack(places, axis=1)),
         start_m=start_m,
@@ -254,7 +254,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> Tables:
 
 
 def form(
-    tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = None, tolerance_rad: float = 1.5e-3
+    tables: ResidentTables, pixels: NDArray[np.float64], *, beams: Beams | None = None, tolerance_rad: float = 1.5e-3
 ) -> NDArray[np.complex64]:
     """Sum the tables over the pixels of one tile.
 

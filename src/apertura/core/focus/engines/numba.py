@@ -99,7 +99,7 @@ def cubic_error_db(oversampling: float, window: NDArray[np.float64]) -> float:
 
 
 @dataclass(frozen=True)
-class Tables:
+class OversampledTables:
     """Range profiles, finely sampled.
 
     Attributes
@@ -122,12 +122,12 @@ class Tables:
     wavenumber_rad_m: float
     aperture: Aperture
 
-    def __getitem__(self, pulses: slice) -> "Tables":
+    def __getitem__(self, pulses: slice) -> "OversampledTables":
         """Return the tables of some pulses, as views."""
         return replace(self, samples=self.samples[pulses], start_m=self.start_m[pulses], aperture=self.aperture[pulses])
 
 
-def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
+def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
     """Return tables of `oversampling` samples per resolution cell.
 
     Parameters
@@ -139,7 +139,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> Tables:
     """
     factor = max(1, round(oversampling / profiles.oversampling))
     fine = refine(profiles.samples, factor)
-    return Tables(
+    return OversampledTables(
         np.ascontiguousarray(fine, np.complex64),
         profiles.start_m,
         profiles.step_m / factor,
@@ -179,7 +179,9 @@ def refine(samples: NDArray[np.complex64], factor: int) -> NDArray[np.complex64]
     return fine.reshape(len(samples), -1)
 
 
-def form(tables: Tables, pixels: NDArray[np.float64], *, beams: Beams | None = None) -> NDArray[np.complex64]:
+def form(
+    tables: OversampledTables, pixels: NDArray[np.float64], *, beams: Beams | None = None
+) -> NDArray[np.complex64]:
     """Return Σ p(R)·exp(+j2πf_mid·R/c) over the pulses at each pixel, R the total path.
 
     Parameters

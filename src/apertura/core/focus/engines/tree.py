@@ -21,10 +21,10 @@ from apertura.core.focus.engines import native
 from apertura.core.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.core.focus.engines.native_binding import TREE_GROUP, TREE_SIDE, available, instruction_set
 from apertura.core.focus.engines.native_tables import Tables
-from apertura.core.focus.engines.tree_inputs import LEAST_PIXELS, LEAST_QUARTER_PX, Chunk, Task, Tile, Trees, prepare
+from apertura.core.focus.engines.tree_inputs import LEAST_PIXELS, LEAST_QUARTER_PX, Chunk, JobTile, Task, Trees, prepare
 from apertura.core.focus.engines.tree_nodes import DIRECTLY, surfaces_of, windows
 from apertura.core.focus.engines.tree_prediction import candidates
-from apertura.core.focus.engines.tree_view import MOST_SHEETS, Relief, Sheets, sheets_for, subaperture_sizes
+from apertura.core.focus.engines.tree_view import MOST_SHEETS, Sheets, SurfaceResidual, sheets_for, subaperture_sizes
 
 __all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 
@@ -147,30 +147,32 @@ class _Block:
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(WAYS), np.int64))
-    _quarters: dict[Tile, list[Tile]] = field(default_factory=dict)
+    _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
 
-    def tiles(self, parts: list[Window]) -> list[Tile]:
+    def tiles(self, parts: list[Window]) -> list[JobTile]:
         """Return tiles of the block; those that are small or rough do not go by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
-            Tile(part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit)
+            JobTile(
+                part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit
+            )
             for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
         ]
 
-    def sheets(self, tile: Tile, most: int) -> Sheets | None:
+    def sheets(self, tile: JobTile, most: int) -> Sheets | None:
         """Return the sheets that a rough tile is read between; None where more are needed, or it is no relief."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
             return None
-        relief = Relief.of(tile.surface, pixels)
+        relief = SurfaceResidual.of(tile.surface, pixels)
         if trees.wavenumber_rad_m * relief.aside_m > limit:
             return None
         wave = {"wavenumber_rad_m": trees.wavenumber_rad_m, "band_rad_m": trees.band_rad_m}
         band = relief.band_rad(trees.profiles.aperture, **wave)
         return Sheets.of(relief, band, self.nodes_db) if sheets_for(band, self.nodes_db) <= most else None
 
-    def sum(self, beams: Beams | None, tiles: list[Tile]) -> None:
+    def sum(self, beams: Beams | None, tiles: list[JobTile]) -> None:
         """Add all pulses to tiles."""
         for pulses in self.trees.chunks(self.chunk):
             some = self.trees[pulses]
@@ -196,7 +198,7 @@ class _Block:
         if left:
             self.add(trees, beams, left)
 
-    def _quartered(self, tile: Tile) -> list[Tile]:
+    def _quartered(self, tile: JobTile) -> list[JobTile]:
         """Return the quarters of a tile, none of one too small: it sees less of what is not smooth."""
         rows, columns = tile.window
         if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:

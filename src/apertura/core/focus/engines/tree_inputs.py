@@ -302,7 +302,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
 
 
 @dataclass(frozen=True, eq=False)
-class Tile:
+class JobTile:
     """Which part of a block it is, where its pixels lie, and whether they lie smoothly enough for a tree."""
 
     window: Window
@@ -310,7 +310,7 @@ class Tile:
     by_tree: bool
 
 
-Task = tuple[Tile, NDArray[np.bool_]]
+Task = tuple[JobTile, NDArray[np.bool_]]
 """A tile, and which groups of 64 pulses are to be added to it."""
 
 _Taken = tuple[
@@ -366,7 +366,7 @@ class Chunk:
         self._held.append(array)
         return array.ctypes.data
 
-    def _taken(self, tile: Tile, wanted: NDArray[np.bool_]) -> _Taken:
+    def _taken(self, tile: JobTile, wanted: NDArray[np.bool_]) -> _Taken:
         """Return the weights of the pulses over a tile, how groups of them are taken, and which go by themselves."""
         way, each = np.where(wanted, BY_TREE if tile.by_tree else DIRECTLY, SILENTLY), np.zeros(len(wanted), np.uint8)
         if self.beams is None or not tile.by_tree:
@@ -380,7 +380,7 @@ class Chunk:
         return weight, way.astype(np.uint8), each
 
     def _struct(
-        self, tile: Tile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]
+        self, tile: JobTile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]
     ) -> TreeTile:
         rows, columns = tile.window
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start

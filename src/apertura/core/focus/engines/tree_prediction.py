@@ -19,8 +19,8 @@ from apertura.core.focus.engines.tree_view import (
     LEAF,
     MOST_SHEETS,
     Counts,
-    Looks,
-    Relief,
+    SurfaceResidual,
+    TileView,
     counts_of,
     look,
     sheets_for,
@@ -34,11 +34,11 @@ _TILES, _CHUNKS_SEEN = 5, 3  # that are looked at
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SampledTiles:
     """A few tiles of one side, each seen from a few chunks."""
 
     surfaces: tuple[Surface, ...]
-    looks: tuple[tuple[Looks, ...], ...]
+    looks: tuple[tuple[TileView, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
     sheets_rad: tuple[tuple[float, float], ...]  # band along heights, and phase of what leaves the surface otherwise
     groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
@@ -51,7 +51,7 @@ class Seen:
 
 
 @lru_cache(maxsize=64)
-def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> Seen:
+def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTiles:
     """Return some tiles, and how they are seen from some chunks."""
     side = min(side_px, job.tile_px, *job.shape)
     whole = [(slice(0, side), slice(0, side))]
@@ -74,22 +74,22 @@ def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> Seen:
         _sheets(job, surface, patch, wavenumber_rad_m=k, band_rad_m=b)
         for surface, patch in zip(surfaces, patches, strict=True)
     )
-    return Seen(surfaces, looks, rough, sheets, tuple(group for group in groups if len(group)))
+    return SampledTiles(surfaces, looks, rough, sheets, tuple(group for group in groups if len(group)))
 
 
 def _sheets(
     job: Job, surface: Surface, patch: NDArray[np.float64], *, wavenumber_rad_m: float, band_rad_m: float
 ) -> tuple[float, float]:
-    """Return what `Seen` says of the sheets of a tile."""
+    """Return what `SampledTiles` says of the sheets of a tile."""
     if not np.isfinite(surface.rough_m):
         return np.inf, np.inf
-    relief = Relief.of(surface, patch)
+    relief = SurfaceResidual.of(surface, patch)
     band = relief.band_rad(job.aperture, wavenumber_rad_m=wavenumber_rad_m, band_rad_m=band_rad_m)
     return band, wavenumber_rad_m * relief.aside_m
 
 
 @lru_cache(maxsize=256)
-def weighed_directly(job: Job, seen: Seen, nodes_db: int) -> float:
+def weighed_directly(job: Job, seen: SampledTiles, nodes_db: int) -> float:
     """Return the part of the groups of pulses that see a tile whose weights no polynomial follows."""
     if job.beams is None:
         return 0.0
@@ -202,7 +202,7 @@ class _Work:
     beside: float
 
 
-def _setting(job: Job, seen: Seen, pulses: int, options: _Options) -> Setting:
+def _setting(job: Job, seen: SampledTiles, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
     design = cells(signal.oversampling, carrier_rad, float(options.oversampling), options.taps)
@@ -316,7 +316,7 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
 
 
 def features(
-    looks: Looks, counts: Counts, options: _Options, signal: Signal, work: "_Work"
+    looks: TileView, counts: Counts, options: _Options, signal: Signal, work: "_Work"
 ) -> list[tuple[float, float]]:
     """Return what one tile and one chunk take by tree: seconds each, and how many."""
     leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]

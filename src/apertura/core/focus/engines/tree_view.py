@@ -122,7 +122,7 @@ _LOOKED_AT = 3  # subapertures of a level, at most
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class TileView:
     """One tile seen from one chunk of pulses.
 
     Attributes
@@ -148,7 +148,7 @@ class Looks:
 
 def look(
     aperture: Aperture, surface: Surface, sizes: tuple[int, ...], *, wavenumber_rad_m: float, band_rad_m: float
-) -> Looks:
+) -> TileView:
     """Return how one tile is seen from one chunk of pulses.
 
     Parameters
@@ -184,7 +184,7 @@ def look(
             most = np.maximum(most, highest(width.max(axis=0)))
         bands.append(most)
     turn, rough = _leaf(aperture, slopes, k + b)
-    return Looks(tuple(bands), turn, rough, 2 * float(np.abs(here).sum(axis=1).max()), phase_rad)
+    return TileView(tuple(bands), turn, rough, 2 * float(np.abs(here).sum(axis=1).max()), phase_rad)
 
 
 def highest(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -306,7 +306,7 @@ class Counts:
     presum_rad: float
 
 
-def counts_of(looks: Looks, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
+def counts_of(looks: TileView, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
     """Return the numbers of nodes of each level, and of pulses that stand for those of a leaf."""
     more = _WEIGHTED if weighted else 0.0
     levels: list[tuple[int, int]] = []
@@ -336,7 +336,7 @@ _SAMPLED = 64  # pulses that are looked at
 
 
 @dataclass(frozen=True, eq=False)
-class Relief:
+class SurfaceResidual:
     """How the pixels of a tile lie off its surface.
 
     Attributes
@@ -357,7 +357,7 @@ class Relief:
     aside_m: float
 
     @classmethod
-    def of(cls, surface: Surface, pixels: NDArray[np.float64]) -> "Relief":
+    def of(cls, surface: Surface, pixels: NDArray[np.float64]) -> "SurfaceResidual":
         """Return that of pixels with places.
 
         Examples
@@ -366,7 +366,7 @@ class Relief:
         >>> plane = np.zeros((2, 2, 3))
         >>> plane[0, 0], plane[0, 1, 0], plane[1, 0, 1] = (1, 0.5, 0), 1, 0.5
         >>> rough = flat + [[[0, 0, 1], [0, 0, -1], [0, 0, 2]]]
-        >>> abs(Relief.of(Surface(plane, plane[0, 0], np.array([0, 0, 1.0]), 1.0), rough).off_m[0])
+        >>> abs(SurfaceResidual.of(Surface(plane, plane[0, 0], np.array([0, 0, 1.0]), 1.0), rough).off_m[0])
         array([1., 1., 2.])
         """
         degree = len(surface.coefficients) - 1
@@ -410,12 +410,12 @@ class Sheets:
         What reading between them may err by.
     """
 
-    relief: Relief
+    relief: SurfaceResidual
     heights_m: NDArray[np.float64]
     error_db: int
 
     @classmethod
-    def of(cls, relief: Relief, band_rad: float, error_db: int) -> "Sheets":
+    def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "Sheets":
         """Return as few sheets as hold a band."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(sheets_for(band_rad, error_db), error_db), error_db)
