@@ -12,7 +12,6 @@ DOCUMENTS = sorted(
     [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config/README.md"]
 )
 CODE = sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("research/**/*.py")])
-GUIDE = ROOT / "docs/finding_your_way.md"
 PLACES = (ROOT, ROOT / "src/apertura")
 SOURCES = ("src", "research", "native", "tests", "workflow", "benchmarks")
 
@@ -143,15 +142,6 @@ def test_a_name_that_a_document_puts_in_a_file_stands_there():
     assert missing(lacking) == {}
 
 
-def test_the_first_name_of_every_answer_of_the_guide_stands_in_its_file():
-    rows = re.findall(r"^\| (.+\?) \| `([^`]+)` \|(.*)\|$", text_of(GUIDE), re.M)
-    assert len(rows) >= 20
-    for question, file, answer in rows:
-        names = re.match(r"(?: `\w+`,?)*", answer)[0]
-        for name in re.findall(r"\w+", names):
-            assert re.search(rf"\b{name}\b", text_of(ROOT / file)), f"{question} {file} has no {name}"
-
-
 def test_every_heading_that_the_code_cites_stands_in_its_document():
     cited = 0
     for source in [*CODE, *ROOT.glob("native/*.?pp"), *ROOT.glob("tests/*.py")]:
@@ -176,10 +166,6 @@ def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_agai
     table = text_of(ROOT / "CONTRIBUTING.md").partition("| layer of")[2]
     rows = re.findall(r"^\| (`[^|]*/`) \| ([^|]*)\|", table, re.M)[: len(checked) - 2]
     assert [set(re.findall(r"`(\w+)/`", layer)) for layer, _ in rows] == [names for names in checked if names]
-    inside = {
-        layer.strip("`/"): [set(re.findall(r"`(\w+)", floor)) for floor in told.split(";")] for layer, told in rows
-    }
-    for contract in contracts[1:]:
-        layer = contract["containers"][0].rpartition(".")[2]
-        if layer in {"core", "pipeline", "views"}:
-            assert inside[layer] == [set(floor.split(" | ")) for floor in contract["layers"]]
+    for names, (_, packages) in zip(filter(None, checked), rows, strict=True):
+        for package in re.findall(r"`(\w+)/`", packages):
+            assert any((ROOT / "src/apertura" / layer / package).is_dir() for layer in names), package
