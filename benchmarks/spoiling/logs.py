@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import gps_from_utc, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from apertura.formats.campaign_files import write_csv_log
 from apertura.simulation.scene import Origin
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

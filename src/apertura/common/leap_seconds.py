@@ -5,7 +5,7 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
-Times = NDArray[np.datetime64]
+from apertura.common.arrays import Times
 
 GPS_EPOCH = np.datetime64("1980-01-06T00:00:00", "ns")
 """Where GPS time begins, without a second between it and UTC."""

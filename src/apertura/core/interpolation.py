@@ -4,9 +4,8 @@ In numpy alone: scipy.signal has the window at whole samples only, and costs a s
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from apertura.common.arrays import Floats
 
 
 def kaiser_beta(rejection_db: float) -> float:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, Adc, Floats
+from apertura.simulation.impairments import STRICT_KEYS, Adc
 from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import digitize, full_scale
 from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate

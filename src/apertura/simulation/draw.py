@@ -10,7 +10,8 @@ import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
-from apertura.simulation.impairments import Blockage, Floats, Impairments, Localization, PhaseWalk, Timing, UniformPhase
+from apertura.common.arrays import Floats
+from apertura.simulation.impairments import Blockage, Impairments, Localization, PhaseWalk, Timing, UniformPhase
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.random import default_rng
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import gps_from_utc
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import pulse_samples
-from apertura.simulation.impairments import Floats
 from apertura.simulation.observation import Observation
 from apertura.simulation.recording import full_scale
 from apertura.simulation.scene import Origin, PointTarget, Target, scatterers

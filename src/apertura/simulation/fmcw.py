@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 
-Floats = NDArray[np.float64]
 Place = tuple[float, float, float]
 
 _LOG_STEP_S = 0.1

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-Floats = NDArray[np.float64]
+from apertura.common.arrays import Floats
+
 STRICT_KEYS = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Of everything that a specification may hold: unknown keys are errors."""
 RadarPoint = Literal["radar_tx", "radar_rx"]

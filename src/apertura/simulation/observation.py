@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.random import Generator
 
+from apertura.common.arrays import Floats
 from apertura.simulation.draw import ImpairmentDraw, draw_impairments, independent_streams
-from apertura.simulation.impairments import AntennaPoint, Floats, Impairments, RadarPoint
+from apertura.simulation.impairments import AntennaPoint, Impairments, RadarPoint
 from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.recording import Geometry, receive
 from apertura.simulation.scene import Scatterers

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.simulation.impairments import Floats
+from apertura.common.arrays import Floats
 from apertura.simulation.radar import TransmitWaveform
 
 Complex = NDArray[np.complex128]

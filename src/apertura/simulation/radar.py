@@ -7,8 +7,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.simulation.impairments import Floats
 from apertura.simulation.scene import Scatterers
 
 

@@ -7,9 +7,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.draw import ImpairmentDraw
-from apertura.simulation.impairments import Adc, ChannelName, Floats, Impairments, Ripple
+from apertura.simulation.impairments import Adc, ChannelName, Impairments, Ripple
 from apertura.simulation.radar import Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Channel, Complex, path_spectrum

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from apertura.common.arrays import Floats
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS, Floats
+from apertura.simulation.impairments import STRICT_KEYS
 
 Vector = tuple[float, float, float]
 

@@ -13,11 +13,12 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
+from apertura.common.arrays import Floats
 from apertura.common.documents import read_yaml, validated
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Floats, Impairments, RadarPoint
+from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
 from apertura.simulation.radar import TransmitWaveform
 from apertura.simulation.scene import Origin, Target, Vector
 from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from apertura.simulation.impairments import Floats
+from apertura.common.arrays import Floats
 from apertura.simulation.radar import Paths, TransmitWaveform
 
 Complex = NDArray[np.complex128]

@@ -9,8 +9,9 @@ from numpy.random import Generator
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from apertura.common.arrays import Floats
 from apertura.core.geometry.geodesy import body_axes, ned_axes
-from apertura.simulation.impairments import STRICT_KEYS, Floats
+from apertura.simulation.impairments import STRICT_KEYS
 from apertura.simulation.scene import Origin, Vector
 
 

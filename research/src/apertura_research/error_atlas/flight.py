@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.antenna.pattern import antenna_axes, gaussian_cut
@@ -22,16 +23,7 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.recording import Geometry
 from apertura.simulation.trajectory import GaussianBeam, Sampled, Straight, Wobble
-from apertura_research.study.paper_scene import (
-    RX_AHEAD_M,
-    Complexes,
-    Disturbance,
-    PaperScene,
-    receive_pair,
-    reduced_scene,
-)
-
-Floats = NDArray[np.float64]
+from apertura_research.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")
 """A node that sends and receives, and one ahead of it that receives."""

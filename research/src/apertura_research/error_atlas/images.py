@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.focus.engines import load_engine
 from apertura.core.imaging.certify import certified
@@ -20,7 +21,7 @@ from apertura.core.planning.planner import make_plan
 from apertura.core.quality.point_targets import locate_maximum
 from apertura.core.scene.terrain import GroundModels
 from apertura.pipeline.opening.images import agreement_by_focus
-from apertura_research.error_atlas.flight import GRID, PAIRS, Flight, Floats, Heard, Told
+from apertura_research.error_atlas.flight import GRID, PAIRS, Flight, Heard, Told
 
 ACCURACY_DB = -70.0
 """Worse arithmetic moves the flat tops of wide lobes by millimetres."""

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
+from apertura.common.arrays import Floats
 from apertura.core.geometry.phase_centres import position_spline
 from apertura.core.geometry.track_checks import CheckedTrack, check_track
 from apertura.core.quality.budget import NodePositions
-from apertura_research.error_atlas.flight import Flight, Floats, Told
+from apertura_research.error_atlas.flight import Flight, Told
 
 NOISE_M = 0.002
 """Of every epoch by itself."""

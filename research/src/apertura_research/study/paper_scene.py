@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.observation import Observation, observe
 from apertura.simulation.presets import paper_scene, paper_waveform
@@ -14,8 +14,6 @@ from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import transfer_functions
 from apertura_research.study.dft_window import demodulated, window_samples
-
-Complexes = NDArray[np.complex64]
 
 LENGTH_M = 30.0
 """Aperture, flown at 1 m/s."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.core.echo.demodulate import remove_path
@@ -14,9 +15,7 @@ from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import half_power_width, locate_maximum
-from apertura_research.study.paper_scene import Complexes, PaperScene, receive_undisturbed
-
-Floats = NDArray[np.float64]
+from apertura_research.study.paper_scene import PaperScene, receive_undisturbed
 
 SWATH_MARGIN_M = 6.0
 """Total path kept beyond the targets on both sides: the neighbourhoods of the peaks, and the taps of the engine."""

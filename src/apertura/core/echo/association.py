@@ -7,13 +7,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.echo.trigger import ABSENT
 
 # ---- How the time tags of two nodes lie to each other: an offset, a drift, and the pairs that follow from them
 
 Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Pairs = tuple[Integers, Integers]
 """Something of the transmitter and the same of the receiver: tags, or indices of paired pulses."""
 

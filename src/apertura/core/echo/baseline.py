@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from apertura.common.arrays import Floats
 
 EXPLAINED_M = 0.05
 """Movement of a sidelink that errors of the logged positions alone may explain."""

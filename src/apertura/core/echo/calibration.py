@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammainccinv, gammaincinv
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import AT_ONCE
-
-Complexes = NDArray[np.complex64]
-Floats = NDArray[np.float64]
 
 FALSE_REFLECTOR = 1e-3
 """Chance that clutter or noise alone passes for a reflector."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc
 
@@ -117,8 +118,6 @@ class _Extreme:
 
 # ---- Captures of a clock that runs off, as a clock that runs true would have taken them ----------------------------
 
-Complexes = NDArray[np.complex64]
-Floats = NDArray[np.float64]
 
 _REJECTION_DB = 100.0
 

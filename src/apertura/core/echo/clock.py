@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.captures import AT_ONCE, Complexes, Floats, spread
+from apertura.common.arrays import Complexes, Floats
+from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 
 SIGMAS = 3.0

@@ -7,10 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.compression import phasors
-
-Complexes = NDArray[np.complex64]
-Floats = NDArray[np.float64]
 
 LOCK_FALSE_ALARM = 1e-3
 """Chance that a pulse of pure noise passes for one with a sidelink."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-Floats = NDArray[np.float64]
+from apertura.common.arrays import Floats
 
 BAND_FLOOR_DB = -10.0
 """A band that nobody states ends where the power of the pulse falls this far below its highest."""

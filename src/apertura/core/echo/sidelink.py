@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.line_of_sight import Complexes, LineOfSight, fit_line_of_sight, phasor
+from apertura.common.arrays import Complexes
+from apertura.core.echo.line_of_sight import LineOfSight, fit_line_of_sight, phasor
 from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]

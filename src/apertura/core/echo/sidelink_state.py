@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import AT_ONCE
-from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, Complexes, Floats, LineOfSight, fit_block, joined
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, fit_block, joined
 
 # ---- The pulses of a sidelink averaged, each aligned to its direct path: what they have in common and what changes
 

@@ -11,21 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags.raised import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
-from apertura.core.echo.captures import (
-    Complexes,
-    Floats,
-    Pulses,
-    Read,
-    Samples,
-    Saturation,
-    blocks_of,
-    correct_clock,
-    spread,
-)
+from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, correct_clock, spread
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of, decide_clock
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from apertura.common.arrays import Complexes
 from apertura.core.echo.captures import Samples
 
 # ---- What is sent before each symbol: a preamble that triggers, and a payload that counts --------------------------
@@ -100,7 +101,6 @@ class Framing:
 # ---- Finding the pulses in a recording that never stops: correlation with the preamble, at a set rate of false
 # alarms
 
-Complexes = NDArray[np.complex64]
 
 _SMALLEST_TRANSFORM = 2**16
 _SILENT = 1e-10  # of the energy of a window, under a preamble: rounding of its transform

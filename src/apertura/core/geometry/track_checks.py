@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.geometry.phase_centres import position_spline
 
 # ---- What is wrong with single epochs of a flight log: spikes and steps --------------------------------------------
@@ -15,7 +16,6 @@ from apertura.core.geometry.phase_centres import position_spline
 # what, once it is taken out, leaves its neighbours smooth. Movement that the log samples badly does not become smooth
 # that way, and is left alone.
 
-Floats = NDArray[np.float64]
 
 MATTERS_M = 5e-3
 """Errors of single epochs below this are the log's noise, whatever it is."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError, shown
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL
@@ -33,8 +34,6 @@ MOST_POSTS = 100_000_000
 
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

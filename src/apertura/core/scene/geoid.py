@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.raster import LARGEST_BLOCK, opened_raster
@@ -34,8 +34,6 @@ _GTX = struct.Struct(">4d2i")
 
 _EXPECTED = "a .gtx or .tif grid of undulations, as PROJ's collection has them"
 _REMEDY = "Get that file again, or correct scene.geoid."
-
-Floats = NDArray[np.float64]
 
 
 def check_grid(path: Path) -> None:

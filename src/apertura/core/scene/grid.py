@@ -6,12 +6,11 @@ from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from apertura.common.arrays import Floats
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
 from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_crs, grid_mapping
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

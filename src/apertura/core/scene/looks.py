@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import reached
@@ -25,8 +26,6 @@ _EXACT = (64, 8, 1)  # a pulse of so many is asked, until one sees the pixel
 _DARK_PULSES = 64  # that tell the centres of a block that no pulse reaches, for its neighbours
 _UNLIT = 1e6  # how much worse a pulse without weight is as a centre
 _JUMP_PITCHES = 4.0  # between nodes a centre moves less, unless it goes over to another pass
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
 
@@ -13,7 +14,6 @@ from apertura.core.scene.grid import SceneGrid
 #
 # Whoever needs heights holds a `Terrain` and asks it for those of a grid, of a window of it, or of single pixels.
 
-Floats = NDArray[np.float64]
 
 _TILE_PX = 512  # heights at single pixels are read by such tiles
 

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
@@ -194,8 +195,6 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
 EARTH_RADIUS_M = 6371e3
 
 _STRIP = 256  # rows of heights read at once
-
-Floats = NDArray[np.float64]
 
 
 def surface_normals(position: Floats) -> Floats:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.atomic import replacement
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import geodetic_from_ecef
@@ -16,7 +17,6 @@ from apertura.core.geometry.geodesy import geodetic_from_ecef
 # ---- What a CPHD file says of a pair besides its samples: where and when, of which scene, and each pulse's
 # parameters
 
-Floats = NDArray[np.float64]
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
 """Parameter of each pulse beside those of the standard: total path beyond which an echo leaves the prefix, m."""

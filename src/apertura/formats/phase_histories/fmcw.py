@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
@@ -32,8 +33,6 @@ _LEAST_STEP = 0.9
 
 _EXPECTED = "beat signals (sweep, sample), real or complex as waveform.iq says, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
-
-Times = NDArray[np.datetime64]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.common.flags.raised import Flags
 
@@ -21,8 +22,6 @@ LARGEST = 1e30
 _BLOCK_BYTES = 8 << 20
 _EARTH_M = (6.3e6, 1e8)
 """How far from the Earth's centre an antenna may be: below any ground, beyond any orbit that images."""
-
-Floats = NDArray[np.float64]
 
 
 class Samples(Protocol):

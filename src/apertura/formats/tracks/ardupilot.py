@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import gps_from_weeks, utc_from_gps
 from apertura.formats.isolated import UnreadableError, read_isolated
@@ -17,7 +18,6 @@ from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.track import FIXES
 
 Fields = Mapping[str, NDArray[Any]]
-Floats = NDArray[np.float64]
 
 _KINDS = {3: FIXES["single"], 4: FIXES["dgps"], 5: FIXES["float"], 6: FIXES["fix"]}
 """GPS.Status; below 3 there is no height."""

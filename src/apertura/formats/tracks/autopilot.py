@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import utc_times
@@ -15,7 +16,6 @@ from apertura.formats.tracks.track import make_track
 
 # ---- An autopilot's clock, which counts from its start, against UTC: the line through what its receiver tells ------
 
-Floats = NDArray[np.float64]
 
 _AGREES_S = 0.25  # receivers' messages are late by about 0.1 s, and now and then by some tens of milliseconds more
 _FASTEST = 1e-4  # the worst of quartz clocks

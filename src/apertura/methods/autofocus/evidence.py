@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.budget import noise_loss
 from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
@@ -17,7 +18,6 @@ from apertura.methods.autofocus.solve import Problem, State
 
 # ---- What a refinement leaves unknown of the tracks ----------------------------------------------------------------
 
-Floats = NDArray[np.float64]
 
 MOST_RATIO = 1e3
 """A point's neighbours, not its noise, bound what its phase tells."""

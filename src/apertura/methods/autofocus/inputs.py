@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -102,7 +103,6 @@ class ReferencePoint:
 
 # ---- What is known of the errors of tracks before the image is asked: white noise that is smoothed, and slow modes
 
-Floats = NDArray[np.float64]
 
 SLOW_MODES = 4
 """Offset, slope, and half a sine and cosine over the flight."""

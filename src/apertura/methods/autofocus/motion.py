@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex64]
 Placed = Callable[[Floats], Aperture]
 """Seconds of the log's clock (time,), inside the log → phase centres."""
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.inputs import Profiles
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 # ---- Blocks of pulses: what tracks are corrected by, and what each block of a pair adds to the patches -------------
 
-Floats = NDArray[np.float64]
 Tracks = Mapping[str, Floats]
 
 _PULSES = 4096  # read at once

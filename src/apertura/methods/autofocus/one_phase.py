@@ -8,13 +8,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.quality.path_errors import PointPaths
 from apertura.methods.autofocus.inputs import NodePrior, TrackErrors
 
 # ---- Whether one phase per pulse mends a scene: how much the path errors of its edges differ from those of its
 # middle
 
-Floats = NDArray[np.float64]
 
 MOST_LOSS_DB = 0.1
 """Of peak that one phase per pulse may leave at the scene's edges where it is enough."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.engines import load_engine
 from apertura.core.focus.inputs import Profiles
@@ -18,7 +19,6 @@ from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
 
 # ---- Patches of the scene about bright places, and the pixels that their images are asked at -----------------------
 
-Floats = NDArray[np.float64]
 
 MOST_PATCHES, CLEAR = 32, 20.0
 """Patches are taken until they tell as much as a dozen whose points stand out so many times."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -16,9 +17,6 @@ from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, affordable, bandwidth_hz
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _FOLDS = 4  # each of so many parts of the patches is held out once
 _APART_CELLS = 2.0  # of range, c/B of total path

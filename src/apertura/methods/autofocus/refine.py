@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
@@ -28,7 +28,6 @@ from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle,
 # ---- The image tied down where sharpness leaves it free: pairs to each other, and all to points whose places are
 # known
 
-Floats = NDArray[np.float64]
 
 _LEAST_RATIO = 30.0  # peak power of a point against its surroundings
 _LEAST_STD_M = 0.01  # of a point's place in one pair against another: what scatters need not be the same spot
@@ -177,7 +176,6 @@ def _rms(misses: Floats) -> float:
 
 # ---- Tracks of a flight refined by the images of all its pairs together --------------------------------------------
 
-Bools = NDArray[np.bool_]
 
 FOLDS = 4
 """A quarter of the patches is not fitted, and tells whether the others are to be believed."""

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Bools, Floats
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.methods.autofocus.inputs import Prior
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, PatchImage, Sharpness, Tracks, phases
@@ -14,7 +15,6 @@ from apertura.methods.autofocus.patches import Patch
 
 # ---- What sharpness does not see of the tracks and yet moves the image: held where the log has it ------------------
 
-Floats = NDArray[np.float64]
 
 SEEN_RAD = 0.03
 """A mode that turns phases by less, rms over the aperture per standard deviation of the log, is not seen."""
@@ -171,7 +171,6 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
 
 # ---- Tracks that make the patches sharpest without leaving what the log allows -------------------------------------
 
-Bools = NDArray[np.bool_]
 
 ITERATIONS = 20
 """Steps towards the sharpest tracks before contributions are cached anew."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
@@ -19,7 +20,6 @@ from apertura.methods.autofocus.solve import Gauge, minimal
 
 # ---- The scene in squares that share it out: what two pairs are compared on ----------------------------------------
 
-Floats = NDArray[np.float64]
 
 MOST_TILES = 64
 """Of a larger scene so many tiles about its middle are taken."""
@@ -310,7 +310,6 @@ class SpeckleTiles:
 
 # ---- Tracks refined where no point stands out: by the speckle that two pairs see alike -----------------------------
 
-Bools = NDArray[np.bool_]
 
 LEAST_COHERENCE = 0.75
 """Of tiles that were not fitted: less is left by tracks that are cycles wrong."""

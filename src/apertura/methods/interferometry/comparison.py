@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.methods.interferometry.coherence import chance, formed, unbiased
 from apertura.methods.interferometry.heights import (
@@ -129,8 +130,6 @@ def raised(measured: InterferogramCounts) -> dict[str, str]:
 
 LEAST_SPREAD = 4.0
 """Looks that a window's energy must be spread over: else a point beside its middle is all that it tells."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

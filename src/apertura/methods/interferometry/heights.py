@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.methods.interferometry.sensitivity import Sensitivity
 from apertura.methods.interferometry.unwrapping import Unwrapped
 
@@ -118,7 +119,6 @@ BY_CHANCE = 1e-3
 MARGIN = 1.4
 """How much more the phase of simulated ground scatters than its bound, at most."""
 
-Floats = NDArray[np.float64]
 
 _STEPS = 30  # of the search for the pixel that shows a place
 _MOST_COVERED = 1.5  # twice is folded over

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 
-Floats = NDArray[np.float64]
 Legs = tuple[Floats, Floats]
 """Phase centres of transmitter and receiver of the pulses that make each place, (place, pulse, 3) metres each."""
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import phasors, turned
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
@@ -15,8 +15,6 @@ from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offset
 #
 # First when the node moved, then where its echoes add up: here at a point whose place is known.
 
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex64]
 MOST_PULSES = 1024
 """That offsets are tried on."""
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import centre_frequency, compress, range_step
 from apertura.core.focus.engines import load_engine
@@ -20,8 +21,6 @@ from apertura.methods.synchronisation.clock_alignment import (
     polished,
     widths,
 )
-
-Floats = NDArray[np.float64]
 
 MOST_PIXELS = 96
 """Along a side of the image that offsets are tried on."""

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.check.clocks import clock, gap_s, likely_cause, shift_s
 from apertura.pipeline.check.inspected import Inspected, Key
-from apertura.pipeline.check.tags import Times, paired, span
+from apertura.pipeline.check.tags import paired, span
 from apertura.pipeline.config import CONFIG
 
 

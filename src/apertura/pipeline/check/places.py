@@ -5,13 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.pipeline.check.hints import likely_place
 from apertura.pipeline.check.inspected import Inspected, Key
-from apertura.pipeline.check.tags import Times, paired, span
+from apertura.pipeline.check.tags import paired, span
 from apertura.pipeline.config import CONFIG, Flight, LeverArms, SampledWaveform
 
 _TAGS = 256  # of a pair at which distances are taken

@@ -5,13 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.recordings.recording import Recording
 from apertura.pipeline.check.clocks import clock, gap_s, likely_cause, shift_s
 from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.config import CONFIG, SEGMENTS
-
-Times = NDArray[np.datetime64]
 
 _OFF = 0.2
 """Spacings further from 1/prf_hz than this share of it are others: tags are good to a few ms, some are whole ms."""

@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import aperture_of, phase_history_of
 from apertura.pipeline.opening.acquisition import Acquisition
-from apertura.pipeline.opening.node_log import Times
 
 # ---- What may be wrong with a flight, as geometries to try: each suspicion with the echoes as they would be then
 

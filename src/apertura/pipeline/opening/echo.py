@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags.raised import Flags
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
@@ -20,11 +21,8 @@ from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
-from apertura.pipeline.opening.node_log import Times
 from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
-
-Complexes = NDArray[np.complex64]
 
 
 @dataclass(frozen=True, eq=False)

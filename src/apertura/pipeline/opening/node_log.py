@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.phase_centres import attitude_axes, phase_centres, position_spline
 from apertura.core.geometry.track_checks import CheckedTrack, check_track
@@ -15,8 +16,6 @@ from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
 from apertura.pipeline.opening.reading import read_log
-
-Times = NDArray[np.datetime64]
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags.raised import Flags
 from apertura.core.geometry.track_checks import CheckedTrack
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node
-from apertura.pipeline.opening.node_log import NodeLog, Times
+from apertura.pipeline.opening.node_log import NodeLog
 
 # ---- Which pulses of a flight image a pair: those inside its lines of segments.tsv ---------------------------------
 

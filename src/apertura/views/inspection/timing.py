@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Times = NDArray[np.datetime64]
+from apertura.common.arrays import Times
 
 NAMED = 10
 """Gaps that are named one by one, the longest."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.reading import read_phase_history
@@ -16,7 +17,7 @@ from apertura.pipeline.check.tags import span
 from apertura.views.inspection.log import fixes
 from apertura.views.inspection.recording import LOST, within
 from apertura.views.inspection.report import Report
-from apertura.views.inspection.timing import Times, counted, timing
+from apertura.views.inspection.timing import counted, timing
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
@@ -36,8 +37,6 @@ from apertura.views.report.phase import draw_phase, sidelink_error_rad
 from apertura.views.report.pulses import PulseRecord, draw_pulses
 from apertura.views.report.sheet import thinned
 from apertura.views.report.waterfall import Waterfall, draw_waterfall
-
-Floats = NDArray[np.float64]
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:

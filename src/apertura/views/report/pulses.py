@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.views.report.sheet import BLUE, GREY, RED, column_of, sheet, thinned
-
-Floats = NDArray[np.float64]
 
 _BINS = 60
 

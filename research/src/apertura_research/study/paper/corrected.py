@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.captures import correct_clock
 from apertura.core.echo.clock import estimate_clock
 from apertura.core.echo.demodulate import Numerology
@@ -15,14 +16,12 @@ from apertura_research.study.paper.claims import Claim, require
 from apertura_research.study.paper_scene import (
     RX_AHEAD_M,
     UNDISTURBED,
-    Complexes,
     Disturbance,
     PaperScene,
     receive_pair,
     reduced_scene,
 )
 from apertura_research.study.point_response import (
-    Floats,
     amplitude_db,
     error_floor_db,
     find_peaks,

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.impairments import Impairments, Timing, UniformPhase
 from apertura.simulation.recording import straight_pair
@@ -14,7 +14,6 @@ from apertura_research.study.paper.experiments import profiles_at
 from apertura_research.study.paper_scene import UNDISTURBED, Disturbance, PaperScene, receive_pair, reduced_scene
 from apertura_research.study.point_response import phase_history
 
-Complexes = NDArray[np.complex64]
 TIMING_S, SMALL_TIMING_S = 1e-9, 0.5e-9
 TARGET_M = 15.0
 _SLANT_M = np.linspace(17.5, 18.7, 4801)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
@@ -22,7 +22,6 @@ from apertura_research.study.paper.experiments import (
 )
 from apertura_research.study.paper.fusion import Images, open_images
 
-Floats = NDArray[np.float64]
 BLUE, ORANGE, GREEN, BLACK = "#0072B2", "#D55E00", "#009E73", "black"
 """Okabe and Ito's, which the colour-blind tell apart."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.transfer import transfer_by_code
 from apertura.core.focus.engines import reference
@@ -17,9 +18,7 @@ from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.results import OpenCampaign, open_campaign
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
-from apertura_research.study.paper_scene import Complexes
 
-Floats = NDArray[np.float64]
 FLIGHT, MONOSTATIC, BISTATIC = "f01", "uav1-uav1", "uav1-uav2"
 WINDOW = "hann"
 

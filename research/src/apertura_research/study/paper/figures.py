@@ -8,13 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.focus.engines import numba
 from apertura.core.imaging.backproject import backproject
 from apertura.core.scene.grid import SceneGrid
 from apertura.views.chart.png import save_png
 from apertura_research.study.paper.losses import ERRORS, history_of
-from apertura_research.study.paper_scene import UNDISTURBED, Complexes, PaperScene, receive_pair
-from apertura_research.study.point_response import Floats, amplitude_db, find_peaks, range_tables, undisturbed_tables
+from apertura_research.study.paper_scene import UNDISTURBED, PaperScene, receive_pair
+from apertura_research.study.point_response import amplitude_db, find_peaks, range_tables, undisturbed_tables
 
 SHOWN: Mapping[str, tuple[str, float]] = {
     "no_errors": ("timing", 0.0),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.quality.measures import Amplitude
 from apertura.core.quality.point_targets import Cut, cut_through, find_peak
 from apertura.simulation.experiments import GAP_M, SEGMENT_M
@@ -20,7 +21,6 @@ from apertura_research.study.paper.experiments import (
     terms_at,
 )
 
-Floats = NDArray[np.float64]
 EAST, NORTH = (1.0, 0.0), (0.0, 1.0)
 REACH_M = 1.5
 """How far cuts go, and what is left out about each target where clutter is measured."""

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.sidelink import divide
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.simulation.impairments import Clock, Timing
@@ -15,13 +16,12 @@ from apertura_research.study.paper.claims import Claim, compare
 from apertura_research.study.paper_scene import (
     NO_IMPAIRMENTS,
     RX_AHEAD_M,
-    Complexes,
     Disturbance,
     PaperScene,
     receive_pair,
     reduced_scene,
 )
-from apertura_research.study.point_response import REACH_M, Floats, find_peaks, range_tables, undisturbed_tables
+from apertura_research.study.point_response import REACH_M, find_peaks, range_tables, undisturbed_tables
 from apertura_research.study.stability.sweeps import SWEEPS, Sweep
 
 DESTROYED_DB = -12.0

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 from apertura.simulation.impairments import Impairments, Localization
@@ -13,7 +14,7 @@ from apertura.simulation.synthesis import transfer_functions
 from apertura_research.study.paper.claims import Claim, compare, require
 from apertura_research.study.paper.losses import ERRORS, peak_losses_db
 from apertura_research.study.paper_scene import RX_AHEAD_M, reduced_scene
-from apertura_research.study.point_response import Floats, amplitude_db, find_peaks, phase_history, range_tables
+from apertura_research.study.point_response import amplitude_db, find_peaks, phase_history, range_tables
 
 PRINTED_CM = 2.0
 DRAWS = 20

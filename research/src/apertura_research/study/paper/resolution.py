@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
 from apertura_research.study.paper.claims import EXPLAINED, Claim, compare
@@ -13,8 +14,8 @@ from apertura_research.study.paper.formulas import (
     cross_range_resolution_m,
     ground_range_resolution_m,
 )
-from apertura_research.study.paper_scene import Complexes, PaperScene, reduced_scene
-from apertura_research.study.point_response import Floats, find_peaks, half_power_widths, mean_image, undisturbed_tables
+from apertura_research.study.paper_scene import PaperScene, reduced_scene
+from apertura_research.study.point_response import find_peaks, half_power_widths, mean_image, undisturbed_tables
 
 WITHIN = 0.05
 """Share by which widths may differ and still agree."""

@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.sidelink import divide
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps.ingest import ingest
@@ -15,8 +16,8 @@ from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Impairments, Timing, UniformPhase
 from apertura.simulation.recording import straight_pair
 from apertura_research.study.paper.claims import Claim, compare, require
-from apertura_research.study.paper_scene import Complexes, Disturbance, receive_pair, reduced_scene
-from apertura_research.study.point_response import Floats, mean_image, phase_history, range_tables
+from apertura_research.study.paper_scene import Disturbance, receive_pair, reduced_scene
+from apertura_research.study.point_response import mean_image, phase_history, range_tables
 
 RECEIVERS = 4
 SPACING_M = 4.7

@@ -4,15 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.methods.autofocus.inputs import TrackErrors
 
 PULSES_HZ = 100.0
 NODES = ("uav1", "uav2")
 _APART_M = 4.7
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

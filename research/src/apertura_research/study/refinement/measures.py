@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from time import process_time
 
 import numpy as np
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.focus.engines import native
 from apertura.core.focus.engines.native_tables import Tables
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -16,8 +16,6 @@ from apertura_research.study.refinement.scenes import GRID
 
 UNCORRECTED = TrackCorrection(np.zeros(1), {})
 _LOOKS = ((33, 25), (9, 9), (9, 9))  # places east and north of an ever closer look for a peak
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

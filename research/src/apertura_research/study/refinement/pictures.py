@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.focus.engines import native
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
@@ -36,8 +36,6 @@ _PANELS: list[Any] = [
 ]
 _COLOURS = ("#0072b2", "#d55e00")
 _LETTERS = 125  # of a line of the title
-
-Floats = NDArray[np.float64]
 
 
 def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int = SEED) -> None:

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.scene.grid import SceneGrid
 
 AREA_M = (-9.0, 5.0, 9.0, 25.0)
 GRID = SceneGrid("local", -10.0, 26.0, 0.05, (440, 400))
 CELL_M2 = 0.07 * 0.4
 """A resolution cell of the flight past the scene, roughly."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

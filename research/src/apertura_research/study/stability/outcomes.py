@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.core.echo.line_of_sight import fit_line_of_sight
 from apertura.core.echo.sidelink import METHODS, choose, measure
 from apertura.core.focus.inputs import PhaseHistory
 from apertura_research.study import point_response
-from apertura_research.study.paper_scene import Complexes, receive_pair
-from apertura_research.study.point_response import Floats, find_peaks, mean_image
+from apertura_research.study.paper_scene import receive_pair
+from apertura_research.study.point_response import find_peaks, mean_image
 from apertura_research.study.stability.sweeps import SWEEPS, Sweep
 
 REFUSED_DB = 40.0

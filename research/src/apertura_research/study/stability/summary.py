@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from apertura.common.arrays import Floats
 from apertura.common.tables import read_table, write_table
-from apertura_research.study.point_response import Floats
 from apertura_research.study.stability.outcomes import Outcome
 from apertura_research.study.stability.sweeps import CHOICES, SWEEPS
 
