@@ -26,9 +26,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.antenna.illumination import illuminate
-from apertura.core.antenna.pattern import gaussian_cut
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.tiles import compute_tiles

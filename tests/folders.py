@@ -32,7 +32,6 @@ from apertura.pipeline.steps import (
     ro_crate,
     scene,
     stac,
-    terrain,
 )
 from apertura.pipeline.store import open_stage
 from apertura.simulation import (
@@ -74,7 +73,7 @@ def settle_ground(campaign: Campaign) -> None:
     """Run the steps between echo and profile."""
     scene.scene(campaign)
     if campaign.settings.scene.dem:
-        terrain.terrain(campaign)
+        scene.terrain(campaign)
 
 
 def ingest_all(campaign: Campaign) -> None:

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.antenna.beam import Beam
-from apertura.core.antenna.pattern import antenna_axes, gaussian_cut
+from apertura.core.antenna.beam import Beam, antenna_axes, gaussian_cut
 from apertura.core.focus.engines import native, native_binding
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Job, Signal

@@ -19,9 +19,8 @@ from scenes import (
     swaying_beam,
 )
 
-from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.antenna.illumination import illuminate
-from apertura.core.antenna.pattern import antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.focus.engines import load_engine, native, reference
 from apertura.core.focus.engines.native_prediction import NO_BEAMS, PatchWeights, patch_weights, pixel_seconds
 from apertura.core.geometry.aperture import Aperture

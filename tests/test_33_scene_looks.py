@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 from scenes import monostatic, straight_track
 
-from apertura.core.antenna.beam import Beam, Beams
-from apertura.core.antenna.pattern import gaussian_cut
+from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.lattice import BLOCK_PX
-from apertura.core.scene.looks import Looks
+from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
 
 GROUND = FlatGround(0.0)

@@ -12,9 +12,17 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.interferometry.comparison import AssumedGround, compared, raised
-from apertura.methods.interferometry.heights import Known, Level, level, levelled, placed
+from apertura.methods.interferometry.heights import (
+    Known,
+    Level,
+    Unwrapped,
+    contradictions,
+    level,
+    levelled,
+    placed,
+    unwrap,
+)
 from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
-from apertura.methods.interferometry.unwrapping import Unwrapped, contradictions, unwrap
 
 FREQUENCY = 1.0e9 + np.arange(128) * 400e6 / 128
 WAVELENGTH = C / FREQUENCY.mean()
@@ -274,7 +282,7 @@ def test_without_the_library_the_phase_stays_within_a_turn_and_says_so(monkeypat
     def missing(name):
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr("apertura.methods.interferometry.unwrapping.version", missing)
+    monkeypatch.setattr("apertura.methods.interferometry.heights.version", missing)
     _, wrapped = ramp_of_phase(0.5)
     told = unwrap(wrapped.astype(np.float32), np.full(wrapped.shape, 0.9, np.float32), looks=9.0)
     np.testing.assert_array_equal(told.phase, wrapped.astype(np.float32))

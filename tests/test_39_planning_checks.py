@@ -7,7 +7,7 @@ from scenes import ground_points, monostatic, plan, planning_job, straight_track
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.planning.checks import check_geometry
+from apertura.core.planning.plan import check_geometry
 
 
 def test_a_spacing_coarser_than_the_cell_is_flagged_with_the_number():

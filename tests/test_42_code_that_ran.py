@@ -28,7 +28,6 @@ from apertura.pipeline.steps import (
     ro_crate,
     scene,
     stac,
-    terrain,
 )
 from apertura.views.report import pictures
 from apertura.views.report import step as page
@@ -39,7 +38,7 @@ STEPS = {
     "echo": echo.echo,
     "calibration": calibration.calibrate,
     "scene": scene.scene,
-    "terrain": terrain.terrain,
+    "terrain": scene.terrain,
     "profile": profile.profile,
     "refined_track": refine.refine,
     "image": image.image,

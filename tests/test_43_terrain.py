@@ -21,7 +21,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of, plan_pair
 from apertura.pipeline.opening.scene import ConfiguredGround, expected_scene, open_scene, settled_scene
-from apertura.pipeline.steps import profile, scene, terrain
+from apertura.pipeline.steps import profile, scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
@@ -331,4 +331,4 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
 def test_a_stage_terrain_without_a_dem_says_so(tiny):
     campaign = Campaign.load(tiny)
     scene.scene(campaign)
-    assert "scene.dem: no DEM" in complaint(lambda: terrain.terrain(campaign))
+    assert "scene.dem: no DEM" in complaint(lambda: scene.terrain(campaign))

@@ -13,9 +13,8 @@ from folders import contents, copy_writable
 from rasterio.warp import transform_bounds
 from rocrate.rocrate import ROCrate
 
-from apertura.common.environment import lock_sha256, software
 from apertura.common.errors import CampaignError
-from apertura.common.provenance import sha256_file
+from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.crate_check import changed_files
 from apertura.formats.catalog.validation import stac_problems

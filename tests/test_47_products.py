@@ -12,9 +12,8 @@ from folders import run_steps
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
-from apertura.common.environment import packages, software
 from apertura.common.paths import shipped
-from apertura.common.provenance import Provenance, sha256_file
+from apertura.common.provenance import Provenance, packages, sha256_file, software
 from apertura.core.focus.engines import instruction_set
 from apertura.formats.export import exports_in, product_files
 from apertura.pipeline.store import open_stage, read_manifest

@@ -20,7 +20,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight
 from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps import cube, echo, export, image, ingest, profile, scene, terrain
+from apertura.pipeline.steps import cube, echo, export, image, ingest, profile, scene
 from apertura.pipeline.store import open_stage
 
 
@@ -85,7 +85,7 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
         echo.echo(campaign, flight.name, pair)
     scene.scene(campaign)
     if campaign.settings.scene.dem:
-        terrain.terrain(campaign)
+        scene.terrain(campaign)
     for pair in flight.pairs:
         profile.profile(campaign, flight.name, pair)
     if util.find_spec("apertura.pipeline.steps.refine"):

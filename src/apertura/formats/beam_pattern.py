@@ -7,8 +7,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
-from apertura.core.antenna.pattern import LIMITS_RAD
-from apertura.formats.tracks.tables import numbers, read_table
+from apertura.core.antenna.beam import LIMITS_RAD
+from apertura.formats.tracks.csv_track import numbers, read_table
 
 Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 """One sampled cut: angles from boresight (deg), growing, and gain (dB)."""

@@ -54,7 +54,7 @@ def scene(campaign: Directory = HERE) -> None:
 @app.command()
 def terrain(campaign: Directory = HERE) -> None:
     """Bring the DEM onto the campaign's grid, terrain.zarr."""
-    _run("apertura.pipeline.steps.terrain:terrain", campaign)
+    _run("apertura.pipeline.steps.scene:terrain", campaign)
 
 
 @app.command()

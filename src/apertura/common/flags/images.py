@@ -5,7 +5,7 @@ from apertura.common.flags.flag import Flag
 OF_IMAGES = {
     "platform_inside_scene": Flag(
         "pulses above the scene, of all", "pulses above the scene: echoes of both sides mix", "scene.bounds_m",
-        "core/planning/checks.py"),
+        "core/planning/plan.py"),
     "platform_below_scene": Flag(
         "m below the lowest ground of the scene", "an antenna is lower than all of a DEM beside it",
         "unit and datum of scene.dem", "core/scene/clearance.py"),
@@ -20,11 +20,11 @@ OF_IMAGES = {
         "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
     "spacing_coarse": Flag(
         "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
-        "scene.spacing_m", "core/planning/checks.py"),
+        "scene.spacing_m", "core/planning/plan.py"),
     "pulses_sparse": Flag(
         "spread of phase rates over the scene, cycles per pulse; 1 is unambiguous",
         "the aperture is undersampled: azimuth ambiguities", "scene.bounds_m; speed and waveform.prf_hz",
-        "core/planning/checks.py"),
+        "core/planning/plan.py"),
     "pulses_missing": Flag(
         "missing pulses, of all in the aperture, and dB of the sidelobes they raise",
         "pulses missing inside the aperture, dropped or never recorded, raise sidelobes above −20 dB along the track",
@@ -32,7 +32,7 @@ OF_IMAGES = {
     "beyond_cyclic_prefix": Flag(
         "share of the scene that arrives too late",
         "part of the scene lies beyond the prefix, or the listening time, of every pulse", "scene.bounds_m",
-        "core/planning/checks.py"),
+        "core/planning/plan.py"),
     "scene_beyond_samples": Flag(
         "share of the scene's total paths",
         "from Python: part of the scene's total paths lies beyond the profiles given", "how the profiles were cropped",

@@ -16,8 +16,8 @@ from apertura.core.focus.job import Integration, Job, Signal
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.imaging.range_profiles import RangeWindow
-from apertura.core.planning.checks import check_positions
 from apertura.core.planning.decisions import integrate
+from apertura.core.planning.plan import check_positions
 from apertura.core.quality.measures import content_loss_db
 from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.grid import SceneGrid

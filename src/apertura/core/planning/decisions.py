@@ -11,8 +11,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.focus.job import Integration, Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import TAPER, Sector, response
-from apertura.core.planning.checks import vertical
-from apertura.core.planning.plan import Decision
+from apertura.core.planning.plan import Decision, vertical
 from apertura.core.quality.budget import (
     ARITHMETIC_BELOW_DB,
     LEAST_ACCURACY_DB,

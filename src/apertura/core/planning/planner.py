@@ -12,9 +12,8 @@ from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.focus.engines.engine import Setting, power_sum_db
 from apertura.core.focus.job import Integration, Job
 from apertura.core.focus.presum import PRESUM_S, Presum, design, presum_error_db
-from apertura.core.planning.checks import check_geometry
 from apertura.core.planning.decisions import decide_terrain
-from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_needed, pulse_blocks
+from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_needed, check_geometry, pulse_blocks
 
 # ---- The search among the settings of all engines for the cheapest that is exact enough ----------------------------
 

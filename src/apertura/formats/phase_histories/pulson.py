@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from apertura.common.atomic import naming
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.formats.tracks.tables import LARGEST_LOG
+from apertura.formats.tracks.csv_track import LARGEST_LOG
 
 SAMPLE_RATE_HZ = 16.384e9
 """Of a scan: 32 of the radar's bins of 1.907 ps."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.formats.times import utc_times
+from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.tables import cut_off, numbers, read_table
 from apertura.formats.tracks.track import contradicted, make_track, remarked, unsaid
 
 _CLOCK, _UTC = "time(millisecond)", "datetime(utc)"

@@ -13,8 +13,8 @@ from pynmea2 import NMEASentence, ParseError
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import utc_times
+from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.tables import LARGEST_LOG, number
 from apertura.formats.tracks.track import FIXES, contradicted, make_track, remarked, start_time, unsaid
 
 _BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")

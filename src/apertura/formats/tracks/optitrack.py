@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
+from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.tables import LARGEST_LOG, number
 from apertura.formats.tracks.track import make_track, start_time, unsaid
 
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}

@@ -14,8 +14,8 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import utc_times
+from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.tables import LARGEST_LOG, number
 from apertura.formats.tracks.track import contradicted, make_track, unsaid
 
 _POSITIONS = {

@@ -13,6 +13,7 @@ from apertura.methods.interferometry.heights import (
     Known,
     Level,
     PlacedHeights,
+    Unwrapped,
     fits,
     least_coherence,
     level,
@@ -20,9 +21,9 @@ from apertura.methods.interferometry.heights import (
     phase_std,
     placed,
     sensible,
+    unwrap,
 )
 from apertura.methods.interferometry.sensitivity import Sensitivity
-from apertura.methods.interferometry.unwrapping import Unwrapped, unwrap
 
 # ---- Where the method ends: what an interferogram cannot tell, measured, in one line each --------------------------
 
@@ -46,7 +47,7 @@ class InterferogramCounts:
     told
         Pixels whose phase was unwrapped; `apart`: those of them in parts that the level does not hold for.
     residues, loops, jumps, by
-        As of `apertura.methods.interferometry.unwrapping.Unwrapped`.
+        As of `apertura.methods.interferometry.heights.Unwrapped`.
     folded
         As of `apertura.methods.interferometry.heights.PlacedHeights`.
     points

@@ -13,9 +13,8 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags.raised import Flags
 from apertura.common.provenance import sha256_file
-from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.antenna.illumination import Illumination, illuminate
-from apertura.core.antenna.pattern import LIMITS_RAD, antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.dechirp import sweep_motion_flags

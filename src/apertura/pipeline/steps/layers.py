@@ -17,8 +17,7 @@ from apertura.core.focus.inputs import Profiles
 from apertura.core.imaging.noise import PLACES, noise_power
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.lattice import BLOCK_PX
-from apertura.core.scene.looks import Looks
+from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.formats.export import write_exports

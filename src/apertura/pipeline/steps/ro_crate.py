@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 
 from apertura.common.atomic import write_json, write_text
 from apertura.common.documents import read_json, undamaged
-from apertura.common.environment import lock_sha256, software
 from apertura.common.paths import inside, shipped
-from apertura.common.provenance import sha256_text
+from apertura.common.provenance import lock_sha256, sha256_text, software
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.crate import CrateJob, CrateRun, Listed, crate_document
 from apertura.formats.catalog.stac import RECORDED

@@ -1,14 +1,24 @@
-"""Rule `scene`: the campaign's one grid, every `auto` settled once, so that each image of each flight lies on it."""
+"""Rules `scene` and `terrain`: the campaign's one grid, every `auto` settled once, and the height of each pixel."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+import xarray as xr
+
+from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.dem import height_range
+from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.scene import Flown, settled
-from apertura.pipeline.store import open_stage, save_document
+from apertura.pipeline.opening.scene import ConfiguredGround, Flown, OpenScene, settled, settled_scene
+from apertura.pipeline.steps.stamping import stamped
+from apertura.pipeline.store import finish, open_array, open_stage, resume, save_document, writing
+
+# ---- Rule `scene`: the campaign's one grid, every `auto` settled once, so that each image of each flight lies on it
 
 
 def scene(campaign: Campaign) -> Path:
@@ -33,4 +43,60 @@ def _first_flight(campaign: Campaign) -> Flown:
             )
             for echo in echoes
         ]
+    )
+
+
+# ---- Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair --------------------
+
+
+def terrain(campaign: Campaign) -> Path:
+    """Write results/terrain.zarr: ellipsoidal height (y, x) of the grid, tile by tile.
+
+    Raises
+    ------
+    CampaignError
+        If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
+    """
+    lineage = result_of(campaign, "terrain").begin(campaign.root)
+    scene, folder = settled_scene(campaign), campaign.stage("terrain")
+    grid, ground = scene.grid, ConfiguredGround.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
+    if ground.dem is None:
+        raise CampaignError(
+            "no DEM",
+            where="config/config.yaml: scene.dem",
+            expected="a GeoTIFF of heights",
+            remedy="Flat ground needs no terrain; name a DEM and its dem_datum, or leave this step out.",
+        )
+    ground.dem.check_cover(grid)
+    windows = list(grid.tiles(campaign.settings.processing.tile_px))
+    with writing(folder) as wip:
+        missing = resume(wip, _empty(campaign, scene, ground, lineage.modules), "height", windows)
+        print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
+        heights = open_array(wip, "height")
+        for window in missing:
+            heights[window] = ground.dem.heights(grid[window])
+        lowest_m, highest_m = height_range(GridHeights(grid, heights), grid, where=ground.dem.path)
+        report = {
+            "dem": ground.dem.path.name,
+            "geoid": ground.dem.geoid.name if ground.dem.geoid else None,
+            "lowest_m": lowest_m,
+            "highest_m": highest_m,
+            "datum": campaign.settings.scene.dem_datum,
+        }
+        finish(wip, folder, lineage=lineage, terrain=report)
+    return folder
+
+
+def _empty(campaign: Campaign, scene: OpenScene, ground: ConfiguredGround, modules: Sequence[str]) -> xr.Dataset:
+    """Return the stamped stage without its heights."""
+    return stamped(
+        xr.Dataset(
+            {"height": (("y", "x"), np.broadcast_to(np.float64(0), scene.grid.shape))},
+            coords=scene.grid.coordinates,
+            attrs={"frame": scene.grid.frame, "terrain": {}},
+        ),
+        "terrain",
+        modules=modules,
+        settings={**campaign.relevant("terrain"), **scene.spec},
+        inputs=ground.inputs,
     )

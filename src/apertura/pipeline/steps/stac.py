@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from apertura.common.atomic import write_json
 from apertura.common.documents import undamaged
-from apertura.common.environment import lock_sha256, software
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
+from apertura.common.provenance import lock_sha256, software
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import AcquisitionTime, Image, asset_of, catalog_files, instant, projection, told_by
 from apertura.formats.export.coverage import Covered, feature_collection

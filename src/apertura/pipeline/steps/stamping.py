@@ -8,8 +8,7 @@ import xarray as xr
 
 from apertura import __version__
 from apertura.common.contracts import STAGES, check
-from apertura.common.environment import lock_sha256, packages, software
-from apertura.common.provenance import Provenance, canonical_json, joined
+from apertura.common.provenance import Provenance, canonical_json, joined, lock_sha256, packages, software
 from apertura.pipeline.digests import Lineage
 
 

@@ -20,19 +20,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, SampledWaveform
 from apertura.pipeline.lineage import STUDY, result_of
 from apertura.pipeline.lineage.inputs import with_inputs
-from apertura.pipeline.steps import (
-    assess,
-    calibration,
-    cube,
-    echo,
-    export,
-    image,
-    ingest,
-    profile,
-    refine,
-    scene,
-    terrain,
-)
+from apertura.pipeline.steps import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
 from apertura.pipeline.store import record_files
 from apertura.views.chart.whole_picture import Whole, draw_whole
 
@@ -122,7 +110,7 @@ def _carried(campaign: Campaign) -> _Run:
         _echoes(campaign, flight)
         scene.scene(campaign)
         if campaign.settings.scene.dem:
-            terrain.terrain(campaign)
+            scene.terrain(campaign)
         for pair in flight.pairs:
             profile.profile(campaign, flight.name, pair)
         refine.refine(campaign, flight.name)

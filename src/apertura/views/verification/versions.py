@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from apertura import __version__
-from apertura.common.environment import lock_sha256, software
+from apertura.common.provenance import lock_sha256, software
 
 _NAMED = 4
 
