@@ -14,8 +14,8 @@ import yaml
 from apertura.common.errors import CampaignError
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.files import check_files
-from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.examination.campaign import Examination
 from apertura.pipeline.steps import (
     assess,
     coverage,
@@ -65,7 +65,7 @@ def copy_writable(source: Path, target: Path) -> Path:
 
 def require_files(campaign: Campaign) -> None:
     """Raise the first problem with the files that the config and the flights promise."""
-    for problem in check_files(Inspected(campaign)):
+    for problem in check_files(Examination(campaign)):
         raise problem
 
 

@@ -16,8 +16,8 @@ from apertura.formats.names import recording_files
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, SampleFile, SampleLayout
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.check.recordings import check_recordings
+from apertura.pipeline.examination.campaign import Examination
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation.campaign import write_campaign
@@ -136,7 +136,7 @@ def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, 
     for node in NODES:
         real = as_real(counts_of(campaign, node), if_hz)
         rewrite(campaign, node, real.astype("<f4"), "rf32_le", **{"apertura:if_hz": if_hz})
-    assert [str(one) for one in check_recordings(Inspected(Campaign.load(campaign)))] == []
+    assert [str(one) for one in check_recordings(Examination(Campaign.load(campaign)))] == []
     for pair, transfer in transfers(campaign).items():
         assert apart_db(transfer, plain[pair]) < -70, pair
 
@@ -173,7 +173,7 @@ def test_a_datatype_or_mixing_that_cannot_be_is_named(campaign, datatype, if_hz,
     rewrite(campaign, "a", real, datatype, **({} if if_hz is None else {"apertura:if_hz": if_hz}))
     with pytest.raises(CampaignError, match=expected):
         transfers(campaign)
-    problems = check_recordings(Inspected(Campaign.load(campaign)))
+    problems = check_recordings(Examination(Campaign.load(campaign)))
     assert any(expected[:20].replace("\\", "") in str(one) for one in problems)
 
 

@@ -12,7 +12,7 @@ import pytest
 from folders import ROOT, edit_config, edit_data, edit_meta
 
 from apertura.pipeline.check import CHECKS, as_line, print_problems, problems
-from apertura.pipeline.check.tags import odd_interval_s
+from apertura.pipeline.check.recordings import odd_interval_s
 from apertura.simulation import PRESETS, preset, simulate
 
 EVERY_SECOND = np.timedelta64(50, "ms") * np.arange(0, 80, 2)

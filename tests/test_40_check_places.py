@@ -13,8 +13,8 @@ from rasterio.transform import from_origin
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems, resources
-from apertura.pipeline.check.clocks import likely_cause
-from apertura.pipeline.check.dem import needles
+from apertura.pipeline.check.hints import likely_cause
+from apertura.pipeline.check.scene import needles
 from apertura.pipeline.opening.reading import read_log
 from apertura.simulation.presets import DEMO_ORIGIN
 

@@ -10,9 +10,9 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import local_crs
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
-from apertura.pipeline.check.inspected import Inspected
-from apertura.pipeline.check.links import check_links
+from apertura.pipeline.check.files import check_links
 from apertura.pipeline.config.config import validated
+from apertura.pipeline.examination.campaign import Examination
 from apertura.pipeline.steps import ingest
 
 
@@ -65,7 +65,7 @@ def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
     with pytest.raises(CampaignError, match="leads through a symbolic link"):
         ingest.ingest(campaign, "f01", "uav1")
     assert [path.name for path in elsewhere.rglob("*")] == ["f01", "uav1", "raw.zarr"]
-    assert len(list(check_links(Inspected(campaign)))) == 1
+    assert len(list(check_links(Examination(campaign)))) == 1
 
 
 @pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "f01/uav1-uav1/mask.tif"])
@@ -73,11 +73,11 @@ def test_a_link_anywhere_below_the_results_is_named(tiny, tmp_path, name):
     path = tiny / "results" / name
     path.parent.mkdir(parents=True)
     path.symlink_to(tmp_path)
-    assert [str(found.where) for found in check_links(Inspected(Campaign.load(tiny)))] == [str(path)]
+    assert [str(found.where) for found in check_links(Examination(Campaign.load(tiny)))] == [str(path)]
 
 
 def test_results_without_links_are_let_be(finished_tiny):
-    assert list(check_links(Inspected(finished_tiny))) == []
+    assert list(check_links(Examination(finished_tiny))) == []
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_other_names_stay_as_they_are(name):
 
 
 def test_a_copy_of_the_results_elsewhere_is_no_link(finished_tiny, tmp_path):
-    assert list(check_links(Inspected(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy"))))) == []
+    assert list(check_links(Examination(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy"))))) == []
 
 
 def test_what_lies_outside_the_folder_is_not_opened_by_a_check(tiny):

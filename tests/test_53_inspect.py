@@ -20,9 +20,8 @@ from matplotlib import image
 
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
-from apertura.views.inspection.command import inspect_path
-from apertura.views.inspection.look import look
-from apertura.views.inspection.pictures import draw_history
+from apertura.views.inspect.look import inspect_path, look
+from apertura.views.inspect.pictures import draw_history
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"
@@ -205,6 +204,16 @@ def test_a_campaign_of_phase_history_is_told_by_the_clock_that_was_aligned(share
     (root / "config/clocks.tsv").unlink()
     assert "apertura align" in look(raw / f"{node}.out").missing[0]
     assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
+
+
+def test_the_offset_of_a_recorders_clock_is_applied_once(tiny):
+    recorded = {part.path.name: part.facts["recorded"]["first_utc"] for part in look(tiny).parts}
+    (tiny / "config/clocks.tsv").write_text("flight\tnode\toffset_s\tdrift_ppm\tstd_s\nf01\tuav1\t2\t0\t0.001\n")
+    for part in look(tiny).parts:
+        first, before = (
+            np.datetime64(one[:-1], "ns") for one in (part.facts["recorded"]["first_utc"], recorded[part.path.name])
+        )
+        assert first - before == np.timedelta64(2 if part.path.name == "uav1" else 0, "s")
 
 
 def test_a_spoilt_campaign_says_what_check_says(tiny):

@@ -1,53 +1,67 @@
 """What is wrong with a campaign folder, all of it at once, before anything runs: headers, logs and numbers, no samples.
 
-Here stands what cannot be imaged at all; what is merely worse is measured by the step that meets it, and is a flag.
+A problem is what cannot be imaged at all; what makes an image worse is measured by a step, and is a flag.
 """
 
 import pkgutil
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
 from apertura.common.processes import as_typed
-from apertura.pipeline.check.loading import load
-from apertura.pipeline.config import located
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import (
+    CLOCKS,
+    CONFIG,
+    FLIGHTS,
+    SEGMENTS,
+    Flight,
+    located,
+    read_clocks,
+    read_flights,
+    read_segments,
+    read_settings,
+)
+from apertura.pipeline.config.section import table_rows
 
 if TYPE_CHECKING:
-    from apertura.pipeline.check.inspected import Inspected
+    from apertura.pipeline.examination.campaign import Examination
 
-Check = Callable[["Inspected"], Iterable[CampaignError]]
+T = TypeVar("T")
+Check = Callable[["Examination"], Iterable[CampaignError]]
 
 CHECKS: Mapping[str, str] = {
-    "flights": "apertura.pipeline.check.flights:check_flights",
+    "flights": "apertura.pipeline.check.files:check_flights",
     "files": "apertura.pipeline.check.files:check_files",
-    "links": "apertura.pipeline.check.links:check_links",
-    "modules": "apertura.pipeline.check.links:check_modules",
-    "results": "apertura.pipeline.check.results:check_writable",
-    "codes": "apertura.pipeline.check.codes:check_codes",
+    "links": "apertura.pipeline.check.files:check_links",
+    "modules": "apertura.pipeline.check.files:check_modules",
+    "results": "apertura.pipeline.check.resources:check_writable",
+    "codes": "apertura.pipeline.check.recordings:check_codes",
     "recordings": "apertura.pipeline.check.recordings:check_recordings",
-    "histories": "apertura.pipeline.check.histories:check_histories",
+    "histories": "apertura.pipeline.check.recordings:check_histories",
     "channels": "apertura.pipeline.check.recordings:check_channels",
-    "intervals": "apertura.pipeline.check.tags:check_intervals",
-    "overlap": "apertura.pipeline.check.tags:check_overlap",
-    "segments": "apertura.pipeline.check.tags:check_segments",
+    "intervals": "apertura.pipeline.check.recordings:check_intervals",
+    "overlap": "apertura.pipeline.check.recordings:check_overlap",
+    "segments": "apertura.pipeline.check.recordings:check_segments",
     "tracks": "apertura.pipeline.check.tracks:check_tracks",
     "attitude": "apertura.pipeline.check.tracks:check_attitude",
-    "coverage": "apertura.pipeline.check.coverage:check_coverage",
-    "patterns": "apertura.pipeline.check.antennas:check_patterns",
+    "coverage": "apertura.pipeline.check.tracks:check_coverage",
+    "patterns": "apertura.pipeline.check.reach:check_patterns",
     "crs": "apertura.pipeline.check.scene:check_scene_crs",
     "reference_points": "apertura.pipeline.check.scene:check_reference_points",
-    "dem": "apertura.pipeline.check.dem:check_dem",
-    "spikes": "apertura.pipeline.check.dem:check_spikes",
-    "apart": "apertura.pipeline.check.places:check_nodes_apart",
-    "distance": "apertura.pipeline.check.places:check_distance",
-    "ground": "apertura.pipeline.check.ground:check_ground",
-    "calibration": "apertura.pipeline.check.calibration:check_calibration",
+    "dem": "apertura.pipeline.check.scene:check_dem",
+    "spikes": "apertura.pipeline.check.scene:check_spikes",
+    "apart": "apertura.pipeline.check.reach:check_nodes_apart",
+    "distance": "apertura.pipeline.check.reach:check_distance",
+    "ground": "apertura.pipeline.check.reach:check_ground",
+    "calibration": "apertura.pipeline.check.reach:check_calibration",
     "memory": "apertura.pipeline.check.resources:check_memory",
     "disk": "apertura.pipeline.check.resources:check_disk",
 }
-"""Name → ``module:function``; a function takes what is `Inspected` and yields problems, or raises one."""
+"""Name → ``module:function``; a function takes an `Examination` and yields problems, or raises one."""
 
 
 def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
@@ -65,21 +79,21 @@ def problems(root: str | Path, *, without: Collection[str] = ()) -> list[Campaig
     >>> [str(problem) for problem in problems("nowhere")]
     ['nowhere: no such folder; expected a campaign folder. `apertura init` makes one.']
     """
-    campaign, found = load(Path(root))
+    campaign, wrong = load(Path(root))
     if campaign is None:
-        return found
-    from apertura.pipeline.check.inspected import Inspected
+        return wrong
+    from apertura.pipeline.examination.campaign import Examination
 
-    return [*found, *problems_of(Inspected(campaign), without=without)]
+    return [*wrong, *problems_of(Examination(campaign), without=without)]
 
 
-def problems_of(inspected: "Inspected", *, without: Collection[str] = ()) -> list[CampaignError]:
+def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> list[CampaignError]:
     """Return what is wrong with a campaign that is opened already; `without` as of `problems`."""
-    found: list[CampaignError] = []
+    wrong: list[CampaignError] = []
     for name, function in CHECKS.items():
         if name not in without:
-            found += _each(pkgutil.resolve_name(function), inspected)
-    return list({str(problem): problem for problem in found}.values())
+            wrong += _each(pkgutil.resolve_name(function), examined)
+    return list({str(problem): problem for problem in wrong}.values())
 
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
@@ -91,7 +105,7 @@ def print_problems(root: str | Path, *, without: Collection[str] = (), stream: T
 
 
 def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
-    """Print the problems of a campaign folder and what of its results is overtaken; return how many lines.
+    """Print the problems of a campaign folder and which of its results are stale; return how many lines.
 
     Parameters
     ----------
@@ -100,7 +114,7 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     products
         Read every byte of the results, too, and name what is not as it was written.
     paranoid
-        Read every input again, also those whose state is that of a hash taken before.
+        Read every input again, also those that have not changed since they were hashed.
     """
     found = print_problems(root)
     campaign, _ = load(Path(root))
@@ -128,9 +142,62 @@ def as_line(problem: CampaignError) -> str:
     return " ".join(located(str(problem)).split())
 
 
-def _each(check: Check, inspected: "Inspected") -> Iterator[CampaignError]:
+def _each(check: Check, examined: "Examination") -> Iterator[CampaignError]:
     """Yield what a check yields, and what it raises in the end."""
     try:
-        yield from check(inspected)
+        yield from check(examined)
     except CampaignError as problem:
         yield problem
+
+
+class _AnyNode(frozenset[str]):
+    """Stands for the nodes of a config that cannot be read: a flight may name any."""
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
+def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
+    """Return a campaign, or None and what is wrong with config.yaml and its tables, each read whatever the others are.
+
+    Examples
+    --------
+    >>> load(Path("nowhere"))[0] is None
+    True
+    """
+    if not root.is_dir():
+        remedy = "`apertura init` makes one."
+        return None, [CampaignError("no such folder", where=root, expected="a campaign folder", remedy=remedy)]
+    wrong: list[CampaignError] = []
+    settings = _tried(lambda: read_settings(_inside(root, CONFIG)), wrong)
+    nodes = settings.nodes if settings else _AnyNode()
+    flights = _tried(lambda: tuple(read_flights(_inside(root, FLIGHTS), nodes=nodes)), wrong)
+    listed = _listed_flights(root / FLIGHTS) if flights is None else flights
+    segments = _tried(lambda: tuple(read_segments(_inside(root, SEGMENTS), flights=listed)), wrong) if listed else ()
+    clocks = _tried(lambda: tuple(read_clocks(_inside(root, CLOCKS), flights=listed)), wrong) if listed else ()
+    if settings is None or flights is None or segments is None or clocks is None:
+        return None, wrong
+    return Campaign(root, settings, flights, segments, clocks), wrong
+
+
+def _inside(root: Path, path: Path) -> Path:
+    return inside(root, path.as_posix(), where=root)
+
+
+def _tried(read: Callable[[], T], wrong: list[CampaignError]) -> T | None:
+    try:
+        return read()
+    except CampaignError as problem:
+        wrong.append(problem)
+        return None
+
+
+def _listed_flights(path: Path) -> tuple[Flight, ...]:
+    """Return the flights of a table with a line that is wrong, as it names them, so that segments are compared."""
+    rows = _tried(
+        lambda: [cells for _, cells in table_rows(path, ["flight", "kind", "transmitter", "nodes"], remedy="")], []
+    )
+    return tuple(
+        Flight(row["flight"], row["kind"], row["transmitter"], tuple(map(str.strip, row["nodes"].split(","))))
+        for row in rows or ()
+    )

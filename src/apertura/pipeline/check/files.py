@@ -1,24 +1,44 @@
-"""Whether everything is there that flights.tsv and the config promise."""
+"""Whether everything that flights.tsv and the config promise is there, may be read, and can run safely."""
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.formats.names import recording_files
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.inspected import Inspected
 from apertura.pipeline.config import CONFIG, FLIGHTS, Flight, SampledWaveform
 
+if TYPE_CHECKING:
+    from apertura.pipeline.examination.campaign import Examination
+
 _AHEAD_S = 5.0
+_IMPORTED = ".snakemake/pip-deployments"
+"""Relative to the working folder (snakemake 9, `PIP_DEPLOYMENTS_PATH`): for plugins that a job installs itself."""
+
+_RECORDS = ("metadata", "incomplete")
+"""Folders of Snakemake's records, of no use where they are damaged, and of no harm to lose."""
 
 
-def check_files(inspected: Inspected) -> Iterator[CampaignError]:
+def check_flights(examined: "Examination") -> Iterator[CampaignError]:
+    """Yield a problem where no flight becomes an image."""
+    if not examined.campaign.image_flights:
+        yield CampaignError(
+            f"{len(examined.campaign.flights)} flights, none of kind image",
+            where=examined.campaign.root / FLIGHTS,
+            expected="at least one flight of kind image",
+            remedy="Add one, or correct its kind.",
+        )
+
+
+def check_files(examined: "Examination") -> Iterator[CampaignError]:
     """Yield every file that is missing, empty, dated in the future or may not be read."""
-    campaign = inspected.campaign
+    campaign = examined.campaign
     for flight in campaign.flights:
         yield from _recorded(campaign, flight)
     lookups: list[Callable[[], dict[str, Path]]] = [
@@ -42,7 +62,7 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
     """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
-            yield from _found(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
+            yield from _looked_up(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
         return
     for node in flight.participants:
         expected = f"the recording of node {node} in flight {flight.name}"
@@ -59,11 +79,11 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
                 yield problem
                 continue
             yield from _readable(path, expected, remedy)
-        yield from _found(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
+        yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 
 
-def _found(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
-    """Yield that files are missing, as whoever looks for them says it, or what is wrong with those found."""
+def _looked_up(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
+    """Yield the error of looking for files, or what is wrong with those that are there."""
     try:
         paths = files()
     except CampaignError as problem:
@@ -87,3 +107,62 @@ def _readable(path: Path, expected: str, remedy: str) -> Iterator[CampaignError]
         yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")
     elif not os.access(path, os.R_OK):
         yield CampaignError("may not be read", where=path, expected=expected, remedy=f"Run `chmod u+r {path}`.")
+
+
+def check_links(examined: "Examination") -> Iterator[CampaignError]:
+    """Yield an error for each symbolic link that the results, or Snakemake's own records, hold or are."""
+    for folder in ("results", ".snakemake"):
+        top = examined.campaign.root / folder
+        yield from (_refused(path) for path in _links(top))
+
+
+def check_modules(examined: "Examination") -> Iterator[CampaignError]:
+    """Yield an error where modules lie in the folder that Snakemake puts on its search path in every job."""
+    folder = examined.campaign.root / _IMPORTED
+    if folder.is_dir() and any(folder.iterdir()):
+        yield CampaignError(
+            "Python modules in Snakemake's own folder",
+            where=folder,
+            expected="a campaign folder without code: every job would import them",
+            remedy="Remove that folder; plugins of Snakemake are installed beside apertura.",
+        )
+
+
+def _links(top: Path) -> Iterator[Path]:
+    if top.is_symlink():
+        yield top
+        return
+    for folder, folders, files in os.walk(top):  # never into a linked folder
+        yield from (path for path in (Path(folder, name) for name in (*folders, *files)) if path.is_symlink())
+
+
+def _refused(path: Path) -> CampaignError:
+    return CampaignError(
+        "a symbolic link",
+        where=path,
+        expected="a folder or a file: nothing is written or deleted through a link",
+        remedy="Remove it; to keep results elsewhere, put the whole campaign folder there.",
+    )
+
+
+def drop_damaged_records(root: Path) -> int:
+    """Remove the records of earlier runs that Snakemake could not read; return how many.
+
+    Hashes say what is stale, not these records: without them, a report only lacks how long earlier jobs took.
+    """
+    records = root / ".snakemake"
+    damaged = [path for folder in _RECORDS for path in (records / folder).rglob("*") if _is_damaged(path)]
+    for path in damaged:
+        path.unlink()
+    if (records / "metadata").is_dir():
+        (records / "incomplete").mkdir(exist_ok=True)  # without it Snakemake takes the records for those of version 7
+    return len(damaged)
+
+
+def _is_damaged(path: Path) -> bool:
+    if not path.is_file() or path.name == "migration_underway":
+        return path.is_file()
+    try:
+        return not isinstance(json.loads(path.read_bytes() or b"{}"), dict)
+    except (ValueError, RecursionError):
+        return True

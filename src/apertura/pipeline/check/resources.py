@@ -1,26 +1,39 @@
-"""Whether memory and disk are enough for what is certain to be needed."""
+"""Whether memory, disk and permissions suffice for what is certain to be needed."""
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from apertura.common.errors import CampaignError
-from apertura.pipeline.check.inspected import Inspected
+from apertura.pipeline.examination.campaign import Examination
 
 _BASE_BYTES = 120_000_000  # the interpreter and its libraries
 _CAPTURE_BYTES = 1100  # of the metadata of a capture while they are read; samples are read in blocks
 _RAW_BYTES = 10  # of a capture in the stage raw, compressed
 _ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, which are not compressed; the rest for pulses that drop out
 _PIXEL_BYTES = 36  # per pixel and pair: image, its part of the cube, three rasters, compressed; 76 before
-
 MEMINFO = Path("/proc/meminfo")
 
 
-def check_memory(inspected: Inspected) -> Iterator[CampaignError]:
+def check_writable(examined: Examination) -> Iterator[CampaignError]:
+    """Yield a problem where neither the campaign folder nor its results may be written: a read-only disk, another's."""
+    campaign = examined.campaign
+    for folder in (campaign.root, campaign.results):
+        if folder.exists() and not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+            yield CampaignError(
+                "may not be written" if folder.is_dir() else "is no folder",
+                where=folder,
+                expected="a folder in which results can be made",
+                remedy="Copy the campaign to a disk of your own, or change the folder's permissions.",
+            )
+
+
+def check_memory(examined: Examination) -> Iterator[CampaignError]:
     """Yield a problem where the metadata of the longest recording do not fit into memory; samples need none."""
-    if not inspected.recordings:
+    if not examined.recordings:
         return
-    key, largest = max(inspected.recordings.items(), key=lambda item: len(item[1].captures.start))
+    key, largest = max(examined.recordings.items(), key=lambda item: len(item[1].captures.start))
     captures = len(largest.captures.start)
     needed = _BASE_BYTES + _CAPTURE_BYTES * captures
     if needed > (free := free_memory()):
@@ -47,14 +60,14 @@ def free_memory(meminfo: Path = MEMINFO) -> int:
     return min(memory_limit(), sum(stated)) if stated else memory_limit()
 
 
-def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
+def check_disk(examined: Examination) -> Iterator[CampaignError]:
     """Yield a problem where the file system of the results has less left than the stages still to be made."""
-    campaign = inspected.campaign
-    needed = sum(disk_bytes(inspected).values())
+    campaign = examined.campaign
+    needed = sum(disk_bytes(examined).values())
     folder = campaign.results if campaign.results.is_dir() else campaign.root
     free = shutil.disk_usage(folder).free
     if needed > free:
-        parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(inspected).items() if size)
+        parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(examined).items() if size)
         yield CampaignError(
             f"results take at least {needed / 1e6:.0f} MB more ({parts})",
             where=folder,
@@ -63,28 +76,28 @@ def check_disk(inspected: Inspected) -> Iterator[CampaignError]:
         )
 
 
-def disk_bytes(inspected: Inspected) -> dict[str, int]:
+def disk_bytes(examined: Examination) -> dict[str, int]:
     """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
-    campaign, sent = inspected.campaign, inspected.sent
+    campaign, transmitted = examined.campaign, examined.transmitted
     raw = sum(
         _RAW_BYTES * len(recording.captures.start)
-        for key, recording in inspected.recordings.items()
-        if recording.framing is None and not _made(inspected, "raw", *key)
+        for key, recording in examined.recordings.items()
+        if recording.framing is None and not _made(examined, "raw", *key)
     )
-    pixels = inspected.grid.shape[0] * inspected.grid.shape[1] if inspected.grid else 0
+    pixels = examined.grid.shape[0] * examined.grid.shape[1] if examined.grid else 0
     if campaign.settings.scene.spacing_m == "auto":
         pixels = 0
     echo = images = 0
     for flight in campaign.flights:
-        recorded = inspected.recordings.get((flight.name, flight.transmitter))
+        recorded = examined.recordings.get((flight.name, flight.transmitter))
         pulses = len(recorded.captures.time) if recorded and recorded.framing is None else 0
         for pair in flight.pairs:
-            if sent and not _made(inspected, "echo", flight.name, pair):
-                echo += round(_ECHO_SHARE * 8 * pulses * sent.numerology.numbers.size)
-            if flight.kind == "image" and not _made(inspected, "image", flight.name, pair):
+            if transmitted and not _made(examined, "echo", flight.name, pair):
+                echo += round(_ECHO_SHARE * 8 * pulses * transmitted.numerology.numbers.size)
+            if flight.kind == "image" and not _made(examined, "image", flight.name, pair):
                 images += _PIXEL_BYTES * pixels
     return {"raw": raw, "echo": echo, "images": images}
 
 
-def _made(inspected: Inspected, stage: str, *where: str) -> bool:
-    return (inspected.campaign.root / inspected.campaign.manifest(stage, *where)).is_file()
+def _made(examined: Examination, stage: str, *where: str) -> bool:
+    return (examined.campaign.root / examined.campaign.manifest(stage, *where)).is_file()

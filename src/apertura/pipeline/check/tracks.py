@@ -1,46 +1,47 @@
-"""Flight logs by themselves: whether they can be read, and whether a node can have flown so."""
+"""Whether flight logs can be read, can be of a flight, and reach over the pulses of their nodes."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
+from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.inspected import Inspected
+from apertura.pipeline.check.hints import likely_cause
 from apertura.pipeline.config import CONFIG
+from apertura.pipeline.examination.campaign import Examination, Key
+from apertura.pipeline.examination.times import Span, apart_s, common_pulses, inside, iso, recorded_span, shift_s
 
 FASTEST_M_S = 340.0
 """No node flies faster than sound: times or positions are in another unit."""
 
 
-def check_tracks(inspected: Inspected) -> Iterator[CampaignError]:
+def check_tracks(examined: Examination) -> Iterator[CampaignError]:
     """Yield logs that cannot be read, logs of two frames, no heights, speeds beyond sound."""
-    yield from inspected.unread
-    for key, track in inspected.tracks.items():
-        seconds = np.diff(track.time.values) / np.timedelta64(1, "s")
-        steps_m = np.linalg.norm(np.diff(track.position.values, axis=0), axis=1)
-        speed = float(np.median(steps_m / seconds))
+    yield from examined.track_problems
+    for key, log in examined.logs.items():
         expected, remedy = "positions of a flight", "Drop those lines, or export the log again."
         found = ""
-        if track.attrs["frame"] != inspected.frame:
-            found, expected = f"positions in frame {track.attrs['frame']}", f"{inspected.frame}, as the other logs"
+        if log.frame != examined.frame:
+            found, expected = f"positions in frame {log.frame}", f"{examined.frame}, as the other logs"
             remedy = "Give logs of one frame."
-        elif key in inspected.geodetic and np.abs(inspected.geodetic[key][:, 2]).max() < 1e-3:
+        elif log.frame == "ecef" and np.abs(log.bounds["height_m"]).max() < 1e-3:
             found, expected = "height 0 at every epoch", "metres above the ellipsoid"
             remedy = "Export the log with its heights."
-        elif speed > FASTEST_M_S:
-            found, expected = f"a median speed of {speed:.0f} m/s", f"less than {FASTEST_M_S:.0f} m/s"
+        elif log.median_speed_m_s > FASTEST_M_S:
+            found, expected = f"a median speed of {log.median_speed_m_s:.0f} m/s", f"less than {FASTEST_M_S:.0f} m/s"
             remedy = "Check the units of times (seconds) and positions (decimal degrees)."
         if found:
-            yield CampaignError(found, where=inspected.campaign.track_file(*key), expected=expected, remedy=remedy)
+            yield CampaignError(found, where=examined.campaign.track_file(*key), expected=expected, remedy=remedy)
 
 
-def check_attitude(inspected: Inspected) -> Iterator[CampaignError]:
+def check_attitude(examined: Examination) -> Iterator[CampaignError]:
     """Yield nodes whose attitude the config takes from a log that holds none, where an arm or a beam needs it."""
-    campaign = inspected.campaign
-    for (flight, node), track in inspected.tracks.items():
+    campaign = examined.campaign
+    for (flight, node), log in examined.logs.items():
         stated = campaign.settings.nodes[node].attitude == "log"
-        if stated and _turned(campaign, flight, node) and not np.isfinite(track.attitude.values).any():
+        if stated and _turned(campaign, flight, node) and not log.has_attitude:
             yield CampaignError(
                 "no roll, pitch and yaw",
                 where=campaign.track_file(flight, node),
@@ -61,3 +62,95 @@ def _turned(campaign: Campaign, flight: str, node: str) -> bool:
         if beams or any(any(getattr(arms, point)) for point in used):
             return True
     return False
+
+
+def check_coverage(examined: Examination) -> Iterator[CampaignError]:
+    """Yield logs that begin after the first pulse they must place, end before the last, or are poor throughout.
+
+    Both nodes of a pulse get their positions at the transmitter's tag. Pulses beyond an end of the log whose solution
+    is poorer than fixed may be left out as the config says, and are not reported here.
+    """
+    waveform = examined.waveform
+    reported: set[Key] = set()
+    for flight in examined.campaign.flights if waveform else ():
+        tx = examined.recordings.get((flight.name, flight.transmitter))
+        for node in flight.nodes:
+            rx = examined.recordings.get((flight.name, node))
+            if tx is None or rx is None or waveform is None:
+                continue
+            pulses = common_pulses(tx, rx, waveform.prf_hz)
+            for key in ((flight.name, flight.transmitter), (flight.name, node)):
+                if key in reported or key not in examined.tracks:
+                    continue
+                problem = (
+                    _no_overlap(examined, key)
+                    if tx.framing is not None
+                    else _uncovered(examined, key, pulses) or _all_poor(examined, key, pulses)
+                )
+                if problem:
+                    reported.add(key)
+                    yield problem
+
+
+def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
+    """Return what is wrong where the recorder ran through: its pulses are not known, but when it ran."""
+    log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
+    shift = shift_s(recorded, log)
+    found = f"log and recording are {abs(shift):.1f} s apart{likely_cause(shift)}"
+    return _problem(examined, key, found, recorded) if apart_s(recorded, log) > 0 else None
+
+
+def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
+    if not pulses.size:
+        return None
+    track = examined.tracks[key]
+    times = track.time.values
+    before, after = pulses < times[0], pulses > times[-1]
+    for out, end in ((before, 0), (after, -1)):
+        if "fix" in track and int(track.fix.values[end]) not in {0, FIXES["fix"]}:
+            out[:] = False
+    lost = int((before | after).sum())
+    if not lost:
+        return None
+    second = np.timedelta64(1, "s")
+    ends = [f"begins {(times[0] - pulses[0]) / second:.3f} s after the first pulse"] if before.any() else []
+    ends += [f"ends {(pulses[-1] - times[-1]) / second:.3f} s before the last"] if after.any() else []
+    recorded = (pulses[0], pulses[-1])
+    shift = shift_s(recorded, (times[0], times[-1]))
+    cause = likely_cause(shift)
+    apart = f"; log and recording are {abs(shift):.1f} s apart{cause}" if cause else ""
+    found = f"the log {' and '.join(ends)}: {lost} of {len(pulses)} pulses without a position{apart}"
+    return _problem(examined, key, found, recorded)
+
+
+def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
+    """Return what is wrong where every epoch between the first and the last pulse is poorer than the config allows."""
+    track, node = examined.tracks[key], examined.campaign.settings.nodes[key[1]]
+    worst = node.worst_fix
+    if "fix" not in track or not pulses.size or worst == "any":
+        return None
+    times, fixes = track.time.values, track.fix.values
+    during = inside(times, (pulses[0], pulses[-1]))
+    if not during.any() or np.isin(fixes[during], (0, FIXES["fix"])).any():
+        return None
+    from apertura.pipeline.opening.node_log import poorer_fix
+
+    if not poorer_fix(fixes, worst)[during].all():
+        return None
+    return CampaignError(
+        f"all {int(during.sum())} epochs while pulses were sent have a solution poorer than {node.poorest_fix}",
+        where=examined.campaign.track_file(*key),
+        expected=f"solutions that {CONFIG}: nodes.{key[1]}.worst_fix allows",
+        remedy="Process the log again, or allow poorer solutions by that key.",
+    )
+
+
+def _problem(examined: Examination, key: Key, found: str, recorded: Span) -> CampaignError:
+    first, last = map(iso, recorded)
+    return CampaignError(
+        found,
+        where=examined.campaign.track_file(*key),
+        expected=f"a log that covers the pulses, {first} to {last} UTC",
+        remedy="Check the log's time system (GPST is 18 s ahead of UTC) and the transmitter's time tags, at which "
+        "both nodes are placed, or give the whole log.",
+    )

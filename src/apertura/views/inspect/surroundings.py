@@ -13,7 +13,7 @@ from apertura.pipeline.config import CLOCKS, CONFIG, read_settings
 from apertura.pipeline.config.nodes import Log
 
 NODE = "<node>"
-"""Stands for a name that nobody has given."""
+"""Stands for a name that is not known."""
 
 _KEY = re.compile(r"\bnodes\.\S+?\.log\.(\w+)")
 _OPTIONS = {one.name for one in fields(LogOptions)}
@@ -40,8 +40,8 @@ class Surroundings:
         Section of the config of the campaign that it lies in; empty outside.
     problem
         Why that config cannot be read.
-    asked
-        What was typed of its log.
+    typed
+        Keys of its log that were typed with --set.
     logged
         Whether a flight log of the node lies beside.
     aligned
@@ -52,7 +52,7 @@ class Surroundings:
     options: LogOptions = AS_IT_SAYS
     waveform: Mapping[str, Any] = field(default_factory=dict)
     problem: CampaignError | None = None
-    asked: Mapping[str, Any] = field(default_factory=dict)
+    typed: Mapping[str, Any] = field(default_factory=dict)
     logged: bool = False
     aligned: bool = False
 
@@ -73,21 +73,21 @@ def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
         If a setting is none.
     """
     name = path.name.partition(".track.")[0] if ".track." in path.name else path.name.partition(".")[0]
-    asked = _parsed(settings)
+    typed = _parsed(settings)
     config = path.parents[2] / CONFIG if path.parent.parent.name == "raw" else None
     if config is None or not config.is_file():
         node = name if ".track." in path.name else NODE
-        return Surroundings(node, _log(asked).options, asked=asked)
+        return Surroundings(node, _log(typed).options, typed=typed)
     try:
         stated = read_settings(config)
     except CampaignError as problem:
-        return Surroundings(name, _log(asked).options, problem=problem, asked=asked)
+        return Surroundings(name, _log(typed).options, problem=problem, typed=typed)
     log = stated.nodes[name].log.model_dump() if name in stated.nodes else {}
     return Surroundings(
         name,
-        _log(log | asked).options,
+        _log(log | typed).options,
         stated.waveform.model_dump(),
-        asked=asked,
+        typed=typed,
         logged=any(other.name.startswith(f"{name}.track.") for other in path.parent.iterdir()),
         aligned=(path.parents[2] / CLOCKS).is_file(),
     )
@@ -98,17 +98,17 @@ def _log(values: Mapping[str, Any]) -> Log:
 
 
 def _parsed(settings: Sequence[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    parsed: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
         column = key.removeprefix("columns.")
         if not equals or not ({key} & _OPTIONS or column != key):
             raise CampaignError(setting, "--set", _EXPECTED, "Correct it.")
         if column != key:
-            found.setdefault("columns", {})[column] = value
+            parsed.setdefault("columns", {})[column] = value
         else:
-            found[key] = value.split(",") if key == "base" else value
-    return found
+            parsed[key] = value.split(",") if key == "base" else value
+    return parsed
 
 
 def retries(problem: CampaignError) -> list[str]:
@@ -119,8 +119,8 @@ def retries(problem: CampaignError) -> list[str]:
     >>> retries(CampaignError("times of day only", "a.nmea", "key nodes.u.log.start_utc in config.yaml", "Add it."))
     ['set nodes.<node>.log.start_utc in the config; to try a value now: --set start_utc=YYYY-MM-DDTHH:MM:SS']
     """
-    told = f"{problem.found} {problem.expected} {problem.remedy}"
-    keys = [key for key in dict.fromkeys(_KEY.findall(told)) if key in _OPTIONS]
+    sentence = f"{problem.found} {problem.expected} {problem.remedy}"
+    keys = [key for key in dict.fromkeys(_KEY.findall(sentence)) if key in _OPTIONS]
     return [
         f"set nodes.{NODE}.log.{key} in the config; to try a value now: --set {_TYPED.get(key, f'{key}=VALUE')}"
         for key in keys

@@ -1,4 +1,4 @@
-"""A campaign while it is checked: recordings, logs and grid opened once, whoever asks for them."""
+"""A campaign's recordings, logs, ground and grid, each opened once at the first use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ from apertura.formats.names import PHASE_HISTORIES
 from apertura.formats.reading import open_recording, read_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.examination.facts import LogFacts, log_facts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,10 +36,13 @@ _NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
 
 
 @dataclass(frozen=True)
-class Inspected:
-    """A campaign, and what its checks open of it.
+class Examination:
+    """A campaign and its files, opened; what is wrong with those that do not open stands beside.
 
-    What cannot be opened is missing here: 'files', 'recordings', 'tracks' and 'crs' say why, once.
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
     """
 
     campaign: Campaign
@@ -50,17 +54,17 @@ class Inspected:
         return stated if isinstance(stated, SampledWaveform) else None
 
     @property
-    def sent(self) -> "Transmitted | None":
+    def transmitted(self) -> "Transmitted | None":
         """What was transmitted; None without samples, or where the file is not what the waveform says."""
-        return self._sent[0]
+        return self._transmitted[0]
 
     @property
-    def unsent(self) -> list[CampaignError]:
+    def transmitted_problems(self) -> list[CampaignError]:
         """What is wrong with the file."""
-        return self._sent[1]
+        return self._transmitted[1]
 
     @cached_property
-    def _sent(self) -> "tuple[Transmitted | None, list[CampaignError]]":
+    def _transmitted(self) -> "tuple[Transmitted | None, list[CampaignError]]":
         from apertura.pipeline.opening.transmitted import transmitted
 
         try:
@@ -80,8 +84,8 @@ class Inspected:
         return self._recordings[0]
 
     @property
-    def unopened(self) -> list[CampaignError]:
-        """What is wrong with the others."""
+    def recording_problems(self) -> list[CampaignError]:
+        """Why the others cannot be opened."""
         return self._recordings[1]
 
     @property
@@ -90,18 +94,18 @@ class Inspected:
         return self._tracks[0]
 
     @property
-    def unread(self) -> list[CampaignError]:
-        """What is wrong with the others."""
+    def track_problems(self) -> list[CampaignError]:
+        """Why the others cannot be opened."""
         return self._tracks[1]
 
     @cached_property
-    def unread_histories(self) -> list[CampaignError]:
-        """What is wrong with phase history: of every pair whose files are small, and of one that the frame rests on."""
+    def history_problems(self) -> list[CampaignError]:
+        """What is wrong with phase history: of every pair whose files are small, and of one that states the frame."""
         if self.waveform is not None:
             return []
         from apertura.pipeline.opening.pair import recorded_echo
 
-        wrong: list[CampaignError] = []
+        problems: list[CampaignError] = []
         pairs = [(flight.name, pair) for flight in self.campaign.flights for pair in flight.pairs]
         for number, (flight, pair) in enumerate(pairs):
             try:
@@ -114,8 +118,8 @@ class Inspected:
             try:
                 recorded_echo(self.campaign, flight, pair)
             except CampaignError as problem:
-                wrong.append(problem)
-        return wrong
+                problems.append(problem)
+        return problems
 
     @cached_property
     def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
@@ -136,11 +140,11 @@ class Inspected:
         return self._each(files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]))
 
     def _each(
-        self, files: Callable[[str, str], tuple[Path, ...]], opened: Callable[[tuple[Path, ...], Key], T]
+        self, files: Callable[[str, str], tuple[Path, ...]], open_files: Callable[[tuple[Path, ...], Key], T]
     ) -> tuple[dict[Key, T], list[CampaignError]]:
-        """Open what lies there and is not empty; the others are for 'files' to name."""
-        found: dict[Key, T] = {}
-        wrong: list[CampaignError] = []
+        """Open files that are there and not empty; the check 'files' names the others."""
+        opened: dict[Key, T] = {}
+        problems: list[CampaignError] = []
         for flight, node in self.keys:
             try:
                 paths = files(flight, node)
@@ -149,31 +153,30 @@ class Inspected:
             if not all(path.stat().st_size for path in paths):
                 continue
             try:
-                found[flight, node] = opened(paths, (flight, node))
+                opened[flight, node] = open_files(paths, (flight, node))
             except CampaignError as problem:
-                wrong.append(problem)
-        return found, wrong
+                problems.append(problem)
+        return opened, problems
 
     @cached_property
-    def geodetic(self) -> dict[Key, NDArray[np.float64]]:
-        """Flight and node → (epoch, 3) float64: latitude, longitude (deg), ellipsoidal height (m) of a log on Earth."""
-        places = {key: track.position.values for key, track in self.tracks.items() if track.attrs["frame"] == "ecef"}
-        return {key: geodetic_from_ecef(position_m) for key, position_m in places.items()}
+    def logs(self) -> dict[Key, LogFacts]:
+        """What each of them holds."""
+        return {key: log_facts(track) for key, track in self.tracks.items()}
 
     @property
     def frame(self) -> str:
         """What positions are in, ecef or local; empty where only the samples say."""
-        logged = [track.attrs["frame"] for track in self.tracks.values()]
-        if logged or self.waveform:
-            return next(iter(logged), "ecef")
+        frames = [track.attrs["frame"] for track in self.tracks.values()]
+        if frames or self.waveform:
+            return next(iter(frames), "ecef")
         return PHASE_HISTORIES[self.campaign.settings.waveform.format].frame  # type: ignore[union-attr]
 
     @cached_property
     def crs(self) -> str | None:
-        """CRS of the scene; `auto` is the zone of the first image flight; None where nobody can tell, or it is none."""
-        asked = self.campaign.settings.scene.crs
-        if asked != "auto":
-            return asked if asked == LOCAL or in_metres(asked) else None
+        """CRS of the scene; `auto` is the zone of the first image flight; None if unknown or not in metres."""
+        requested = self.campaign.settings.scene.crs
+        if requested != "auto":
+            return requested if requested == LOCAL or in_metres(requested) else None
         from apertura.core.scene.auto_grid import utm_crs
 
         middle = self.middle_m
@@ -188,7 +191,11 @@ class Inspected:
     def middle_m(self) -> NDArray[np.float64] | None:
         """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
         first = {flight.name for flight in self.campaign.image_flights[:1]}
-        logs = [self.tracks[key].position.values for key in self.geodetic if key[0] in first]
+        logs = [
+            track.position.values
+            for key, track in self.tracks.items()
+            if key[0] in first and track.attrs["frame"] == "ecef"
+        ]
         return np.median(np.concatenate(logs), axis=0) if logs else None
 
     @cached_property
@@ -196,23 +203,23 @@ class Inspected:
         """The scene's pixels, coarser ones where the spacing is `auto`; None where bounds are, or the CRS is wrong."""
         from apertura.core.scene.grid import SceneGrid
 
-        asked = self.campaign.settings.scene
-        if self.crs is None or asked.bounds_m == "auto" or self.other_frame:
+        requested = self.campaign.settings.scene
+        if self.crs is None or requested.bounds_m == "auto" or self.other_frame:
             return None
-        xmin, ymin, xmax, ymax = asked.bounds_m
-        spacing = min(xmax - xmin, ymax - ymin) / _NODES if asked.spacing_m == "auto" else asked.spacing_m
+        xmin, ymin, xmax, ymax = requested.bounds_m
+        spacing = min(xmax - xmin, ymax - ymin) / _NODES if requested.spacing_m == "auto" else requested.spacing_m
         try:
-            return SceneGrid.from_bounds(self.crs, asked.bounds_m, spacing_m=spacing)
+            return SceneGrid.from_bounds(self.crs, requested.bounds_m, spacing_m=spacing)
         except CampaignError:
             return None
 
     @property
     def ground(self) -> "ConfiguredGround | None":
-        """The ground as the config states it, opened; None where it cannot be, or nobody knows in which CRS."""
+        """The ground as the config states it, opened; None where it cannot be, or the CRS is not known."""
         return self._ground[0]
 
     @property
-    def no_ground(self) -> list[CampaignError]:
+    def ground_problems(self) -> list[CampaignError]:
         """Why it cannot be opened."""
         return self._ground[1]
 
@@ -223,21 +230,20 @@ class Inspected:
 
     @cached_property
     def _ground(self) -> "tuple[ConfiguredGround | None, list[CampaignError], float]":
-        from apertura.pipeline.opening.scene import ConfiguredGround
 
-        flown_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
-        asked = self.campaign.settings.scene
+        track_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
+        requested = self.campaign.settings.scene
         try:
             files = self.campaign.height_files()
         except CampaignError:
-            return None, [], flown_m
+            return None, [], track_m
         if self.crs is None or not all(path.is_file() and path.stat().st_size for path in files.values()):
-            return None, [], flown_m
+            return None, [], track_m
         try:
-            ground = ConfiguredGround.of(asked, files, crs=self.crs)
-            return ground, [], flown_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
+            ground = ConfiguredGround.of(requested, files, crs=self.crs)
+            return ground, [], track_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
         except CampaignError as problem:
-            return None, [problem], flown_m
+            return None, [problem], track_m
 
 
 def in_metres(crs: str) -> bool:

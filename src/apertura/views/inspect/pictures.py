@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import shown
+from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.tracks.track import FIXES
-from apertura.views.inspection.log import east_north_up
-from apertura.views.inspection.recording import LOST
-from apertura.views.inspection.timing import gaps, interval_s, seconds, utc
+from apertura.pipeline.examination.times import LOST_CAPTURE, Span, gaps, interval_s, seconds, utc
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,9 +34,6 @@ _ROWS = 256  # pulses and captures that are drawn
 _COLUMNS = 1024
 _FLOOR_DB = -60.0
 
-Span = tuple[np.datetime64, np.datetime64]
-"""First and last."""
-
 Floats = NDArray[np.floating[Any]]
 
 
@@ -50,8 +46,8 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
     place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
     for label, own in _by_fix(track).items():
-        told, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
-        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=told, markersize=2.5)
+        words, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
+        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)
         height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
     for number, epoch in enumerate(gaps(times, LONG_GAP)):
         ends = slice(epoch - 1, epoch + 1)
@@ -66,6 +62,22 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     _intervals(steps, at_s[1:], times)
     _named(steps, f"seconds since {utc(times[0])}", "since the epoch before, s")
     return figure
+
+
+def east_north_up(position_m: NDArray[np.float64], frame: str, middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 3) positions as metres to east and north of a place on Earth, and height above the ellipsoid.
+
+    In a frame without a place on Earth they are its axes as they stand.
+
+    Examples
+    --------
+    >>> east_north_up(np.array([[6378147.0, 30.0, 40.0]]), "ecef", np.array([6378137.0, 0.0, 0.0])).round(3)[:, :2]
+    array([[30., 40.]])
+    """
+    if frame != "ecef":
+        return position_m
+    north_east = ((position_m - middle) @ ned_axes(middle))[:, :2]
+    return np.column_stack([north_east[:, ::-1], geodetic_from_ecef(position_m)[:, 2]])
 
 
 def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]) -> None:
@@ -109,7 +121,7 @@ def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name:
 def _captures(axes: "Axes", times: NDArray[np.datetime64]) -> None:
     """Draw the times between captures; red where some are missing."""
     _intervals(axes, np.arange(1, len(times)), times)
-    for capture in gaps(times, LOST)[:_ROWS]:
+    for capture in gaps(times, LOST_CAPTURE)[:_ROWS]:
         axes.axvline(capture, color="red", linewidth=0.6)
     typical_s = interval_s(times)
     axes.axhline(typical_s, color="tab:blue", linewidth=0.8, label=f"typical: {typical_s:.6g} s")

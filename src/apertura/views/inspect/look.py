@@ -1,16 +1,22 @@
-"""What a path is: of the readers in the tables that its name fits, the first that reads it tells."""
+"""`apertura inspect`: what a path is, by the first reader of the tables that its name fits and that reads it."""
 
+import json
+import logging
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from apertura.common.errors import CampaignError, explained, quoted, shown
 from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format, log_suffixes, recording_files
-from apertura.views.inspection.report import Report
-from apertura.views.inspection.surroundings import Surroundings, retries, surroundings
+from apertura.views.inspect.report import Report, print_report
+from apertura.views.inspect.surroundings import Surroundings, retries, surroundings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_FILES = 100
 """Of a folder that are looked into."""
@@ -18,6 +24,68 @@ MOST_FILES = 100
 _HEAD_BYTES = 16
 
 Reader = Callable[[], Report]
+
+
+def inspect_path(
+    path: Path,
+    settings: Sequence[str] = (),
+    *,
+    name: Path | None = None,
+    plot: Path | None = None,
+    as_json: bool = False,
+) -> int:
+    """Print what a file or folder is; return 0, or 2 where no reader reads it.
+
+    Parameters
+    ----------
+    path
+        Absolute.
+    name
+        What people call it; None: its path.
+    settings
+        KEY=VALUE, keys of `apertura.formats.tracks.log_options.LogOptions`.
+    plot
+        Draw a preview into this .png file.
+    as_json
+        Print JSON.
+
+    Raises
+    ------
+    CampaignError
+        If the path is not there, a setting is none, or the preview would not be a .png file of its own.
+    """
+    if plot is not None and (plot.suffix.lower() != ".png" or plot == path or (plot.exists() and not _is_png(plot))):
+        found = "a file that is no picture" if plot.exists() else "another suffix than .png"
+        raise CampaignError(found, f"--plot {plot}", "the name of a new .png file", "Choose another name.")
+    logging.getLogger("apertura.formats.reading").addHandler(
+        logging.NullHandler()
+    )  # remarks of readers are in the report
+    report = look(path, settings)
+    drawn = None if plot is None or report.picture is None else _drawn(report.picture(), plot)
+    if as_json:
+        print(json.dumps(report.as_json() | {"plot": drawn and str(drawn)}, indent=1, allow_nan=False))
+    else:
+        print_report(report, name if report.path == path else None)
+        if plot is not None:
+            print(shown(drawn, 400) if drawn else "nothing to draw")
+    return 2 if report.problem else 0
+
+
+def _is_png(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(8) == b"\x89PNG\r\n\x1a\n"
+
+
+def _drawn(figure: "Figure", plot: Path) -> Path:
+    """Write a picture; return its path."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from apertura.common.atomic import replacement
+
+    FigureCanvasAgg(figure)
+    with replacement(plot) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})
+    return plot
 
 
 def look(path: Path, settings: Sequence[str] = ()) -> Report:
@@ -33,7 +101,7 @@ def look(path: Path, settings: Sequence[str] = ()) -> Report:
     Raises
     ------
     CampaignError
-        If it is not there, or a setting is none; whatever a file holds is told by the report.
+        If it is not there, or a setting is none; whatever else is wrong with a file is in the report.
     """
     try:
         mode = path.stat().st_mode
@@ -51,7 +119,7 @@ def _folder(path: Path, settings: Sequence[str]) -> Report:
     if any(path.name.endswith(row.suffix) for row in PHASE_HISTORIES.values()):
         return _file(path, surroundings(path, settings))
     if (path / "config").is_dir() or (path / "raw").is_dir():
-        from apertura.views.inspection.whole import campaign_report
+        from apertura.views.inspect.campaign import campaign_report
 
         return campaign_report(path)
     names = sorted(one for one in path.iterdir() if one.is_file() and not one.name.startswith("."))
@@ -70,8 +138,8 @@ def _file(path: Path, beside: Surroundings) -> Report:
     for kind, name, read in _readers(path, beside):
         try:
             return _with_config(read(), beside)
-        except Exception as error:  # whatever a file makes a reader do is told of the file
-            refused.append(Report(path, kind, name, _size(path), problem=_told(error, path)))
+        except Exception as error:  # whatever a file makes a reader raise is reported of the file
+            refused.append(Report(path, kind, name, _size(path), problem=_as_problem(error, path)))
     if not refused:
         return _unknown(path)
     first = refused[0]
@@ -86,7 +154,7 @@ def _with_config(report: Report, beside: Surroundings) -> Report:
     return replace(report, missing=(*report.missing, f"a config that can be read: {beside.problem}"))
 
 
-def _told(error: Exception, path: Path) -> CampaignError:
+def _as_problem(error: Exception, path: Path) -> CampaignError:
     if isinstance(error, CampaignError):
         return error
     known = explained(error)
@@ -96,13 +164,13 @@ def _told(error: Exception, path: Path) -> CampaignError:
 
 def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
     """Yield kind, format and reader for every row of the tables that a name fits; of a format stated that alone."""
-    stated = "" if "format" in beside.asked or ".track." in path.name else str(beside.waveform.get("format", ""))
+    stated = "" if "format" in beside.typed or ".track." in path.name else str(beside.waveform.get("format", ""))
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, beside)
-        return  # it is what the campaign will read: that another reader knows the file would be no comfort
-    if "format" not in beside.asked:
+        return  # the campaign reads it as that, whichever other reader knows the file
+    if "format" not in beside.typed:
         yield from _of_recorders(path, beside)
-    if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.asked):
+    if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.typed):
         with suppress(CampaignError):  # none that is known
             yield "flight log", log_format(path, beside.options), partial(_log, path, beside)
     yield from _others(path)
@@ -119,31 +187,30 @@ def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, 
 
 
 def _recording(path: Path, node: str, beside: Surroundings) -> Report:
-    from apertura.views.inspection.recording import recording_report
+    from apertura.views.inspect.files import recording_report
 
     return recording_report(recording_files(path.parent, node), beside)
 
 
 def _history(path: Path, name: str, beside: Surroundings) -> Report:
-    from apertura.views.inspection.history import history_report
+    from apertura.views.inspect.files import history_report
 
     files = PHASE_HISTORIES[name].files_of(path)
     return history_report(path if path.is_dir() else files[0], files, name, beside)
 
 
 def _log(path: Path, beside: Surroundings) -> Report:
-    from apertura.views.inspection.log import log_report
+    from apertura.views.inspect.files import log_report
 
     return log_report(path, beside)
 
 
 def _others(path: Path) -> Iterator[tuple[str, str, Reader]]:
-    from apertura.views.inspection.array import SUFFIX, array_report
-    from apertura.views.inspection.elevation import SUFFIXES, elevation_report
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report
 
-    if path.suffix.lower() in SUFFIXES:
-        yield "elevation model", "", partial(elevation_report, path)
-    if path.suffix == SUFFIX:
+    if path.suffix.lower() in DEM:
+        yield "elevation model", "", partial(dem_report, path)
+    if path.suffix in ARRAY:
         yield "array", "", partial(array_report, path)
 
 

@@ -1,4 +1,4 @@
-"""What is told of a file or folder: facts by name, for people and for machines."""
+"""The report of a file or folder: facts by name, printed for people and for machines."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ _LONGEST = 600
 
 @dataclass(frozen=True)
 class Report:
-    """What is told of a file or folder.
+    """What a file or folder is, and what it holds.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Report:
         What a folder holds.
     columns
         Facts of the parts that a table of them shows.
-    spelt
+    lines_of_parts
         Facts of the parts that are too long for a table, a line each.
     picture
         Draws a preview.
@@ -53,7 +53,7 @@ class Report:
     problem: CampaignError | None = None
     parts: tuple["Report", ...] = ()
     columns: tuple[str, ...] = ()
-    spelt: tuple[str, ...] = ()
+    lines_of_parts: tuple[str, ...] = ()
     picture: "Callable[[], Figure] | None" = None
 
     @property
@@ -95,10 +95,10 @@ def worded(name: str, value: object) -> tuple[str, str]:
     (('rate', '1.25 MHz'), ('height', '1.00 to 20.50 m'), ('fix', 'fix 3, float 1'))
     """
     ends = next((end for end in sorted(_UNITS, key=len, reverse=True) if name.endswith(f"_{end}")), "")
-    return name.removesuffix(f"_{ends}").replace("_", " "), shown(_told(value, _UNITS.get(ends, "")), _LONGEST)
+    return name.removesuffix(f"_{ends}").replace("_", " "), shown(_words(value, _UNITS.get(ends, "")), _LONGEST)
 
 
-def _told(value: object, unit: str) -> str:
+def _words(value: object, unit: str) -> str:
     if isinstance(value, Mapping):
         return ", ".join(" ".join(worded(str(name), part)) for name, part in value.items()) or "none"
     if isinstance(value, list):
@@ -111,10 +111,10 @@ def _told(value: object, unit: str) -> str:
 
 
 def _listed(values: list[Any], unit: str) -> str:
-    told = [_told(value, unit) for value in values]
+    words = [_words(value, unit) for value in values]
     if unit and len(values) == 2 and not isinstance(values[0], str):
-        return f"{told[0].removesuffix(f' {unit}')} to {told[1]}"
-    return ("; " if any(isinstance(value, Mapping) for value in values) else ", ").join(told) or "none"
+        return f"{words[0].removesuffix(f' {unit}')} to {words[1]}"
+    return ("; " if any(isinstance(value, Mapping) for value in values) else ", ").join(words) or "none"
 
 
 def _number(value: float, unit: str) -> str:
@@ -128,7 +128,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def print_report(report: Report, name: Path | None = None) -> None:
-    """Print what is told of a file or folder, for people; `name` is what they call it."""
+    """Print a report for people; `name` is the path as they typed it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -143,12 +143,12 @@ def print_report(report: Report, name: Path | None = None) -> None:
     if report.parts:
         console.print(_table(report))
     for part in report.parts:
-        for fact, value in (worded(name, part.facts[name]) for name in report.spelt if name in part.facts):
+        for fact, value in (worded(name, part.facts[name]) for name in report.lines_of_parts if name in part.facts):
             console.print(Text(f"  {shown(part.path.name)}, {part.title}, {fact}: {value}"))
     if report.problem:
         problem = report.problem
-        told = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
-        console.print(Text.assemble(("refused: ", "red"), told))
+        sentence = f"{problem.found}; expected {problem.expected}. {problem.remedy}"
+        console.print(Text.assemble(("refused: ", "red"), sentence))
     if report.missing:
         console.print(Text("missing for an image:" if not report.problem else "what helps:", style="yellow"))
     for sentence in report.missing:
@@ -163,7 +163,7 @@ def _table(report: Report) -> Any:
 
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in ("", "is", *(worded(name, None)[0] for name in report.columns)):
-        table.add_column(heading, overflow="fold")  # a narrow terminal wraps what is told, and cuts nothing
+        table.add_column(heading, overflow="fold")  # a narrow terminal wraps, and cuts nothing
     for part in report.parts:
         cells = [worded(name, part.facts[name])[1] if name in part.facts else "" for name in report.columns]
         title = f"{part.title}, refused: {part.problem.found}" if part.problem else part.title

@@ -1,0 +1,256 @@
+"""When something was recorded or logged: span, rate, gaps, and how the times of two recordings or logs overlap."""
+
+from dataclasses import dataclass
+from math import fsum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Times
+from apertura.formats.recordings.recording import Recording
+
+Span = tuple[np.datetime64, np.datetime64]
+"""First and last."""
+
+LOST_CAPTURE = 1.5
+"""Intervals between captures from which on one is missing between them."""
+
+LAG = 16
+"""Intervals over which a rate is measured, too: that averages out what rounds single times."""
+
+_UNIX_DAYS = np.timedelta64(3650, "D")
+
+
+@dataclass(frozen=True, eq=False)
+class TimeFacts:
+    """When something was logged or recorded.
+
+    Attributes
+    ----------
+    count
+        How many times there are.
+    span
+        The first and the last.
+    clock
+        UTC; its own, where no clock was set; none, where times only count pulses.
+    interval_s
+        Typical time between neighbours, seconds; inf of one alone.
+    gap_at
+        (gap,) intp: numbers of the times before which there is a gap.
+    after_s, gap_s
+        (gap,) float64: when each gap begins, seconds since the first time, and how long it is.
+    """
+
+    count: int
+    span: Span
+    clock: Literal["UTC", "its own", "none"]
+    interval_s: float
+    gap_at: NDArray[np.intp]
+    after_s: NDArray[np.float64]
+    gap_s: NDArray[np.float64]
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last."""
+        return float((self.span[1] - self.span[0]) / np.timedelta64(1, "s"))
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Times per second without gaps; None of one alone."""
+        return 1 / self.interval_s if 0 < self.interval_s < np.inf else None
+
+    @property
+    def lost(self) -> int:
+        """How many times are missing in all gaps."""
+        return int((np.round(self.gap_s / self.interval_s) - 1).sum())
+
+
+def time_facts(times: Times, *, longer: float) -> TimeFacts:
+    """Return when something was logged or recorded.
+
+    Parameters
+    ----------
+    times
+        (time,) datetime64[ns], ascending, at least one.
+    longer
+        Typical intervals from which on there is a gap.
+
+    Examples
+    --------
+    >>> kept = np.delete(np.arange(40), [20, 21])
+    >>> facts = time_facts(np.datetime64("2025-05-14", "ns") + kept * np.timedelta64(50, "ms"), longer=1.5)
+    >>> facts.clock, round(facts.rate_hz, 9), facts.gap_at.tolist(), facts.gap_s.round(9).tolist(), facts.lost
+    ('UTC', 20.0, [20], [0.15], 2)
+    """
+    late, elapsed_s = gaps(times, longer), seconds(times)
+    return TimeFacts(
+        count=len(times),
+        span=(times[0], times[-1]),
+        clock="none" if counted(times) else "its own" if own_clock(times) else "UTC",
+        interval_s=interval_s(times),
+        gap_at=late,
+        after_s=elapsed_s[late - 1],
+        gap_s=np.diff(elapsed_s)[late - 1],
+    )
+
+
+def iso(time: np.datetime64) -> str:
+    """Return a time as date and time of day to the millisecond.
+
+    Examples
+    --------
+    >>> iso(np.datetime64("2025-05-14T09:30:00.0021", "ns"))
+    '2025-05-14T09:30:00.002'
+    """
+    return str(np.datetime_as_string(time, "ms"))
+
+
+def utc(time: np.datetime64) -> str:
+    """Return a time to a millisecond, ISO 8601 with its zone.
+
+    Examples
+    --------
+    >>> utc(np.datetime64("2025-05-14T09:30:00.1234567", "ns"))
+    '2025-05-14T09:30:00.123Z'
+    """
+    return f"{iso(time)}Z"
+
+
+def seconds(times: Times) -> NDArray[np.float64]:
+    """Return (time,) float64: seconds since the first."""
+    return np.asarray((times - times[0]) / np.timedelta64(1, "s"), np.float64)
+
+
+def steps_s(times: Times, *, over: int = 1) -> NDArray[np.float64]:
+    """Return (time - over,) float64: seconds from each time to the one that is `over` intervals later."""
+    return np.asarray((times[over:] - times[:-over]) / np.timedelta64(1, "s"), np.float64)
+
+
+def interval_s(times: Times) -> float:
+    """Return the typical time between neighbours, seconds; inf of one alone.
+
+    The median of single intervals says which stretches are without losses; their mean is finer than times that
+    were written coarsely.
+
+    Examples
+    --------
+    >>> kept = np.delete(np.arange(60), np.arange(20, 60, 9))
+    >>> coarse_ms = np.round(kept * 33.34).astype("timedelta64[ms]")
+    >>> round(interval_s(np.datetime64("2025-05-14", "ns") + coarse_ms), 4)
+    0.0333
+    """
+    if len(times) < 2:
+        return np.inf
+    single_s = float(np.median(steps_s(times)))
+    lag = min(LAG, len(times) - 1)
+    spans_s = steps_s(times, over=lag)
+    whole_s = spans_s[np.abs(spans_s - lag * single_s) < single_s / 2]
+    return fsum(whole_s) / (whole_s.size * lag) if whole_s.size else single_s
+
+
+def gaps(times: Times, longer: float) -> NDArray[np.intp]:
+    """Return the numbers of the times before which more than `longer` typical intervals are without any.
+
+    Examples
+    --------
+    >>> kept = np.delete(np.arange(40), [20, 21])
+    >>> gaps(np.datetime64("2025-05-14", "ns") + kept * np.timedelta64(50, "ms"), 1.5)
+    array([20])
+    """
+    return np.flatnonzero(np.diff(seconds(times)) > longer * interval_s(times)) + 1
+
+
+def own_clock(times: Times) -> bool:
+    """Return whether times count from the epoch of the machine: no clock was set when they were taken.
+
+    Examples
+    --------
+    >>> own_clock(np.array(["1970-01-01T00:00:05"], "datetime64[ns]"))
+    True
+    """
+    return bool(times[0] < np.datetime64(0, "ns") + _UNIX_DAYS)
+
+
+def counted(times: Times) -> bool:
+    """Return whether times only count pulses from the epoch of the machine, one a second: there was no clock at all.
+
+    Examples
+    --------
+    >>> counted(np.arange(3).astype("datetime64[s]").astype("datetime64[ns]"))
+    True
+    """
+    return own_clock(times) and bool((np.diff(times) == np.timedelta64(1, "s")).all())
+
+
+def recorded_span(recording: Recording) -> Span:
+    """Return the times of the first and the last capture; of all samples where the recorder ran through."""
+    first, last = recording.captures.time[0], recording.captures.time[-1]
+    if recording.framing is not None:
+        last = last + np.timedelta64(round(len(recording.samples) / recording.sample_rate_hz * 1e9), "ns")
+    return first, last
+
+
+def frame_numbers(recording: Recording) -> NDArray[np.int64]:
+    """Return (n,) int64: the frame numbers of the captures that have one."""
+    frame = recording.captures.frame
+    return np.asarray(frame[frame >= 0])
+
+
+def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
+    """Return the transmitter's tags of pulses that surely find a partner in the receiver's recording.
+
+    By equal frame numbers where both nodes have them, else by tags, but for one interval at either end. None where a
+    counter wraps or the recorder ran through: their pulses are not known from headers.
+
+    Parameters
+    ----------
+    tx, rx
+        Recordings of the transmitting and of the receiving node, which may be the same.
+    prf_hz
+        Pulses per second.
+    """
+    times = tx.captures.time
+    if tx.framing is not None or rx.framing is not None:
+        return times[:0]
+    if tx is rx:
+        return times
+    numbers = frame_numbers(tx), frame_numbers(rx)
+    if all(own.size for own in numbers):
+        wrapped = any((np.diff(own) <= 0).any() for own in numbers)
+        return times[:0] if wrapped else times[np.isin(tx.captures.frame, numbers[1])]
+    interval = np.timedelta64(round(1e9 / prf_hz), "ns")
+    first, last = recorded_span(rx)
+    return times[inside(times, (first + interval, last - interval))]
+
+
+def inside(times: Times, span: Span) -> NDArray[np.bool_]:
+    """Return (time,) bool: which times lie inside a span, both ends included.
+
+    Examples
+    --------
+    >>> days = np.arange("2025-01-01", "2025-01-06", dtype="datetime64[D]")
+    >>> inside(days, (days[1], days[3]))
+    array([False,  True,  True,  True, False])
+    """
+    return np.asarray((times >= span[0]) & (times <= span[1]))
+
+
+def apart_s(one: Span, other: Span) -> float:
+    """Return the seconds between two spans; 0 or less where they touch or overlap.
+
+    Examples
+    --------
+    >>> first, second = (np.datetime64(f"2025-05-14T{time}", "ns") for time in ("09:30:00", "09:30:10"))
+    >>> late = np.timedelta64(1, "h")
+    >>> apart_s((first, second), (first + late, second + late)), apart_s((first, second), (second, second + late))
+    (3590.0, 0.0)
+    """
+    second = np.timedelta64(1, "s")
+    return float(max((other[0] - one[1]) / second, (one[0] - other[1]) / second))
+
+
+def shift_s(one: Span, other: Span) -> float:
+    """Return by how many seconds the middle of the other span is later."""
+    second = np.timedelta64(1, "s")
+    return float(((other[0] - one[0]) / second + (other[1] - one[1]) / second) / 2)

@@ -1,0 +1,369 @@
+"""Reports of one file: a flight log, a recording, phase history, a DEM, an array."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, shown
+from apertura.core.scene.dem import open_dem
+from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
+from apertura.formats.npy import read_npy
+from apertura.formats.reading import open_recording, read_phase_history, read_track
+from apertura.pipeline.examination.facts import (
+    HistoryFacts,
+    LogFacts,
+    RecordingFacts,
+    dem_facts,
+    history_facts,
+    log_facts,
+    log_faults,
+    recording_facts,
+)
+from apertura.pipeline.examination.times import TimeFacts, inside, own_clock, utc
+from apertura.views.inspect.report import Report
+from apertura.views.inspect.surroundings import NODE, Surroundings
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apertura.formats.recordings.recording import Recording
+
+ARRAY, DEM = (".npy",), (".tif", ".tiff")
+"""Suffixes."""
+
+FIRST = 128
+"""Captures whose samples are read."""
+
+LISTED = 10
+"""Gaps that are listed one by one, the longest."""
+
+PHASE_HISTORY = "phase_history"
+"""waveform.kind of samples that say themselves what was transmitted."""
+
+_MOST_SAMPLES = 1 << 21
+_MOST_NUMBERS = 1 << 28
+
+
+def time_rows(times: TimeFacts) -> dict[str, Any]:
+    """Return facts of a report: span, rate and gaps."""
+    utc_known = times.clock == "UTC"
+    rows: dict[str, Any] = {"clock": "UTC" if utc_known else "its own"}
+    if utc_known:
+        rows |= {"first_utc": utc(times.span[0]), "last_utc": utc(times.span[1])}
+    rows |= {"duration_s": times.duration_s, "rate_hz": times.rate_hz, "gaps": int(times.gap_at.size)}
+    if times.gap_at.size:
+        longest = np.sort(np.argsort(-times.gap_s, kind="stable")[:LISTED])
+        rows["lost_in_gaps"] = times.lost
+        rows["longest_gaps"] = [
+            {"after_s": round(float(times.after_s[gap]), 6), "length_s": round(float(times.gap_s[gap]), 6)}
+            for gap in longest
+        ]
+    return rows
+
+
+def log_report(path: Path, beside: Surroundings) -> Report:
+    """Return the report of a flight log.
+
+    Raises
+    ------
+    CampaignError
+        If it is none, or leaves open what `LogOptions` must say.
+    """
+    track = read_track(path, node=beside.node, options=beside.options)
+    facts = log_facts(track)
+    from apertura.views.inspect.pictures import draw_log
+
+    return Report(
+        path,
+        "flight log",
+        log_format(path, beside.options),
+        _log_rows(facts, track),
+        tuple(_log_lacks(path, facts, beside)),
+        picture=lambda: draw_log(track, path.name),
+    )
+
+
+def _log_rows(log: LogFacts, track: "xr.Dataset") -> dict[str, Any]:
+    checked = log_faults(track)
+    rows: dict[str, Any] = {
+        "epochs": log.times.count,
+        "left_out": dict(log.dropped),
+        **time_rows(log.times),
+        "fix": log.fixes,
+        "attitude_share": log.attitude_share,
+        "frame": log.frame,
+        "bounds": dict(log.bounds),
+        "length_m": log.length_m,
+        "speed_m_s": {"median_m_s": log.median_speed_m_s, "largest_m_s": log.largest_speed_m_s},
+        "unusable_epochs": int((~checked.kept).sum()),
+        "faults": {name: len(where) for name, where in checked.faults.items()},
+        "error_between_epochs_m": checked.interpolation_m,
+    }
+    if log.stated_std_m is not None:
+        rows["stated_std_m"] = list(log.stated_std_m)
+    if log.remarks:
+        rows["remarks"] = list(log.remarks)
+    return rows
+
+
+def _log_lacks(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
+    lacks, suffixes = [], log_suffixes()
+    if beside.node == NODE:
+        suffix = path.suffix[1:].lower()
+        lacks.append(f"its name: copy it to raw/<flight>/{NODE}.track.{suffix if suffix in suffixes else suffixes[0]}")
+    lacks += [f"what --set gives here: put nodes.{NODE}.log.{key} into config/config.yaml" for key in beside.typed]
+    if not log.has_attitude:
+        lacks.append(f"attitude: set nodes.{NODE}.attitude to course, or lever arms to zero and antennas to null")
+    if log.times.gap_at.size:
+        lacks.append(f"epochs where it has gaps ({log.times.gap_at.size}): pulses there may be left out")
+    kinds = log.fixes or {}
+    if kinds and not {"fix", "float"} & kinds.keys():
+        lacks.append("a solution with carrier phase (RTK or PPK): positions err by many wavelengths")
+    elif kinds.get("float") or any(name not in {"fix", "float", "not stated"} for name in kinds):
+        lacks.append(f"a fixed solution throughout: pulses at other epochs are left out, see nodes.{NODE}.worst_fix")
+    if log.fixes is None and log.stated_std_m is None:
+        lacks.append(f"how far it errs: the log does not say; state nodes.{NODE}.position_std_m")
+    return lacks
+
+
+def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
+    """Return the report of a recording.
+
+    Parameters
+    ----------
+    files
+        In the order of a row of `apertura.formats.names.RECORDERS`.
+    beside
+        Where they lie.
+
+    Raises
+    ------
+    CampaignError
+        If they are none.
+    """
+    recording = open_recording(files)
+    facts, samples = recording_facts(recording), first_samples(recording)
+    rows = _recording_rows(recording, facts) | {"first_captures": _levels(recording.channels, samples)}
+    from apertura.views.inspect.pictures import draw_recording
+
+    node = files[0].name.removesuffix(files[0].suffix)
+    logs = sorted(log for log in files[0].parent.glob("*.track.*") if log.name.startswith(f"{node}.track."))
+    lacks = _recording_lacks(recording, facts, beside)
+    if logs:
+        covered, left_out = _against_log(recording, node, logs[0], beside)
+        rows, lacks = rows | covered, lacks + left_out
+    else:
+        lacks.append(f"where it was: no flight log {node}.track.<{'|'.join(log_suffixes())}> lies beside")
+    return Report(
+        files[0],
+        "recording",
+        files[0].suffix.lstrip("."),
+        rows,
+        tuple(lacks),
+        picture=lambda: draw_recording(recording, samples, files[0].name),
+    )
+
+
+def _recording_rows(recording: "Recording", facts: RecordingFacts) -> dict[str, Any]:
+    rows: dict[str, Any] = {
+        "files": [file.name for file in recording.files],
+        "channels": list(facts.channels),
+        "sample_rate_hz": facts.sample_rate_hz,
+        "carrier_hz": facts.carrier_hz,
+        "samples": facts.samples,
+        "captures": facts.captures,
+        "capture_samples": facts.capture_samples,
+    }
+    if facts.times is None:
+        length_s = facts.samples / facts.sample_rate_hz
+        return rows | {"runs_through": True, "first_utc": utc(facts.span[0]), "duration_s": length_s}
+    return rows | time_rows(facts.times) | {"frame_numbers": facts.frames and asdict(facts.frames)}
+
+
+def first_samples(recording: "Recording") -> NDArray[np.complex64]:
+    """Return (capture, sample, channel) complex64: the first captures; of one that runs through its first samples."""
+    captures = recording.captures
+    each = min(captures.length, _MOST_SAMPLES)
+    count = max(1, min(FIRST, len(captures.start), _MOST_SAMPLES // max(each, 1)))
+    iq = recording.samples.captures(captures.start[:count], each).astype(np.float32)
+    return np.asarray(iq[..., 0] + 1j * iq[..., 1], np.complex64)
+
+
+def _levels(channels: Sequence[str], samples: NDArray[np.complex64]) -> dict[str, dict[str, float]]:
+    """Return channel → RMS amplitude and the largest of either component, in counts of the recorder."""
+    parts = samples.view(np.float32)
+    peaks = np.abs(parts.reshape(-1, len(channels), 2)).max(axis=(0, 2))
+    rms = np.sqrt(np.mean(np.abs(samples.astype(np.complex128)) ** 2, axis=(0, 1)))
+    return {
+        name: {"rms": float(one), "largest": float(peak)} for name, one, peak in zip(channels, rms, peaks, strict=True)
+    }
+
+
+def _recording_lacks(recording: "Recording", facts: RecordingFacts, beside: Surroundings) -> list[str]:
+    lacks = []
+    if not beside.waveform:
+        prf_hz = facts.times and facts.times.rate_hz
+        stated = {"sample_rate_hz": facts.sample_rate_hz, "carrier_hz": facts.carrier_hz, "prf_hz": prf_hz}
+        known = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
+        lacks.append(f"what was transmitted: section waveform of config/config.yaml, with {known} as recorded here")
+        lacks.append(f"its place: raw/<flight>/{NODE}{'|'.join(file.suffix for file in recording.files)} of a campaign")
+    if not facts.carrier_hz:
+        lacks.append("the carrier: the recording does not say; the one of the config will be taken")
+    if facts.captures == 1 and facts.times is not None:
+        lacks.append("pulses: it is one capture; write one per trigger, or apertura:framing where the recorder ran on")
+    if own_clock(recording.captures.time):
+        lacks.append("the time: the recorder has a clock of its own; `apertura align` finds how it stands to the log's")
+    return lacks
+
+
+def _against_log(
+    recording: "Recording", node: str, log: Path, beside: Surroundings
+) -> tuple[dict[str, Any], list[str]]:
+    """Return facts of how much of a recording its log covers, and what it leaves out."""
+    try:
+        logged = read_track(log, node=node, options=beside.options).time.values
+    except CampaignError as problem:
+        return {}, [f"a readable flight log: {problem}"]
+    covered = float(np.mean(inside(recording.captures.time, (logged[0], logged[-1]))))
+    rows = {"log_beside": log.name, "captures_inside_log_share": covered}
+    if covered == 1.0:
+        return rows, []
+    first, last = utc(logged[0]), utc(logged[-1])
+    clocks = "; `apertura align` finds a clock that is off" if covered == 0 else ""
+    return rows, [f"positions for {1 - covered:.1%} of the captures: {log.name} lasts from {first} to {last}{clocks}"]
+
+
+def history_report(here: Path, files: Sequence[Path], kind: str, beside: Surroundings) -> Report:
+    """Return the report of phase history.
+
+    Parameters
+    ----------
+    here
+        The file or folder.
+    files
+        It and the one beside that belongs to it, or all of the folder.
+    kind
+        A key of `apertura.formats.names.PHASE_HISTORIES`.
+    beside
+        Where they lie.
+
+    Raises
+    ------
+    CampaignError
+        If there are none, they are not of that kind, or only the config of a campaign says what was transmitted, and
+        there is none.
+    """
+    if not files:
+        raise CampaignError(f"no {kind} group, the folder is empty", here, "phase history", "Copy the folder again.")
+    described = beside.waveform if beside.waveform.get("format") == kind else {}
+    if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
+        raise CampaignError(
+            "samples that do not say what was transmitted",
+            here,
+            f"raw/<flight>/{here.name} of a campaign whose config says waveform.format: {kind}",
+            "`apertura init` makes a campaign folder; copy it there.",
+        )
+    echo = _read_history(files, kind, beside.node, described)
+    facts = history_facts(echo)
+    from apertura.views.inspect.pictures import draw_history
+
+    return Report(
+        here,
+        "phase history",
+        kind,
+        _history_rows(facts),
+        tuple(_history_lacks(facts, kind, beside)),
+        picture=lambda: draw_history(echo, here.name),
+    )
+
+
+def _read_history(files: Sequence[Path], kind: str, node: str, described: Mapping[str, Any]) -> "xr.Dataset":
+    """Return the `echo` stage as of one antenna, else as of two, where the format says how it was taken."""
+    try:
+        return read_phase_history(kind, files, pair=f"{node}-{node}", described=described)
+    except CampaignError as problem:
+        try:
+            return read_phase_history(kind, files, pair=f"tx-{node}", described=described)
+        except CampaignError:
+            raise problem from None
+
+
+def _history_rows(facts: HistoryFacts) -> dict[str, Any]:
+    rows: dict[str, Any] = {"pulses": facts.times.count, "frequencies": facts.frequencies, "band_hz": facts.band_hz}
+    if facts.resolution_m is not None:
+        rows |= {"resolution_of_path_m": facts.resolution_m, "unambiguous_path_m": facts.unambiguous_m}
+    rows |= {"clock": "none, pulses are counted"} if facts.times.clock == "none" else time_rows(facts.times)
+    if facts.frame is not None:
+        rows |= {"frame": facts.frame, "bistatic": facts.bistatic}
+        rows |= {f"{leg}_bounds": dict(bounds) for leg, bounds in facts.bounds.items()}
+    return rows | {"left_out": dict(facts.dropped), "flags": dict(facts.flags)}
+
+
+def _history_lacks(facts: HistoryFacts, kind: str, beside: Surroundings) -> list[str]:
+    lacks = []
+    if facts.frame is None and not beside.logged:
+        lacks.append(f"where it was: a flight log {NODE}.track.<{'|'.join(log_suffixes())}> beside, for each antenna")
+    if facts.frame is None and not beside.aligned and facts.times.clock != "UTC":
+        lacks.append("the time: the recorder has a clock of its own; `apertura align` sets it against the log's")
+    if not beside.waveform:
+        lacks.append(f"its place: a campaign folder whose config says waveform.format: {kind}")
+    return lacks
+
+
+def dem_report(path: Path) -> Report:
+    """Return the report of a raster of heights.
+
+    Raises
+    ------
+    CampaignError
+        If it is no GeoTIFF.
+    """
+    facts = dem_facts(path)
+    left, bottom, right, top = facts.bounds
+    rows: dict[str, Any] = {
+        "posts": f"{facts.posts[0]} × {facts.posts[1]}",
+        "crs": shown(facts.crs or "none", 200),
+        "x": f"{left:.9g} to {right:.9g}",
+        "y": f"{bottom:.9g} to {top:.9g}",
+        "spacing": f"{facts.spacing[0]:.6g} × {facts.spacing[1]:.6g} {facts.unit}",
+        "bands": facts.bands,
+        "type": facts.dtype,
+    }
+    heights = facts.heights
+    if heights is not None:
+        known = heights[np.isfinite(heights)]
+        rows["height_m"] = [float(known.min()), float(known.max())] if known.size else None
+        rows["posts_without_height_share"] = 1 - known.size / max(heights.size, 1)
+    try:
+        open_dem(path, "a scene on Earth")
+        lacks: tuple[str, ...] = ()
+    except CampaignError as problem:
+        lacks = (f"{problem.found}; expected {problem.expected}: set scene.dem_datum if that is what it lacks",)
+    from apertura.views.inspect.pictures import draw_heights
+
+    picture = None if heights is None else (lambda: draw_heights(heights, facts.bounds, path.name))
+    return Report(path, "elevation model", "", rows, lacks, picture=picture)
+
+
+def array_report(path: Path) -> Report:
+    """Return the report of a .npy file; code symbols are an array of complex numbers.
+
+    Raises
+    ------
+    CampaignError
+        If it is none, or holds no numbers.
+    """
+    expected = f"a .npy file of at most {_MOST_NUMBERS} numbers"
+    array = read_npy(path, kinds="biufc", most=_MOST_NUMBERS, expected=expected, remedy="Save it again.")
+    sizes = np.abs(array[np.isfinite(array)]) if array.size else np.zeros(0)
+    rows = {
+        "shape": [int(side) for side in array.shape],
+        "type": str(array.dtype),
+        "amplitude": [float(sizes.min()), float(sizes.max())] if sizes.size else None,
+        "not_finite": int(array.size - sizes.size),
+    }
+    return Report(path, "code symbols" if array.ndim == 1 and array.dtype.kind == "c" else "array", "", rows)
