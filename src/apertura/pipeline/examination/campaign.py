@@ -230,6 +230,7 @@ class Examination:
 
     @cached_property
     def _ground(self) -> "tuple[ConfiguredGround | None, list[CampaignError], float]":
+        from apertura.pipeline.opening.scene import ConfiguredGround
 
         track_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
         requested = self.campaign.settings.scene
