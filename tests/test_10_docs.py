@@ -169,3 +169,13 @@ def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_agai
     for names, (_, packages) in zip(filter(None, checked), rows, strict=True):
         for package in re.findall(r"`(\w+)/`", packages):
             assert any((ROOT / "src/apertura" / layer / package).is_dir() for layer in names), package
+
+
+def test_every_dependency_has_its_reason_among_the_decisions():
+    settings = tomllib.loads(text_of(ROOT / "pyproject.toml"))
+    project = settings["project"]
+    listed = [*project["dependencies"], *settings["dependency-groups"]["dev"]]
+    listed += [one for extra in project["optional-dependencies"].values() for one in extra]
+    reasons = text_of(ROOT / "docs/decisions.md").partition("## Dependencies")[2]
+    names = {re.match(r"[\w-]+", one)[0] for one in listed}
+    assert {name for name in names if not re.search(rf"(?<![\w-]){name}(?![\w-])", reasons)} == set()

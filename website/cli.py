@@ -11,8 +11,8 @@ from apertura.views.cli import app
 
 _HEAD = """# Command line
 
-`apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something has to be seen to, in one message;
-130, ended by a signal; 1, what `verify`, `diff`, `reproduce` or `check-crate` was asked about is
+`apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
+130, ended by a signal; 1, what `verify`, `diff`, `reproduce` or `check-crate` compared is
 not the same, or a defect of apertura. Written by `make pages` from the commands.
 """
 
@@ -24,17 +24,26 @@ def cli_page() -> str:
 
 
 def _sections(command: Any, context: typer.Context, level: int) -> Iterator[str]:
-    """Yield a section for each command; those that have commands of their own come last."""
-    if level > 1:
-        usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ")
-        yield f"\n{'#' * level} {context.command_path}\n\n{_told(command.help)}\n\n    {usage}\n"
+    """Yield a section for each command; those that have commands of their own come last, these as rows of a table."""
+    if level > 2:
+        told = _told(command.help).partition("\n")[0]
+        yield f"| `{_usage(command, context)}` | {_cell(told)} |\n"
+        return
+    if level == 2:
+        yield f"\n## {context.command_path}\n\n{_told(command.help)}\n\n    {_usage(command, context)}\n"
     commands = getattr(command, "commands", {})
+    if level == 2 and commands:
+        yield "\nOptions: `--help` of each.\n\n| command | what it does |\n|---|---|\n"
     rows = [] if commands else [_row(one, context) for one in command.params if not getattr(one, "hidden", False)]
     if rows:
         yield "\n| argument or option | what it is |\n|---|---|\n" + "".join(rows)
     for name, one in sorted(commands.items(), key=lambda item: hasattr(item[1], "commands")):
         if not one.hidden:
             yield from _sections(one, typer.Context(one, info_name=name, parent=context), level + 1)
+
+
+def _usage(command: Any, context: typer.Context) -> str:
+    return " ".join(command.get_usage(context).split()).removeprefix("Usage: ")
 
 
 def _row(one: Any, context: typer.Context) -> str:
