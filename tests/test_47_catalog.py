@@ -17,7 +17,6 @@ from apertura.common.environment import lock_sha256, software
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.catalog.crate_check import changed_files
 from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import RESULTS, on_demand, places_of, result_of, results_of
@@ -25,6 +24,7 @@ from apertura.pipeline.steps.jobs import job_of
 from apertura.pipeline.steps.ro_crate import ro_crate
 from apertura.pipeline.steps.stac import stac
 from apertura.pipeline.store import read_manifest
+from apertura.views.verify.crate import changed_files
 
 ROOT = Path(__file__).parents[1]
 

@@ -192,7 +192,7 @@ def test_a_page_that_came_with_the_results_is_not_served(finished):
 
 def test_a_map_that_is_not_as_it_was_written_is_one_message_at_the_start(finished):
     tampered(finished)
-    with pytest.raises(CampaignError, match=r"map/map\.json: not as map\.manifest\.json describes it"):
+    with pytest.raises(CampaignError, match=r"map/map\.json: not as it was written; expected what map\.manifest\.json"):
         served(finished)
     (finished.results / "map" / "map.manifest.json").write_text("{")
     with pytest.raises(CampaignError, match=r"map\.manifest\.json: damaged"):
