@@ -16,6 +16,7 @@ import numpy as np
 
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
+from apertura.core.quality.budget import is_stated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, SampledWaveform
 from apertura.pipeline.lineage import STUDY, result_of
@@ -168,7 +169,7 @@ def _whole(name: str, runs: list[_Run]) -> Whole:
 
 def _expected_db(report: Mapping[str, Any]) -> float:
     """Return the loss of all causes that somebody stated, unrounded."""
-    return float(sum(line["loss_db"] for line in report["budget"] if not line["stated"].startswith("not stated")))
+    return float(sum(line["loss_db"] for line in report["budget"] if is_stated(line)))
 
 
 def _title(campaign: Campaign, rows: list[Whole], repeats: int) -> str:

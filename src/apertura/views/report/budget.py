@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from apertura.core.quality.budget import is_stated
 from apertura.views.report.sheet import BLUE, GREY, RED, sheet
 
 _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
 _LABELS = {"loss_db": "peak lost, dB", "shift_m": "targets shifted, m", "phase_rad": "phase of the image, rad"}
-NOT_STATED = "not stated"
 _STYLES: Mapping[bool, Any] = {
-    False: {"color": BLUE, "label": "stated or measured"},
-    True: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
+    True: {"color": BLUE, "label": "stated or measured"},
+    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
 }
 
 
@@ -72,12 +72,8 @@ def _draw(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
     least, places = _LEAST[measure], np.arange(len(lines))
     sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
     highest = max([10 * least, *sizes])
-    for silent, style in _STYLES.items():
-        some = [
-            place
-            for place, line in enumerate(lines)
-            if line["stated"].startswith(NOT_STATED) == silent and sizes[place] > least
-        ]
+    for stated, style in _STYLES.items():
+        some = [place for place, line in enumerate(lines) if is_stated(line) == stated and sizes[place] > least]
         axes.barh(some, [sizes[place] for place in some], height=0.62, **style)
     for place, (size, line) in enumerate(zip(sizes, lines, strict=True)):
         if size <= least:

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 from urllib.parse import quote
 
+from apertura.views.image_report import ImageValues, explained_flags
 from apertura.views.webmap.requests import asked_file
 
 FORMAT = 1
@@ -77,13 +78,14 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
     layers
         Its rasters.
     """
+    values = ImageValues.of(report)
     return {
         "flight": flight,
         "image": image,
-        "verdict": str(report["focus"]["verdict"]),
-        "why": str(report["focus"]["why"]),
-        "error_db": float(report["numerical_error_db"]),
-        "flags": {str(flag): str(line) for flag, line in report["flags"].items()},
+        "verdict": values.verdict,
+        "why": values.why,
+        "error_db": values.error_db,
+        "flags": explained_flags(values.flags),
         "layers": [
             {**asdict(layer), "url": url_of(f"{flight}/{image}/{layer.file}", layer.sha256)} for layer in layers
         ],
