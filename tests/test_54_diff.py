@@ -72,7 +72,7 @@ def test_pixels_that_one_alone_holds_are_counted(tmp_path, scene):
     scene[:2, :5] = np.nan
     write_slc(tmp_path / "b.tif", scene, tags={}, **HERE)
     assert told(tmp_path / "a.tif", tmp_path / "b.tif")["pixels"] == [
-        "10 values are held by the first alone, 0 by the second alone"
+        "10 values are in the first alone, 0 in the second alone"
     ]
 
 

@@ -103,6 +103,6 @@ def map_page(
 ) -> None:
     """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
     from apertura.pipeline.campaign import Campaign
-    from apertura.views.webmap.map_server import served
+    from apertura.views.webmap.server import served
 
     served(Campaign.load(given(campaign)), port=port).show(in_browser=open_)

@@ -23,7 +23,7 @@ from apertura.views.image_report import FUSED
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
-"""How far from its true place a target is looked for and its cuts go, metres."""
+"""How far from its true place a target is searched for and its cuts reach, metres."""
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,9 @@ from apertura.views.image_report import (
     verdict_row,
 )
 from apertura.views.report import PAGE, PANELS, PICTURES
-from apertura.views.report.landing import rst_table, rst_text
-from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table
+from apertura.views.report.image_drawings import draw_panels
+from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
-from apertura.views.report.panels import draw_panels
 
 ASKED = ("key", "value")
 """Headings of what was asked."""
@@ -184,7 +183,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
 
-    What it is made from is looked at when it is written: snakemake settles the times of files before.
+    Its sources are hashed when it is written: snakemake settles the times of files before.
     """
     path = campaign.result(PAGE)
     with replacement(path) as temporary:

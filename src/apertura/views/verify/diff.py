@@ -71,12 +71,12 @@ class Tally:
 
     def add(self, first: Pixels, second: Pixels) -> None:
         """Add a block of each."""
-        held = np.isfinite(first), np.isfinite(second)
-        lacking = int((held[0] & ~held[1]).sum()), int((held[1] & ~held[0]).sum())
+        valid = np.isfinite(first), np.isfinite(second)
+        lacking = int((valid[0] & ~valid[1]).sum()), int((valid[1] & ~valid[0]).sum())
         self.only = self.only[0] + lacking[0], self.only[1] + lacking[1]
         self.phased = np.iscomplexobj(first) or np.iscomplexobj(second)
         wide = np.complex128 if self.phased else np.float64
-        a, b = (values[held[0] & held[1]].astype(wide) for values in (first, second))
+        a, b = (values[valid[0] & valid[1]].astype(wide) for values in (first, second))
         apart = np.abs(a - b)
         self.differing += int(np.count_nonzero(apart)) + sum(lacking)
         if not a.size:
@@ -294,7 +294,7 @@ def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> I
         count = tally.compared + sum(tally.only)
         yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"
     if any(tally.only):
-        yield f"{tally.only[0]} values are held by the first alone, {tally.only[1]} by the second alone"
+        yield f"{tally.only[0]} values are in the first alone, {tally.only[1]} in the second alone"
 
 
 def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:

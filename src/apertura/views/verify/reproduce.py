@@ -50,7 +50,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     known = [result.manifest for _, result in results_of(campaign)]
     if not whole and product.manifest not in known:
         expected = f"one of the {len(known)} results of its campaign"
-        raise CampaignError("no result that the config promises", path, expected, "`apertura list` tells them.")
+        raise CampaignError("no result that the config promises", path, expected, "`apertura list` names them.")
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
     if not wanted:
         raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
