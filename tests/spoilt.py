@@ -4,7 +4,7 @@ import json
 
 import rasterio
 
-from apertura.views.verification.verify import verify
+from apertura.views.verify.chain import verify
 
 DB = "results/f01/uav1-uav2/db.tif"
 EXPORT = "results/f01/uav1-uav2/export.manifest.json"

@@ -8,15 +8,25 @@ from docutils.core import publish_parts
 from matplotlib.image import imread
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.views.report.budget import Measured, draw_budget
-from apertura.views.report.cuts import DrawnCut, draw_cuts
-from apertura.views.report.geometry import FlownGeometry, draw_geometry
-from apertura.views.report.landing import rst_table, rst_text
-from apertura.views.report.page import Heading, Paragraph, Picture, Table, page
-from apertura.views.report.panels import draw_panels
-from apertura.views.report.phase import draw_phase, sidelink_error_rad, steadiness
-from apertura.views.report.pulses import PulseRecord, draw_pulses
-from apertura.views.report.waterfall import Waterfall, draw_waterfall
+from apertura.views.report.flight_drawings import (
+    FlownGeometry,
+    PulseRecord,
+    Waterfall,
+    draw_geometry,
+    draw_pulses,
+    draw_waterfall,
+)
+from apertura.views.report.image_drawings import (
+    DrawnCut,
+    Measured,
+    draw_budget,
+    draw_cuts,
+    draw_panels,
+    draw_phase,
+    sidelink_error_rad,
+    steadiness,
+)
+from apertura.views.report.page import Heading, Paragraph, Picture, Table, page, rst_table, rst_text
 
 HOSTILE = """`a <javascript:alert(1)>`_ |b| *c* {{ 7 * 7 }} <script>alert("1")</script> $\\frac{x$ ../../etc &amp; it's
 .. raw:: html

@@ -14,8 +14,7 @@ import pytest
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.views.webmap.document import FORMAT, Layer, image_entry, map_document, named_files
-from apertura.views.webmap.page import FILES, SHELL, page_files
-from apertura.views.webmap.server import MapServer
+from apertura.views.webmap.server import FILES, SHELL, MapServer, page_files
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "webmap"

@@ -6,8 +6,7 @@ import pytest
 from folders import copy_writable
 
 from apertura.pipeline.campaign import Campaign
-from apertura.views.chart.whole import whole_chart
-from apertura.views.chart.whole_picture import Whole, draw_whole, spread_db
+from apertura.views.chart.whole import Whole, draw_whole, spread_db, whole_chart
 
 
 def whole(setting="a", *, loss_db=-0.1):

@@ -239,7 +239,7 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
 def test_a_report_that_was_edited_is_not_believed(finished):
     path = finished / "results/f01/fused/image.json"
     path.write_text(path.read_text().replace("focused", "perfect"))
-    with pytest.raises(CampaignError, match=r"image\.json: not as export\.manifest\.json describes it"):
+    with pytest.raises(CampaignError, match=r"image\.json: not as it was written; expected what export\.manifest"):
         print_summary(Campaign.load(finished))
 
 

@@ -16,7 +16,6 @@ from rocrate.rocrate import ROCrate
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.catalog.crate_check import changed_files
 from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import RESULTS, on_demand, places_of, result_of, results_of
@@ -24,6 +23,7 @@ from apertura.pipeline.steps.jobs import job_of
 from apertura.pipeline.steps.ro_crate import ro_crate
 from apertura.pipeline.steps.stac import stac
 from apertura.pipeline.store import read_manifest
+from apertura.views.verify.crate import changed_files
 
 ROOT = Path(__file__).parents[1]
 

@@ -17,8 +17,7 @@ from apertura.common.provenance import sha256_file
 from apertura.formats.export import exports_in, product_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import record_files
-from apertura.views.webmap.map_server import served
-from apertura.views.webmap.page import FILES, SHELL
+from apertura.views.webmap.server import FILES, SHELL, served
 from apertura.views.webmap.step import webmap
 
 
@@ -138,7 +137,7 @@ def test_an_image_that_is_not_as_it_was_written_is_not_shown(finished):
 def bundled(monkeypatch):
     """A page of which each file holds its name, as if it had been bundled."""
     monkeypatch.setattr(
-        "apertura.views.webmap.map_server.page_files", lambda: {name: name.encode() for name in (*SHELL, *FILES)}
+        "apertura.views.webmap.server.page_files", lambda: {name: name.encode() for name in (*SHELL, *FILES)}
     )
 
 
@@ -192,7 +191,7 @@ def test_a_page_that_came_with_the_results_is_not_served(finished):
 
 def test_a_map_that_is_not_as_it_was_written_is_one_message_at_the_start(finished):
     tampered(finished)
-    with pytest.raises(CampaignError, match=r"map/map\.json: not as map\.manifest\.json describes it"):
+    with pytest.raises(CampaignError, match=r"map/map\.json: not as it was written; expected what map\.manifest\.json"):
         served(finished)
     (finished.results / "map" / "map.manifest.json").write_text("{")
     with pytest.raises(CampaignError, match=r"map\.manifest\.json: damaged"):

@@ -10,10 +10,10 @@ from folders import complaint, copy_writable, edit_config
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import open_document, read_manifest
 from apertura.views.report import PICTURES
-from apertura.views.report.phase import steadiness
+from apertura.views.report.image_drawings import steadiness
 from apertura.views.report.pictures import Shown, pictures
 from apertura.views.report.step import landing, page
-from apertura.views.verification.tags import read_tags
+from apertura.views.verify.products import read_tags
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"
 """All that a campaign's name may hold."""

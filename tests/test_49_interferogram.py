@@ -26,7 +26,7 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.views.summary import print_summary
-from apertura.views.verification.verify import print_verified
+from apertura.views.verify.chain import print_verified
 
 SLOPE = (0.03, 0.06)
 MARKS = ((-3.0, -2.5), (3.0, 3.0))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from folders import copy_writable, edit_config
 
-from apertura.views.verification.verify import print_verified
+from apertura.views.verify.chain import print_verified
 
 CHROMIUM = Path("/usr/bin/chromium")
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $z$ ../../etc 'a'"

@@ -10,9 +10,8 @@ from rasterio import Affine
 from apertura.formats.export.cog import write_power, write_slc
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps import export, profile
-from apertura.views.verification.contents import flat
-from apertura.views.verification.diff import differences, first_difference, print_differences
-from apertura.views.verification.pixels import Tally
+from apertura.views.verify.diff import Tally, differences, first_difference, print_differences
+from apertura.views.verify.products import flat
 
 HERE = {"transform": Affine(0.5, 0, 500000, 0, -0.5, 5400000), "crs": "EPSG:32632"}
 PAIR = "results/f01/uav1-uav2"
@@ -73,7 +72,7 @@ def test_pixels_that_one_alone_holds_are_counted(tmp_path, scene):
     scene[:2, :5] = np.nan
     write_slc(tmp_path / "b.tif", scene, tags={}, **HERE)
     assert told(tmp_path / "a.tif", tmp_path / "b.tif")["pixels"] == [
-        "10 values are held by the first alone, 0 by the second alone"
+        "10 values are in the first alone, 0 in the second alone"
     ]
 
 
@@ -187,7 +186,7 @@ def test_a_large_raster_is_compared_block_by_block(tmp_path, monkeypatch):
             seen.append(first.shape)
             super().add(first, second)
 
-    monkeypatch.setattr("apertura.views.verification.diff.Tally", Spied)
+    monkeypatch.setattr("apertura.views.verify.diff.Tally", Spied)
     assert told(tmp_path / "a.tif", tmp_path / "a.tif") == {}
     assert sum(rows * columns for rows, columns in seen) == side**2
     assert max(seen) <= (2048, 2048)

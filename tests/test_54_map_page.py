@@ -20,7 +20,7 @@ from pyproj import Transformer
 
 from apertura.pipeline.store import record_files
 from apertura.simulation import preset, simulate
-from apertura.views.webmap.page import is_built
+from apertura.views.webmap.server import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"
 CHROMIUM = Path("/usr/bin/chromium")

@@ -8,11 +8,11 @@ from folders import complaint, contents, copy_writable
 
 from apertura.common.processes import hold
 from apertura.pipeline.workflow import run_workflow
-from apertura.views.verification.products import manifests
-from apertura.views.verification.reproduce import print_reproduced
+from apertura.views.verify.products import manifests
+from apertura.views.verify.reproduce import print_reproduced
 
 PAIR = "results/f01/uav1-uav2"
-RUN = "apertura.views.verification.reproduce.run_workflow"
+RUN = "apertura.views.verify.reproduce.run_workflow"
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
 from apertura.common.code_imports import PACKAGE
 from apertura.common.provenance import canonical_json, sha256_file
-from apertura.views.verification.verify import verify
+from apertura.views.verify.chain import verify
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
         return done.returncode, [line.split(":")[0] for line in done.stdout.splitlines()]
 
     assert verified() == (0, [])
-    source = copied / "export" / "cog.py"
+    source = copied / "formats" / "export" / "cog.py"
     source.write_text(source.read_text() + "EDITED = 1\n")
     assert verified() == (1, [f"changed  code of {EXPORT}"])
 

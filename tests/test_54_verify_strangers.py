@@ -10,7 +10,7 @@ from folders import complaint, copy_writable
 from spoilt import DB, EXPORT, IMAGE, RAW, edited, flip, retag, tag, wrong
 
 from apertura.common.provenance import canonical_json, sha256_file
-from apertura.views.verification.verify import print_verified, verify
+from apertura.views.verify.chain import print_verified, verify
 
 
 @pytest.fixture

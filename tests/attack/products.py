@@ -10,8 +10,7 @@ from PIL import Image, PngImagePlugin
 from rasterio import Affine
 
 from apertura.formats.export.cog import write_slc
-from apertura.views.verification.contents import sections_of
-from apertura.views.verification.tags import document, hashes, read_tags
+from apertura.views.verify.products import document, hashes, read_tags, sections_of
 
 _TOLD = {"raw/f01/uav1.sigmf-data": "0f" * 32, "results/scene.manifest.json": "1e" * 32}
 _TAGS = {

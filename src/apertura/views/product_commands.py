@@ -31,7 +31,7 @@ def verify(
 ) -> None:
     """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
     there = None if campaign is None else given(campaign)
-    from apertura.views.verification.verify import print_verified
+    from apertura.views.verify.chain import print_verified
 
     raise typer.Exit(print_verified(given(product), there, quiet=quiet))
 
@@ -46,7 +46,7 @@ def reproduce(
 ) -> None:
     """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
     kept = None if keep is None else given(keep)
-    from apertura.views.verification.reproduce import print_reproduced
+    from apertura.views.verify.reproduce import print_reproduced
 
     raise typer.Exit(print_reproduced(given(product), cores=cores, keep=kept))
 
@@ -58,7 +58,7 @@ def diff(
     whole: Annotated[bool, typer.Option("--all", help="every line of a section, however many")] = False,
 ) -> None:
     """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
-    from apertura.views.verification.diff import print_differences
+    from apertura.views.verify.diff import print_differences
 
     raise typer.Exit(print_differences(given(first), given(second), whole=whole))
 
@@ -67,7 +67,7 @@ def check_crate(
     folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
 ) -> None:
     """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
-    from apertura.views.verification.passed_on import print_checked
+    from apertura.views.verify.crate import print_checked
 
     raise typer.Exit(print_checked(given(folder)))
 
@@ -103,6 +103,6 @@ def map_page(
 ) -> None:
     """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
     from apertura.pipeline.campaign import Campaign
-    from apertura.views.webmap.map_server import served
+    from apertura.views.webmap.server import served
 
     served(Campaign.load(given(campaign)), port=port).show(in_browser=open_)

@@ -14,15 +14,16 @@ from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
-from apertura.formats.export import product_files
+from apertura.formats.export import product, product_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.store import open_stage
+from apertura.views.image_report import FUSED
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
-"""How far from its true place a target is looked for and its cuts go, metres."""
+"""How far from its true place a target is searched for and its cuts reach, metres."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ def score(campaign: Campaign) -> list[Finding]:
 def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
     grid = settled_scene(campaign).grid
     along = _along_track(campaign, flight, grid)
-    files = {pair: campaign.results / flight.name / pair / "slc.tif" for pair in flight.pairs}
-    files["fused"] = campaign.results / flight.name / "fused" / "coherent_slc.tif"
+    sources = {**dict.fromkeys(flight.pairs, "image"), FUSED: "coherent"}
+    files = {name: campaign.result(flight.name, name, product(of, "write_slc").file) for name, of in sources.items()}
     for name, file in files.items():
         if not file.is_file():
             raise CampaignError(

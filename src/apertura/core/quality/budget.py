@@ -1,7 +1,7 @@
 """The error budget of an image: what is known to spoil it, and what each cause is expected to cost."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -17,6 +17,8 @@ LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
 """Between them `accuracy_db: auto` stays: sidelobes show down to the first, nothing shows below the second."""
 
 NOTHING = Effect(0.0, 0.0, 0.0)
+
+_NOT_STATED = "not stated"
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,18 @@ class BudgetLine:
             name: float(f"{value:.3g}") + 0.0 if np.isfinite(value) else None
             for name, value in asdict(self.effect).items()
         }
-        return {"cause": self.cause, "stated": self.stated or f"not stated; {self.unit} would do this", **expected}
+        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}; {self.unit} would do this", **expected}
+
+
+def is_stated(report: Mapping[str, Any]) -> bool:
+    """Return whether the size of a cause is stated or measured, from the `report` of its line.
+
+    Examples
+    --------
+    >>> is_stated(BudgetLine("heights", None, NOTHING, unit="1 m").report)
+    False
+    """
+    return not report["stated"].startswith(_NOT_STATED)
 
 
 @dataclass(frozen=True)

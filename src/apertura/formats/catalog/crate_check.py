@@ -1,13 +1,12 @@
-"""The files that a crate tells of, held against its hashes."""
+"""The files that a crate names, with the hashes that it states of them."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 from apertura.common.documents import DAMAGED, read_json, undamaged
-from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
-from apertura.common.provenance import sha256_file
 from apertura.formats.catalog import CRATE
 from apertura.formats.catalog.crate import input_id
 
@@ -17,8 +16,24 @@ LARGEST_CRATE = 1_000_000_000
 _EXPECTED = "an RO-Crate as the workflow writes it"
 
 
-def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
-    """Return file → 'changed' or 'missing', of those whose bytes are not what the crate says; every byte is read.
+@dataclass(frozen=True)
+class CrateFile:
+    """A file that a crate names.
+
+    Attributes
+    ----------
+    path
+        Where it lies, or would.
+    sha256
+        Its hash as the crate states it, hex.
+    """
+
+    path: Path
+    sha256: str
+
+
+def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
+    """Return the files that a crate states hashes of, by their names in it; none is opened.
 
     Parameters
     ----------
@@ -34,7 +49,7 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
 
     Examples
     --------
-    >>> changed_files(Path("nowhere"))
+    >>> recorded_files(Path("nowhere"))
     Traceback (most recent call last):
     ...
     apertura.common.errors.CampaignError: nowhere/ro-crate-metadata.json: no such file; expected an RO-Crate ...
@@ -42,24 +57,14 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
     crate = inside(root, CRATE, where=root)
     document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_CRATE)
     with undamaged(crate, expected=_EXPECTED, remedy=DAMAGED):
-        told = [_place(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]
-        found = {name: _differs(path, sha256) for name, path, sha256, outside in told if inputs or not outside}
-    return {name: how for name, how in sorted(found.items()) if how}
+        files = [_file(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]
+    return {name: file for name, file, outside in files if inputs or not outside}
 
 
-def _place(entity: dict[str, Any], root: Path, crate: Path) -> tuple[str, Path, str, bool]:
-    """Return name, path and hash of a file, and whether it lies above the crate."""
-    called, prefix = str(entity["@id"]), input_id("")
-    outside = called.startswith(prefix)
-    name = unquote(called.removeprefix(prefix))
-    return name, inside(root.parent if outside else root, name, where=crate), str(entity["sha256"]), outside
-
-
-def _differs(path: Path, sha256: str) -> str:
-    if not path.is_file():
-        return "missing"
-    try:
-        return "" if sha256_file(path) == sha256 else "changed"
-    except OSError as error:
-        expected, remedy = "a file that can be read", "Let it be read, or copy it again."
-        raise CampaignError(f"not readable ({error.strerror})", path, expected, remedy) from error
+def _file(entity: dict[str, Any], root: Path, crate: Path) -> tuple[str, CrateFile, bool]:
+    """Return name and place of a file, and whether it lies above the crate."""
+    identifier, prefix = str(entity["@id"]), input_id("")
+    outside = identifier.startswith(prefix)
+    name = unquote(identifier.removeprefix(prefix))
+    path = inside(root.parent if outside else root, name, where=crate)
+    return name, CrateFile(path, str(entity["sha256"])), outside

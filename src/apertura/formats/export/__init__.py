@@ -57,6 +57,8 @@ class Export:
         ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.formats.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
+    opened
+        What the summary says beside its name, how to open it; empty: the summary does not name it.
     laid
         Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
     """
@@ -66,6 +68,7 @@ class Export:
     function: str
     pictured: bool = False
     laid: bool = True
+    opened: str = ""
 
     @property
     def module(self) -> str:
@@ -94,12 +97,23 @@ EXPORTS: tuple[Export, ...] = (
     Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", laid=False),
     Export("coherent_power.tif", "coherent", "apertura.formats.export.cog:write_power"),
     Export("coherent_power.qml", "coherent", "apertura.formats.export.style:write_linear_style"),
-    Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db"),
+    Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db", opened="in a GIS"),
     Export("coherent_db.qml", "coherent", "apertura.formats.export.style:write_db_style"),
-    Export("quicklook.png", "coherent", "apertura.formats.export.quicklook:write_quicklook", pictured=True),
+    Export(
+        "quicklook.png",
+        "coherent",
+        "apertura.formats.export.quicklook:write_quicklook",
+        pictured=True,
+        opened="with what the image says of itself",
+    ),
     Export("noncoherent_power.tif", "noncoherent", "apertura.formats.export.cog:write_power"),
     Export("noncoherent_power.qml", "noncoherent", "apertura.formats.export.style:write_linear_style"),
-    Export("noncoherent_db.tif", "noncoherent", "apertura.formats.export.db:write_db"),
+    Export(
+        "noncoherent_db.tif",
+        "noncoherent",
+        "apertura.formats.export.db:write_db",
+        opened="in a GIS, added without phases",
+    ),
     Export("noncoherent_db.qml", "noncoherent", "apertura.formats.export.style:write_db_style"),
     Export("noncoherent_magnitude.tif", "magnitude", "apertura.formats.export.cog:write_magnitude"),
     Export("noncoherent_magnitude.qml", "magnitude", "apertura.formats.export.style:write_linear_style"),
@@ -119,7 +133,12 @@ EXPORTS: tuple[Export, ...] = (
     Export("coherence.qml", "coherence", "apertura.formats.export.style:write_layer_style"),
     Export("unwrapped.tif", "unwrapped", "apertura.formats.export.interferogram:write_unwrapped"),
     Export("unwrapped.qml", "unwrapped", "apertura.formats.export.style:write_layer_style"),
-    Export("height.tif", "height", "apertura.formats.export.interferogram:write_height"),
+    Export(
+        "height.tif",
+        "height",
+        "apertura.formats.export.interferogram:write_height",
+        opened="in a GIS, with its deviation beside it",
+    ),
     Export("height.qml", "height", "apertura.formats.export.style:write_layer_style"),
     Export("height_std.tif", "height_std", "apertura.formats.export.interferogram:write_height_std"),
     Export("height_std.qml", "height_std", "apertura.formats.export.style:write_layer_style"),
@@ -150,6 +169,17 @@ def exports_in(folder: str) -> Iterator[Export]:
     ['incidence.tif', 'incidence.qml', 'bistatic_angle.tif', 'bistatic_angle.qml']
     """
     return (export for export in EXPORTS if SOURCES[export.source] == folder)
+
+
+def product(source: str, function: str) -> Export:
+    """Return the row of the file that a function writes from a source.
+
+    Examples
+    --------
+    >>> product("coherent", "write_slc").file
+    'coherent_slc.tif'
+    """
+    return next(row for row in EXPORTS if row.source == source and row.function.endswith(f":{function}"))
 
 
 def export_modules(folder: str) -> list[str]:

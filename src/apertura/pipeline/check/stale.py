@@ -16,7 +16,7 @@ from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result, digest_of
 from apertura.pipeline.lineage import results_of
-from apertura.pipeline.store import damaged_files, read_manifest
+from apertura.pipeline.store import compare, compare_origin, damaged_files, read_manifest, states_origin
 
 _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
@@ -167,32 +167,32 @@ _PRODUCTS = {
 """Result → the files that people open."""
 
 
+_SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to it"}
+
+
 def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
-    if not {"sources", "settings", "code"} <= recorded.keys():
+    if not states_origin(recorded):
         yield "it does not say what it was made from"
         return
-    yield from _spoilt(root, result.manifest, recorded["files"])
-    for source in sorted({*result.sources, *recorded["sources"]}):
-        was = recorded["sources"].get(source)
-        if was is None:
-            yield f"{source} is new to it"
-        elif not inside(root, source, where=root / result.manifest).is_file():
-            yield f"{source} is gone"
-        elif digest_of(root, source, paranoid=paranoid) != was:
-            yield f"{source} has changed"
-    if recorded["settings"] != result.settings_sha256:
-        yield "its settings have changed"
-    if recorded["code"] != result.code_sha256:
-        yield "its code has changed"
+    folder = (root / result.manifest).parent
 
-
-def _spoilt(root: Path, manifest: str, files: Mapping[str, str]) -> Iterator[str]:
-    """Yield what of a result's own files is gone, or edited since; arrays are looked into where they are opened."""
-    folder = (root / manifest).parent
-    for name, digest in files.items():
-        path = inside(folder, name, where=root / manifest)
+    def file(name: str) -> str:  # arrays are looked into where they are opened
+        path = inside(folder, name, where=root / result.manifest)
         if not path.is_file():
-            yield f"{name} is gone"
-            return
-        if ".zarr/" not in name and digest_of(root, path.relative_to(root).as_posix()) != digest:
-            yield f"{name} is not as it was written"
+            return ""
+        return str(recorded["files"][name]) if ".zarr/" in name else digest_of(root, path.relative_to(root).as_posix())
+
+    def source(name: str) -> str:
+        path = inside(root, name, where=root / result.manifest)
+        return digest_of(root, name, paranoid=paranoid) if path.is_file() else ""
+
+    for difference in compare(recorded["files"], file):
+        if difference.state == "missing":
+            yield f"{difference.name} is gone"
+            break
+        yield f"{difference.name} is not as it was written"
+    for difference in compare_origin(recorded, result, source):
+        if difference.part == "source":
+            yield f"{difference.name} {_SOURCE[difference.state]}"
+        else:
+            yield {"settings": "its settings have changed", "code": "its code has changed"}[difference.part]

@@ -7,6 +7,9 @@ products have manifests of the same kind. Each names its files with their hashes
 
 from apertura.pipeline.store.chunks import blocks_of_rows, write_blocks
 from apertura.pipeline.store.manifest import (
+    check_listed,
+    compare,
+    compare_origin,
     damaged_files,
     manifest_of,
     open_document,
@@ -15,6 +18,8 @@ from apertura.pipeline.store.manifest import (
     record_files,
     remake,
     save_document,
+    sha256_present,
+    states_origin,
 )
 from apertura.pipeline.store.progress import (
     create,
@@ -30,6 +35,9 @@ from apertura.pipeline.store.stages import open_stage, save_stage
 
 __all__ = [
     "blocks_of_rows",
+    "check_listed",
+    "compare",
+    "compare_origin",
     "create",
     "damaged_files",
     "finish",
@@ -46,7 +54,9 @@ __all__ = [
     "resume",
     "save_document",
     "save_stage",
+    "sha256_present",
     "sharing",
+    "states_origin",
     "write_blocks",
     "writing",
 ]

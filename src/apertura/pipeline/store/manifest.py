@@ -1,8 +1,9 @@
-"""The manifest of a result: hashes of its files and what it was made from; written last, checked when it is opened."""
+"""The manifest of a result: hashes of its files and what it was made from; written last, compared when it is opened."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
@@ -81,6 +82,119 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     return document
 
 
+@dataclass(frozen=True)
+class Difference:
+    """One thing that is not as a manifest records it.
+
+    Attributes
+    ----------
+    part
+        Of the record: a file of the result, a source, the settings or the code.
+    name
+        Of the file or source, as recorded; empty of settings and code.
+    state
+        missing: recorded, and not there; altered: with another hash; added: there, and not recorded.
+    recorded, present
+        sha256, hex; empty of what is added, and where a file is missing.
+    """
+
+    part: Literal["file", "source", "settings", "code"]
+    name: str
+    state: Literal["missing", "altered", "added"]
+    recorded: str = ""
+    present: str = ""
+
+
+class Expected(Protocol):
+    """What a result would be made from now, `apertura.pipeline.digests.Result`."""
+
+    @property
+    def sources(self) -> Sequence[str]:
+        """Files and manifests, relative to the campaign folder."""
+
+    @property
+    def settings_sha256(self) -> str:
+        """Hash of its settings."""
+
+    @property
+    def code_sha256(self) -> str:
+        """Hash of its code."""
+
+
+def compare(
+    recorded: Mapping[str, str],
+    present: Callable[[str], str],
+    *,
+    added: Iterable[str] = (),
+    part: Literal["file", "source"] = "file",
+) -> Iterator[Difference]:
+    """Compare files with recorded hashes; yield what differs, in order of the names.
+
+    Parameters
+    ----------
+    recorded
+        Name → sha256, hex.
+    present
+        Returns the sha256 of a file as it is now; empty where it is not there.
+    added
+        Names that are there now, or that count now.
+    part
+        Which part of the record it is.
+
+    Examples
+    --------
+    >>> now = {"a": "4c", "b": "0f", "d": "1a"}
+    >>> found = compare({"a": "4c", "b": "9e", "c": "77"}, lambda name: now.get(name, ""), added=now)
+    >>> [(one.name, one.state) for one in found]
+    [('b', 'altered'), ('c', 'missing'), ('d', 'added')]
+    """
+    for name in sorted({*recorded, *added}):
+        if name not in recorded:
+            yield Difference(part, name, "added")
+        elif (now := present(name)) != recorded[name]:
+            yield Difference(part, name, "altered" if now else "missing", recorded[name], now)
+
+
+def compare_origin(
+    document: Mapping[str, Any], expected: Expected, present: Callable[[str], str]
+) -> Iterator[Difference]:
+    """Compare what a manifest says of where its result comes from with what is there now: sources, settings and code.
+
+    Parameters
+    ----------
+    document
+        The manifest, with ``sources``, ``settings`` and ``code``.
+    expected
+        What the result would be made from now.
+    present
+        As `compare`, of sources.
+    """
+    yield from compare(document["sources"], present, added=expected.sources, part="source")
+    if document["settings"] != expected.settings_sha256:
+        yield Difference("settings", "", "altered", str(document["settings"]), expected.settings_sha256)
+    if document["code"] != expected.code_sha256:
+        yield Difference("code", "", "altered", str(document["code"]), expected.code_sha256)
+
+
+def states_origin(document: Mapping[str, Any]) -> bool:
+    """Return whether a manifest says what its result was made from; those before 0.1.0 did not."""
+    return {"sources", "settings", "code"} <= document.keys()
+
+
+def sha256_present(path: Path) -> str:
+    """Return the sha256 of a file, every byte read; empty where there is none."""
+    return sha256_file(path) if path.is_file() else ""
+
+
+def damaged_files(manifest: Path) -> list[str]:
+    """Return the files of a result that are not as they were written, or not there; every byte is read."""
+
+    def present(name: str) -> str:
+        return sha256_present(inside(manifest.parent, name, where=manifest))
+
+    return [difference.name for difference in compare(read_manifest(manifest)["files"], present)]
+
+
 def check_document(path: Path) -> None:
     """Check a finished document against its manifest.
 
@@ -89,7 +203,7 @@ def check_document(path: Path) -> None:
     CampaignError
         If it is missing, or is not what the manifest describes.
     """
-    refuse_others(manifest_of(path), _expected(path), {path.name: sha256_file(path)})
+    _check(manifest_of(path), _files_of(path), {path.name: sha256_file(path)})
 
 
 def check_stage(folder: Path) -> dict[str, str]:
@@ -106,14 +220,14 @@ def check_stage(folder: Path) -> dict[str, str]:
     CampaignError
         If it is missing, or is not what the manifest describes.
     """
-    expected, inside = _expected(folder), f"{folder.name}/"
+    recorded, inside = _files_of(folder), f"{folder.name}/"
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-    there = {
-        f"{inside}{name}": expected.get(f"{inside}{name}", "") if _is_chunk(name) else sha256_file(folder / name)
+    present = {
+        f"{inside}{name}": recorded.get(f"{inside}{name}", "") if _is_chunk(name) else sha256_file(folder / name)
         for name in names
     }
-    refuse_others(manifest_of(folder), expected, there)
-    return {name.removeprefix(inside): digest for name, digest in expected.items()}
+    _check(manifest_of(folder), recorded, present)
+    return {name.removeprefix(inside): digest for name, digest in recorded.items()}
 
 
 def _is_chunk(name: str) -> bool:
@@ -121,7 +235,8 @@ def _is_chunk(name: str) -> bool:
     return "c" in name.split("/")[1:]
 
 
-def _expected(result: Path) -> dict[str, str]:
+def _files_of(result: Path) -> dict[str, str]:
+    """Return the files of a finished result and their hashes; raise CampaignError if it is not finished."""
     manifest = manifest_of(result)
     if not manifest.is_file() or not result.exists():
         raise CampaignError(
@@ -133,24 +248,40 @@ def _expected(result: Path) -> dict[str, str]:
     return dict(read_manifest(manifest)["files"])
 
 
-def damaged_files(manifest: Path) -> list[str]:
-    """Return the files of a result that are not as they were written, or not there; every byte is read."""
-    expected = read_manifest(manifest)["files"]
-    there = {name: inside(manifest.parent, name, where=manifest) for name in expected}
-    return [name for name, path in there.items() if not path.is_file() or sha256_file(path) != expected[name]]
-
-
-def refuse_others(manifest: Path, expected: Mapping[str, str], present: Mapping[str, str]) -> None:
-    """Raise CampaignError unless the files present are those expected."""
-    names = sorted(expected.keys() | present.keys())
-    differing = [name for name in names if expected.get(name) != present.get(name)]
+def _check(manifest: Path, recorded: Mapping[str, str], present: Mapping[str, str]) -> None:
+    """Raise CampaignError unless the files present are those recorded."""
+    differing = list(compare(recorded, lambda name: present.get(name, ""), added=present))
     if differing:
         raise CampaignError(
-            f"{len(differing)} files are not as they were written, first {differing[0]}",
+            f"{len(differing)} files are not as they were written, first {differing[0].name}",
             where=manifest.parent,
             expected=f"what {manifest.name} describes",
             remedy=f"Delete {manifest} and run the workflow again.",
         )
+
+
+def check_listed(path: Path, manifest: Path, *, present: Callable[[Path], str] = sha256_present) -> str:
+    """Check one of a result's files against their manifest; return its sha256.
+
+    Parameters
+    ----------
+    path
+        The file, in the manifest's folder or below.
+    manifest
+        That lists it.
+    present
+        Returns the sha256 of the file as it is now; empty where it is not there.
+
+    Raises
+    ------
+    CampaignError
+        If it is not as it was written, or the manifest does not list it.
+    """
+    recorded = str(read_manifest(manifest)["files"].get(path.relative_to(manifest.parent).as_posix(), ""))
+    if not recorded or present(path) != recorded:
+        remedy = f"Delete {manifest} and run the workflow again."
+        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
+    return recorded
 
 
 def save_document(path: Path, document: Mapping[str, Any], lineage: ResultOrigin | None = None) -> None:
@@ -181,8 +312,5 @@ def open_listed(path: Path, manifest: Path) -> dict[str, Any]:
         If it or the manifest is missing, or it is not as it was written.
     """
     document = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
-    expected = read_manifest(manifest)["files"].get(path.name)
-    if expected != sha256_file(path):
-        found = f"not as {manifest.name} describes it"
-        raise CampaignError(found, path, "what the workflow wrote", "Run the workflow again.")
+    check_listed(path, manifest)
     return document

@@ -26,8 +26,7 @@ from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import asked_accuracy, job_of, plan_job
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.store import open_stage, record_files
-from apertura.views.chart.interactive import write_page
-from apertura.views.chart.pareto import Point, draw_points, with_front
+from apertura.views.chart.pareto import Point, draw_points, with_front, write_page
 
 PULSES, SIDE_PX = 1024, 256
 LEAST_ROWS = 32

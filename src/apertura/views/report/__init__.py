@@ -4,7 +4,7 @@ PICTURES = ("geometry", "pulses", "phase", "cuts", "range_profiles", "budget")
 """What is drawn of a pair, in the order in which it is read."""
 
 PAGE = "report.html"
-"""What is said of a flight, and of all of them."""
+"""The report of a flight, and of all of them."""
 
 PANELS = "panels.png"
 """Images of a flight and their sums side by side."""

@@ -1,6 +1,7 @@
-"""A page of headings, sentences, tables and pictures as one HTML file that needs nothing else and prints on A4."""
+"""What the report is written in: one HTML file that needs nothing else, and reStructuredText for Snakemake's report."""
 
 import base64
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -133,3 +134,43 @@ def page(title: str, blocks: Iterable[Block]) -> str:
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n{policy}\n<title>{escape(title)}</title>\n'
         f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
+
+
+def rst_text(text: str) -> str:
+    r"""Return text as reStructuredText shows it, letter by letter, on one line.
+
+    Parameters
+    ----------
+    text
+        Any text, also an untrusted one.
+
+    Examples
+    --------
+    >>> rst_text("a *b* `c`_ |d| {{ e }}")
+    'a \\*b\\* \\`c\\`\\_ \\|d\\| \\{\\{ e \\}\\}'
+    >>> rst_text(".. raw:: html\n\n   <b>")
+    '\\.\\. raw\\:\\: html \\<b\\>'
+    """
+    line = " ".join(text.split())
+    return re.sub(r"([^\w\s]|_)", r"\\\1", line)
+
+
+def rst_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    r"""Return a table of text as the directive ``list-table``.
+
+    Examples
+    --------
+    >>> print(rst_table(["image", "flags"], [["a-b", "none"]]))
+    .. list-table::
+       :header-rows: 1
+    <BLANKLINE>
+       * - image
+         - flags
+       * - a\-b
+         - none
+    """
+    lines = [".. list-table::", "   :header-rows: 1", ""]
+    for row in (head, *rows):
+        for place, cell in enumerate(row):
+            lines.append(f"   {'*' if place == 0 else ' '} - {rst_text(cell)}".rstrip())
+    return "\n".join(lines)

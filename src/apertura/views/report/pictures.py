@@ -30,13 +30,23 @@ from apertura.pipeline.steps.coverage import crs_name, few_looks
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import blocks_of_rows, open_stage, record_files
 from apertura.views.report import PICTURES
-from apertura.views.report.budget import Measured, draw_budget
-from apertura.views.report.cuts import DrawnCut, draw_cuts
-from apertura.views.report.geometry import FlownGeometry, draw_geometry
-from apertura.views.report.phase import draw_phase, sidelink_error_rad
-from apertura.views.report.pulses import PulseRecord, draw_pulses
+from apertura.views.report.flight_drawings import (
+    FlownGeometry,
+    PulseRecord,
+    Waterfall,
+    draw_geometry,
+    draw_pulses,
+    draw_waterfall,
+)
+from apertura.views.report.image_drawings import (
+    DrawnCut,
+    Measured,
+    draw_budget,
+    draw_cuts,
+    draw_phase,
+    sidelink_error_rad,
+)
 from apertura.views.report.sheet import thinned
-from apertura.views.report.waterfall import Waterfall, draw_waterfall
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
@@ -141,7 +151,7 @@ class Shown:
         )
 
     def record(self) -> PulseRecord:
-        """Return which pulses make the image, and what the sidelink told of them."""
+        """Return which pulses make the image, and what the sidelink measured of them."""
         echo, sent = self.echo, self._sent()
         counted = echo.attrs.get("pulses") or {}
         snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
@@ -170,21 +180,21 @@ class Shown:
         """Return what each pulse adds at the brightest target: without sidelink, with it, with tracks refined."""
         logged, echo = profiles_of(self.profile, lazy=True), self.echo
         every = np.arange(len(logged) + 1)
-        heard = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
-        found = {}
+        phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
+        stages = {}
         if "sidelink_phase" in echo and "sidelink_vector" in echo:
-            turns = 2 * np.pi * float(echo.frequency.values.mean()) / SPEED_OF_LIGHT_M_S
+            wavenumber_rad_m = 2 * np.pi * float(echo.frequency.values.mean()) / SPEED_OF_LIGHT_M_S
             length_m = np.linalg.norm(echo.sidelink_vector.values, axis=1)
-            error = sidelink_error_rad(echo.sidelink_phase.values, length_m, wavenumber_rad_m=turns)
-            found["before: without the sidelink"] = np.nan_to_num(heard * np.exp(1j * error))
-            found["corrected by the sidelink"] = heard
+            error = sidelink_error_rad(echo.sidelink_phase.values, length_m, wavenumber_rad_m=wavenumber_rad_m)
+            stages["before: without the sidelink"] = np.nan_to_num(phasors * np.exp(1j * error))
+            stages["corrected by the sidelink"] = phasors
         else:
-            found["as recorded, on the tracks of the logs"] = heard
+            stages["as recorded, on the tracks of the logs"] = phasors
         refined = open_refined(self.campaign, self.flight)
         if refined.correction is not None:
             moved = refined.profiles(open_pair(self.campaign, self.flight, self.pair, echo=echo), logged)
-            found["tracks refined"] = block_contributions(moved, self._target_m, edges=every)[0].astype(np.complex128)
-        return found
+            stages["tracks refined"] = block_contributions(moved, self._target_m, edges=every)[0].astype(np.complex128)
+        return stages
 
     def cuts(self) -> list[DrawnCut]:
         """Return the cuts whose widths image.json states."""
@@ -193,20 +203,20 @@ class Shown:
         peak = find_peak(image, *(round(at) for at in self._target))
         cuts = []
         for name, direction in (("cross-range", (east, north)), ("ground range", (north, -east))):
-            way: dict[str, Any] = {"direction": direction, "spacing_m": spacing_m, "reach_m": CUT_REACH_M}
-            cut = cut_through(image, peak, **way)
-            cuts.append(DrawnCut(name, *line_through(image, peak, **way), cut.width_m, cut.pslr_db, cut.islr_db))
+            line: dict[str, Any] = {"direction": direction, "spacing_m": spacing_m, "reach_m": CUT_REACH_M}
+            cut = cut_through(image, peak, **line)
+            cuts.append(DrawnCut(name, *line_through(image, peak, **line), cut.width_m, cut.pslr_db, cut.islr_db))
         return cuts
 
     def waterfall(self) -> Waterfall:
         """Return the mean power of the range profiles, read some at a time."""
         profile = self.profile
-        falling = Waterfall(profile.start.values, profile.attrs["step_m"], profile.sizes["range"])
+        waterfall = Waterfall(profile.start.values, profile.attrs["step_m"], profile.sizes["range"])
         with progress("pulses", profile.sizes["pulse"]) as done:
             for part in blocks_of_rows(profile, "profile"):
-                falling.add(part.start, profile.profile[part].values)
+                waterfall.add(part.start, profile.profile[part].values)
                 done(part.stop - part.start)
-        return falling
+        return waterfall
 
 
 def _seconds(times: NDArray[np.datetime64], since: np.datetime64) -> Floats:

@@ -6,38 +6,38 @@ from pathlib import Path
 from typing import Any
 
 from apertura.common.atomic import replacement, write_text
-from apertura.common.documents import undamaged
-from apertura.common.errors import CampaignError, shown
 from apertura.common.paths import shipped
-from apertura.common.provenance import Provenance, sha256_file
+from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
+from apertura.formats.export import exports_in, product
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.images import averaged
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import open_listed, open_stage, read_manifest, record_files
-from apertura.views.report import PAGE, PANELS, PICTURES
-from apertura.views.report.landing import rst_table, rst_text
-from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table
-from apertura.views.report.page import page as page_of
-from apertura.views.report.panels import draw_panels
-from apertura.views.report.words import (
-    ASKED,
+from apertura.pipeline.store import check_listed, open_stage, record_files
+from apertura.views.image_report import (
     BUDGET,
     DECISIONS,
     FLAGGED,
+    FUSED,
     VERDICTS,
     budget_rows,
     decision_rows,
     flag_rows,
-    said,
+    read_reports,
     sentences,
     shared_rows,
-    told,
     verdict_row,
 )
+from apertura.views.report import PAGE, PANELS, PICTURES
+from apertura.views.report.image_drawings import draw_panels
+from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
+from apertura.views.report.page import page as page_of
+
+ASKED = ("key", "value")
+"""Headings of what was asked."""
 
 _DOTS = 480  # of the longer side of a panel
 _MOST_PANELS = 2  # pairs beside their sums
@@ -46,33 +46,14 @@ _MOST_PANELS = 2  # pairs beside their sums
 def page(campaign: Campaign, flight: str) -> list[Path]:
     """Write results/<flight>/report.html and the panels of its images; return their paths."""
     lineage = result_of(campaign, "page", flight).begin(campaign.root)
-    reports = reports_of(campaign, flight)
-    panels, text = campaign.result(flight, "fused", PANELS), campaign.result(flight, PAGE)
-    _write_panels(panels, campaign, flight, reports["fused"], lineage)
+    reports = read_reports(campaign, flight)
+    panels, text = campaign.result(flight, FUSED, PANELS), campaign.result(flight, PAGE)
+    _write_panels(panels, campaign, flight, reports[FUSED], lineage)
     title = f"{campaign.settings.campaign}, flight {flight}"
     write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
     written = [text, panels]
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
-
-
-def reports_of(campaign: Campaign, flight: str) -> dict[str, dict[str, Any]]:
-    """Return image.json of each pair of a flight and of 'fused'.
-
-    Raises
-    ------
-    CampaignError
-        If one is not as it was written.
-    """
-    found = {}
-    for name in (*campaign.flight(flight).pairs, "fused"):
-        path = campaign.result(flight, name, "image.json")
-        report = open_listed(path, path.with_name("export.manifest.json"))
-        with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
-            flags = {shown(flag): shown(line, 2000) for flag, line in report["flags"].items()}
-            verdict_row(name, report)  # what every sentence stands on is there
-        found[name] = {**report, "flags": flags}
-    return found
 
 
 def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> Iterator[Block]:
@@ -81,9 +62,9 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     )
     yield Table("What each image says of itself.", VERDICTS, [verdict_row(*one) for one in reports.items()])
     yield Heading(2, "Pairs and their sums")
-    yield Paragraph(" ".join(sentences("Sum of the pairs", reports["fused"])))
+    yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
     yield Picture(
-        campaign.result(flight, "fused", PANELS).read_bytes(),
+        campaign.result(flight, FUSED, PANELS).read_bytes(),
         _caption("panels"),
     )
     for pair in campaign.flight(flight).pairs:
@@ -98,11 +79,13 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
 
 def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> Iterator[Block]:
     folder = campaign.result(flight, pair)
-    listed = {f"pictures/{name}.png": "pictures" for name in PICTURES}
+    shown = {row.file: "export" for row in exports_in("pair") if row.pictured}
+    shown |= {f"pictures/{name}.png": "pictures" for name in PICTURES}
     yield Heading(2, f"Pair {pair}")
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
-    for name, of in ({"quicklook.png": "export"} | listed).items():
-        yield Picture(_checked(folder / name, f"{of}.manifest.json", folder), _caption(Path(name).stem))
+    for name, of in shown.items():
+        check_listed(folder / name, folder / f"{of}.manifest.json")
+        yield Picture((folder / name).read_bytes(), _caption(Path(name).stem))
     yield Table(
         "Error budget; in brackets what a size assumed would do where nobody stated one.",
         BUDGET,
@@ -116,21 +99,11 @@ def _caption(name: str) -> str:
     return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
 
 
-def _checked(path: Path, manifest: str, folder: Path) -> bytes:
-    """Return a picture as it was written."""
-    listed = read_manifest(folder / manifest)["files"]
-    name = path.relative_to(folder).as_posix()
-    if not path.is_file() or listed.get(name) != sha256_file(path):
-        remedy = f"Delete {folder / manifest} and run the workflow again."
-        raise CampaignError("not as it was written", path, f"what {manifest} describes", remedy)
-    return path.read_bytes()
-
-
 def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
     scene, pairs = settled_scene(campaign), campaign.flight(flight).pairs[:_MOST_PANELS]
-    files = {pair: campaign.result(flight, pair, "power.tif") for pair in pairs}
+    files = {pair: campaign.result(flight, pair, product("image", "write_power").file) for pair in pairs}
     for kind in ("coherent", "noncoherent"):
-        files[f"{kind} sum"] = campaign.result(flight, "fused", f"{kind}_power.tif")
+        files[f"{kind} sum"] = campaign.result(flight, FUSED, product(kind, "write_power").file)
     powers = {}
     for name, file in files.items():
         with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
@@ -146,20 +119,40 @@ def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[st
 
 def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
     """Return what was asked of a campaign, key of the config → value; grid as settled, and why."""
-    values: dict[str, Any] = campaign.values
-    scene = settled_scene(campaign)
+    scene, values = settled_scene(campaign), campaign.values
     west, south, east, north = scene.grid.bounds_m
     rows, columns = scene.grid.shape
-    waveform = [(f"waveform: {name}", said(value)) for name, value in values["waveform"].items() if told(value)]
+    bounds = ", ".join(map(setting_text, scene.grid.bounds_m))
+    size = f"{setting_text(east - west)} m × {setting_text(north - south)} m, {columns} × {rows} pixels"
     grid = [
         ("scene: CRS", scene.grid.crs + _why(scene, "crs")),
-        ("scene: west, south, east, north, m", ", ".join(map(said, scene.grid.bounds_m)) + _why(scene, "bounds_m")),
-        ("scene: size", f"{said(east - west)} m × {said(north - south)} m, {columns} × {rows} pixels"),
-        ("scene: pixels", f"{said(scene.grid.spacing_m)} m" + _why(scene, "spacing_m")),
-        ("scene: ground", values["scene"]["dem"] or f"level, {said(scene.level.height_m)} m"),
+        ("scene: west, south, east, north, m", bounds + _why(scene, "bounds_m")),
+        ("scene: size", size),
+        ("scene: pixels", f"{setting_text(scene.grid.spacing_m)} m" + _why(scene, "spacing_m")),
+        ("scene: ground", values["scene"]["dem"] or f"level, {setting_text(scene.level.height_m)} m"),
     ]
-    chosen = [(f"processing: {name}", said(value)) for name, value in values["processing"].items() if told(value)]
-    return [*waveform, *grid, *chosen]
+    return [*_set_rows("waveform", values["waveform"]), *grid, *_set_rows("processing", values["processing"])]
+
+
+def _set_rows(section: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the settings of a section that are not left to apertura."""
+    unset: tuple[object, ...] = ("auto", None, "", (), [], {})
+    return [(f"{section}: {name}", setting_text(value)) for name, value in values.items() if value not in unset]
+
+
+def setting_text(value: object) -> str:
+    """Return a setting as people write it.
+
+    Examples
+    --------
+    >>> [setting_text(value) for value in (1_204_800_000.0, 3.125e-06, {"align_phase": False}, "hann")]
+    ['1204800000', '3.125e-06', 'align_phase: False', 'hann']
+    """
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name}: {setting_text(one)}" for name, one in value.items())
+    return str(value)
 
 
 def _why(scene: OpenScene, name: str) -> str:
@@ -169,7 +162,7 @@ def _why(scene: OpenScene, name: str) -> str:
 def landing(campaign: Campaign) -> dict[str, Any]:
     """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
     flights = {one.name: one.pairs for one in campaign.image_flights}
-    reports = {f"{one} {name}": report for one in flights for name, report in reports_of(campaign, one).items()}
+    reports = {f"{one} {name}": report for one in flights for name, report in read_reports(campaign, one).items()}
     first, pairs = next(iter(flights.items()))
     decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)
     return {
@@ -178,7 +171,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
         "asked": rst_table(ASKED, asked_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
         "sentences": [
-            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} fused"]))) for one in flights
+            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} {FUSED}"]))) for one in flights
         ],
         "first": rst_text(first),
         "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),
@@ -190,7 +183,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
 
-    What it is made from is looked at when it is written: snakemake settles the times of files before.
+    Its sources are hashed when it is written: snakemake settles the times of files before.
     """
     path = campaign.result(PAGE)
     with replacement(path) as temporary:

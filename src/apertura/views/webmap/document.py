@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import parse_qs, quote, unquote, urlsplit
 
-from apertura.views.webmap.requests import asked_file
+from apertura.views.image_report import ImageValues, explained_flags
 
 FORMAT = 1
 """Of `map.json`; the page refuses another."""
@@ -77,13 +77,14 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
     layers
         Its rasters.
     """
+    values = ImageValues.of(report)
     return {
         "flight": flight,
         "image": image,
-        "verdict": str(report["focus"]["verdict"]),
-        "why": str(report["focus"]["why"]),
-        "error_db": float(report["numerical_error_db"]),
-        "flags": {str(flag): str(line) for flag, line in report["flags"].items()},
+        "verdict": values.verdict,
+        "why": values.why,
+        "error_db": values.error_db,
+        "flags": explained_flags(values.flags),
         "layers": [
             {**asdict(layer), "url": url_of(f"{flight}/{image}/{layer.file}", layer.sha256)} for layer in layers
         ],
@@ -112,7 +113,7 @@ def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Pla
 
 
 def url_of(file: str, sha256: str) -> str:
-    """Return the address of a file of the results as seen from ``map/``, with the hash that `MapServer` holds it to.
+    """Return the address of a file of the results as seen from ``map/``, with the hash that `MapServer` compares.
 
     Examples
     --------
@@ -120,6 +121,29 @@ def url_of(file: str, sha256: str) -> str:
     '../f%201/a-b/db.tif?sha256=0f'
     """
     return f"../{quote(file)}?sha256={sha256}"
+
+
+def asked_file(target: str) -> tuple[str, str | None]:
+    """Return the file that a request names and the hash it expects, if any; '' is no name of a file.
+
+    Parameters
+    ----------
+    target
+        As it stands in the request, percent-encoded.
+
+    Examples
+    --------
+    >>> asked_file("/f01/a-b/db.tif?sha256=0f"), asked_file("http://x/y"), asked_file("/%ff")
+    (('f01/a-b/db.tif', '0f'), ('', None), ('', None))
+    """
+    try:
+        if not target.startswith("/"):
+            return "", None
+        split = urlsplit(target)
+        name = unquote(split.path[1:], errors="strict")
+        return name, parse_qs(split.query).get("sha256", [None])[-1]
+    except ValueError:
+        return "", None
 
 
 def named_files(document: Mapping[str, Any]) -> dict[str, str]:

@@ -1,23 +1,181 @@
-"""The map of one campaign on this machine alone: our page, and files that are listed with their hashes; read only."""
+"""The map of one campaign on this machine alone: the page, and products listed with their hashes; read only.
+
+No policy of content keeps a page from leading its own window elsewhere. So the map is a frame of another origin: where
+a frame may be led to is for the window around it to say, and a sandboxed frame leads no window and opens none. Browsers
+that know connection allowlists (Chromium 152) hold to them for everything, name look-ups, early connections and WebRTC
+too, which no other header of all these reaches.
+"""
 
 import os
+import re
 import stat
 import sys
 import webbrowser
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
+from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.processes import Interrupted
-from apertura.views.webmap.page import FILES, SHELL
-from apertura.views.webmap.policy import headers_of
-from apertura.views.webmap.requests import LOOPBACK, WINDOW, UnsatisfiableRangeError, asked_bytes, asked_file, own_host
+from apertura.formats.export import MAP, product_files
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import digest_of
+from apertura.pipeline.store import manifest_of, open_listed, read_manifest
+from apertura.views.webmap.document import asked_file, named_files
+
+LOOPBACK = "127.0.0.1"
+"""The only address that is listened on, and the name under which the map and its data are answered."""
+
+WINDOW = "localhost"
+"""The name under which the window around the map is answered: to a browser, another origin."""
+
+_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
+
+
+class UnsatisfiableRangeError(ValueError):
+    """No byte of the file is asked for."""
+
+
+def own_host(hosts: list[str], port: int) -> str | None:
+    """Return which name of this server a request says; None for another that leads here (DNS rebinding).
+
+    Parameters
+    ----------
+    hosts
+        Every ``Host`` of the request.
+    port
+        Of the server.
+
+    Examples
+    --------
+    >>> own_host(["Localhost:8000"], 8000), own_host(["evil.example:8000"], 8000), own_host([], 8000)
+    ('localhost', None, None)
+    """
+    names = {f"{name}:{port}": name for name in (LOOPBACK, WINDOW)}
+    return names.get(hosts[0].lower()) if len(hosts) == 1 else None
+
+
+def asked_bytes(header: str | None, size: int) -> tuple[int, int] | None:
+    """Return the first byte asked for and the one after the last; None for the whole file.
+
+    A header that is none, or asks for several ranges, asks for the whole file (RFC 9110, 14.2).
+
+    Parameters
+    ----------
+    header
+        ``Range`` of the request.
+    size
+        Bytes of the file.
+
+    Raises
+    ------
+    UnsatisfiableRangeError
+        If the range begins beyond the file.
+
+    Examples
+    --------
+    >>> asked_bytes("bytes=10-19", 100), asked_bytes("bytes=90-", 95), asked_bytes("bytes=-5", 95), asked_bytes(None, 9)
+    ((10, 20), (90, 95), (90, 95), None)
+    """
+    found = _RANGE.fullmatch(header.strip()) if header else None
+    if found is None:
+        return None
+    first, last, suffix = (None if digits is None else int(digits) for digits in found.groups())
+    if first is None:
+        first, last = size - min(size, suffix or 0), size - 1
+    elif last is not None and last < first:
+        return None
+    if first >= size:
+        raise UnsatisfiableRangeError(f"bytes from {first} of {size}")
+    return first, min(size, size if last is None else last + 1)
+
+
+_OF_ALL = {
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-DNS-Prefetch-Control": "off",
+    "Cache-Control": "no-cache",
+}
+
+
+def headers_of(port: int) -> Mapping[str, Mapping[str, str]]:
+    """Return name of the server → what every answer under that name carries.
+
+    Parameters
+    ----------
+    port
+        Of the server.
+
+    Examples
+    --------
+    >>> headers_of(8000)["localhost"]["Connection-Allowlist"]
+    '(response-origin "http://127.0.0.1:8000")'
+    """
+    page, window = (f"http://{name}:{port}" for name in (LOOPBACK, WINDOW))
+    of_window = (
+        f"default-src 'none'; script-src 'self'; style-src 'self'; frame-src {page}; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    of_page = (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        f"worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors {window}; "
+        "sandbox allow-scripts allow-same-origin allow-downloads"
+    )
+    return {
+        WINDOW: _OF_ALL | {"Content-Security-Policy": of_window, "Connection-Allowlist": f'(response-origin "{page}")'},
+        LOOPBACK: _OF_ALL | {"Content-Security-Policy": of_page, "Connection-Allowlist": "(response-origin)"},
+    }
+
+
+SHELL = ("shell.html", "shell.js", "shell.css")
+"""The window, of which the map is a frame; what is opened first."""
+
+FILES = ("index.html", "app.js", "app.css")
+"""The map; what is opened first."""
+
+BUILT = Path(__file__).parent / "page"
+"""Where `webmap/build.mjs` writes: no part of the sources, but of the package that is installed."""
+
+_NOT_BUILT = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>No map</title>
+<p>This apertura was installed without its map: no <code>npm</code> was there to build it.
+<p>Install Node.js 20 or newer, type <code>make webmap</code> in apertura's sources, then
+<code>apertura map</code> again.
+"""
+
+
+def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
+    """Return name → content of `SHELL` and `FILES`; without a bundle, a `shell.html` that says how to get one.
+
+    Parameters
+    ----------
+    built
+        Where the bundle is.
+
+    Examples
+    --------
+    >>> list(page_files(Path("nowhere")))
+    ['shell.html']
+    """
+    if not is_built(built):
+        return {SHELL[0]: _NOT_BUILT.encode()}
+    return {name: (built / name).read_bytes() for name in (*SHELL, *FILES)}
+
+
+def is_built(built: Path = BUILT) -> bool:
+    """Return whether the bundle is there."""
+    return all((built / name).is_file() for name in (*SHELL, *FILES))
+
 
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -40,9 +198,9 @@ class MapServer(ThreadingHTTPServer):
         The results.
     files
         Gives the names below it that are served, with slashes, and the hash that each has to have; no other file is.
-        Asked for every request; CampaignError where nobody knows.
+        Asked for every request; CampaignError where they are not known.
     page
-        Of `apertura.views.webmap.page.page_files`.
+        Of `apertura.views.webmap.server.page_files`.
     sha256_of
         Gives the hash of a file as it is now.
     port
@@ -219,3 +377,53 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
         """Say nothing: a map asks for hundreds of ranges."""
+
+
+def served(campaign: Campaign, *, port: int = 0) -> MapServer:
+    """Return a server of the campaign's map, of the products that it names and of nothing else.
+
+    Parameters
+    ----------
+    campaign
+        With results.
+    port
+        To listen on; 0 for a free one.
+
+    Raises
+    ------
+    CampaignError
+        If there is no map, it is not as it was written, or the port is taken.
+    """
+    files = _listing(campaign)
+    files()
+    results = campaign.relative(campaign.results)
+
+    def sha256_of(name: str) -> str:
+        return digest_of(campaign.root, f"{results}/{name}")
+
+    return MapServer(campaign.results, files, page=page_files(), sha256_of=sha256_of, port=port)
+
+
+def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
+    """Return what gives file of the results → sha256: `map.json` by its manifest, and what that names.
+
+    Both are read again when the manifest is another: the workflow ran meanwhile.
+    """
+    products = frozenset(product_files({flight.name: flight.pairs for flight in campaign.image_flights}))
+
+    @lru_cache(maxsize=1)
+    def listed(*_: int) -> Mapping[str, str]:
+        path = campaign.result(MAP)
+        manifest = manifest_of(path)
+        document = open_listed(path, manifest)
+        with undamaged(path, expected="the map of a finished campaign", remedy="Run the workflow again."):
+            named = {name: sha256 for name, sha256 in named_files(document).items() if name in products}
+        return {**named, MAP: read_manifest(manifest)["files"][path.name]}
+
+    def listed_now() -> Mapping[str, str]:
+        with suppress(OSError):
+            state = manifest_of(campaign.result(MAP)).stat()
+            return listed(state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        return listed()
+
+    return listed_now

@@ -10,7 +10,6 @@ import numpy as np
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.flags import FLAGS
 from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
@@ -19,7 +18,8 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
-from apertura.pipeline.store import open_listed, read_manifest, record_files
+from apertura.pipeline.store import check_listed, read_manifest, record_files
+from apertura.views.image_report import FUSED, read_report
 from apertura.views.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
 
 _FEW = 512  # places along a raster's longer side that its range of values is taken from
@@ -34,10 +34,9 @@ def webmap(campaign: Campaign) -> list[Path]:
     notes: list[str] = []
     places += _true(campaign, scene, notes)
     for flight, image in _images(campaign):
-        report = open_listed(campaign.result(flight, image, "image.json"), _exported(campaign, flight, image))
+        report = read_report(campaign, flight, image)
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
-            explained = {**report, "flags": _explained(report["flags"])}
-            images.append(image_entry(flight, image, explained, _layers(campaign, flight, image, report)))
+            images.append(image_entry(flight, image, report, _layers(campaign, flight, image, report)))
             places += found_places(flight, image, report)
     document = map_document(
         campaign.settings.campaign,
@@ -56,26 +55,12 @@ def webmap(campaign: Campaign) -> list[Path]:
 
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
     for flight in campaign.image_flights:
-        yield from ((flight.name, image) for image in ("fused", *flight.pairs))
-
-
-def _exported(campaign: Campaign, flight: str, image: str) -> Path:
-    return campaign.root / campaign.manifest("export", flight, image)
-
-
-def _explained(flags: Mapping[str, str]) -> dict[str, str]:
-    """Return flag → what was measured, what it means and what to look at."""
-    told = {}
-    for flag, line in flags.items():
-        known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
-        said = [line.rstrip("."), *([known.means, f"look at: {known.look}"] if known else [])]
-        told[flag] = " ".join(f"{words}." for words in said)
-    return told
+        yield from ((flight.name, image) for image in (FUSED, *flight.pairs))
 
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
     """Return what a page can show of an image: real rasters, the linear ones only where no dB show the same."""
-    kinds = {"export": "fused"} if image == "fused" else {"export": "pair", "layers": "layers"}
+    kinds = {"export": "fused"} if image == FUSED else {"export": "pair", "layers": "layers"}
     return [
         layer
         for result, kind in kinds.items()
@@ -86,27 +71,28 @@ def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, An
 
 
 def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | None:
-    path = manifest.with_name(row.file)
+    path, root = manifest.with_name(row.file), manifest.parents[3]
+
+    def present(file: Path) -> str:
+        return digest_of(root, file.relative_to(root).as_posix()) if file.is_file() else ""
+
+    sha256 = check_listed(path, manifest, present=present)
     remedy = f"Delete {manifest} and run the workflow again."
-    root = manifest.parents[3]
-    expected = read_manifest(manifest)["files"].get(row.file)
-    if not path.is_file() or digest_of(root, path.relative_to(root).as_posix()) != expected:
-        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
     with opened_raster(path, expected="what the workflow wrote", remedy=remedy) as raster:
         title, unit = str(raster.descriptions[0] or row.file), str(raster.units[0] or "")
         if np.dtype(raster.dtypes[0]).kind == "c" or (unit == "1" and row.source in _SHOWN_IN_DB):
             return None
         if row.source == "mask":
-            return Layer(row.file, expected, "classes", title, "", 0.0, 3.0)
+            return Layer(row.file, sha256, "classes", title, "", 0.0, 3.0)
         if unit == "dB" and row.source in _SHOWN_IN_DB:
             peak_db = 20 * math.log10(max(float(report["brightest"]["amplitude"]), 1e-30))
             low, high = peak_db + float(report["noise_floor_db"]), peak_db
-            return Layer(row.file, expected, "image", title, unit, *(round(end, 2) + 0.0 for end in (low, high)))
+            return Layer(row.file, sha256, "image", title, unit, *(round(end, 2) + 0.0 for end in (low, high)))
         fewer = max(1.0, max(raster.shape) / _FEW)
         values = raster.read(1, out_shape=tuple(max(1, round(size / fewer)) for size in raster.shape), masked=True)
-    seen = np.ma.masked_invalid(values).compressed()
-    low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
-    return Layer(row.file, expected, "measure", title, unit, _rounded(low), _rounded(high))
+    valid = np.ma.masked_invalid(values).compressed()
+    low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 1.0)
+    return Layer(row.file, sha256, "measure", title, unit, _rounded(low), _rounded(high))
 
 
 _SHOWN_IN_DB = frozenset({"image", "coherent", "noncoherent", "magnitude"})

@@ -13,8 +13,8 @@ from apertura.pipeline.lineage import on_demand, results_of
 from apertura.pipeline.lineage.inputs import with_inputs
 from apertura.pipeline.store import read_manifest
 from apertura.pipeline.workflow import run_workflow
-from apertura.views.verification.diff import differences, first_difference
-from apertura.views.verification.products import find_product
+from apertura.views.verify.diff import differences, first_difference
+from apertura.views.verify.products import find_product
 
 _LINES = 8
 _LONGEST = 400
@@ -50,7 +50,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     known = [result.manifest for _, result in results_of(campaign)]
     if not whole and product.manifest not in known:
         expected = f"one of the {len(known)} results of its campaign"
-        raise CampaignError("no result that the config promises", path, expected, "`apertura list` tells them.")
+        raise CampaignError("no result that the config promises", path, expected, "`apertura list` names them.")
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
     if not wanted:
         raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
@@ -118,20 +118,20 @@ def compared(root: Path, again: Path, manifest: str) -> list[str]:
             lines.append(f"missing  {folder}{name}: {'there' if pair[0].is_file() else 'made again'} alone")
         elif (at := first_difference(*pair)) is not None:
             lines.append(f"changed  {folder}{name}: first differs at byte {at}")
-            lines += _told(*pair) if len(lines) == 1 else []
+            lines += _differences(*pair) if len(lines) == 1 else []
     return lines
 
 
-def _told(path: Path, again: Path) -> Iterator[str]:
+def _differences(path: Path, again: Path) -> Iterator[str]:
     """Yield what `apertura diff` says of the first file that differs, from what is there to what was made again."""
     stage = next((folder for folder in path.parents if folder.suffix == ".zarr"), None)
     if stage is not None:
         path, again = stage, again.parents[len(path.relative_to(stage).parts) - 1]
     with suppress(CampaignError):  # a stage that is damaged is not opened
-        told = [(section, line) for section, lines in differences(path, again).items() for line in lines]
-        yield from (f"         {section:<9}{line}" for section, line in told[:_LINES])
-        if len(told) > _LINES:
-            yield f"         and {len(told) - _LINES} more"
+        differing = [(section, line) for section, lines in differences(path, again).items() for line in lines]
+        yield from (f"         {section:<9}{line}" for section, line in differing[:_LINES])
+        if len(differing) > _LINES:
+            yield f"         and {len(differing) - _LINES} more"
 
 
 def _files(root: Path, manifest: str) -> Mapping[str, str]:

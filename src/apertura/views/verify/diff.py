@@ -1,27 +1,125 @@
-"""`apertura diff`: two products told apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+"""`apertura diff`: two products compared: geometry, settings, inputs, stages, code, software, flags and pixels."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, shown
 from apertura.common.raster import opened_raster
 from apertura.formats.export.writing import blocks_of
 from apertura.pipeline.store import open_stage
-from apertura.views.verification.contents import EXPECTED, REMEDY, SECTIONS, sections_of
-from apertura.views.verification.links import shortened
-from apertura.views.verification.pixels import Pixels, Tally, rows_of
-from apertura.views.verification.products import unlinked
-from apertura.views.verification.tags import picture
+from apertura.views.verify.chain import shortened
+from apertura.views.verify.products import EXPECTED, REMEDY, SECTIONS, picture, sections_of, unlinked
+
+Pixels = NDArray[Any]
 
 _LINES = 20
 _VALUE = 60
 _READ_BYTES = 1 << 20
 _HASH = re.compile("[0-9a-f]{64}")
+
+
+@dataclass
+class Tally:
+    """Sums over the values of two arrays, block by block: how far they differ, how alike, where only one has a value.
+
+    Attributes
+    ----------
+    compared
+        Values that both hold.
+    only
+        Values that one holds and the other does not (NaN, infinite), of the first and of the second.
+    differing
+        Values that are not the same, those that one lacks among them.
+    largest, square
+        Largest magnitude of the difference, and sum of its squares.
+    peak
+        Largest magnitude in either.
+    phased
+        Whether values are complex.
+
+    Examples
+    --------
+    >>> tally = Tally.of([(np.array([1.0, 2.0, np.nan]), np.array([1.0, 2.5, 0.0]))])
+    >>> tally.compared, tally.only, tally.differing, tally.largest, tally.rms
+    (2, (0, 1), 2, 0.5, 0.3535533905932738)
+    """
+
+    compared: int = 0
+    only: tuple[int, int] = (0, 0)
+    differing: int = 0
+    largest: float = 0.0
+    square: float = 0.0
+    peak: float = 0.0
+    phased: bool = False
+    _about: float = 0.0
+    _sums: Any = None
+
+    @classmethod
+    def of(cls, blocks: Iterable[tuple[Pixels, Pixels]]) -> "Tally":
+        """Return the sums over pairs of blocks of one shape, real or complex."""
+        tally = cls()
+        for first, second in blocks:
+            tally.add(np.asarray(first), np.asarray(second))
+        return tally
+
+    def add(self, first: Pixels, second: Pixels) -> None:
+        """Add a block of each."""
+        valid = np.isfinite(first), np.isfinite(second)
+        lacking = int((valid[0] & ~valid[1]).sum()), int((valid[1] & ~valid[0]).sum())
+        self.only = self.only[0] + lacking[0], self.only[1] + lacking[1]
+        self.phased = np.iscomplexobj(first) or np.iscomplexobj(second)
+        wide = np.complex128 if self.phased else np.float64
+        a, b = (values[valid[0] & valid[1]].astype(wide) for values in (first, second))
+        apart = np.abs(a - b)
+        self.differing += int(np.count_nonzero(apart)) + sum(lacking)
+        if not a.size:
+            return
+        self.compared += a.size
+        self.largest, self.square = max(self.largest, float(apart.max())), self.square + float((apart**2).sum())
+        self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
+        if self._sums is None:  # of real values the mean is taken off: sums about one of them keep their digits
+            self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
+        a, b = a - self._about, b - self._about
+        self._sums += [a.sum(), b.sum(), np.vdot(a, a), np.vdot(b, b), np.vdot(b, a)]
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the difference; 0 where nothing could be compared."""
+        return float(np.sqrt(self.square / self.compared)) if self.compared else 0.0
+
+    @property
+    def alike(self) -> float:
+        """Coherence |Σ a b*| / √(Σ|a|² Σ|b|²) of complex values, correlation of real ones; NaN where all are equal."""
+        if self._sums is None:
+            return float("nan")
+        of_a, of_b, aa, bb, ab = self._sums
+        if not self.phased:
+            aa, bb, ab = (
+                both - left * right / self.compared
+                for both, left, right in ((aa, of_a, of_a), (bb, of_b, of_b), (ab, of_a, of_b))
+            )
+        scale = np.sqrt(max(aa.real, 0.0) * max(bb.real, 0.0))
+        return float((abs(ab) if self.phased else ab.real) / scale) if scale > 0 else float("nan")
+
+
+def rows_of(shape: tuple[int, ...], itemsize: int, *, block_bytes: int = 1 << 24) -> Iterator[slice]:
+    """Yield rows of an array, as many at a time as fit into some bytes, one at least.
+
+    Examples
+    --------
+    >>> list(rows_of((5, 1000), 8, block_bytes=16_000))
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    step = max(1, block_bytes // max(1, itemsize * int(np.prod(shape[1:], dtype=int))))
+    for first in range(0, shape[0], step):
+        yield slice(first, min(first + step, shape[0]))
 
 
 def differences(first: Path, second: Path) -> dict[str, list[str]]:
@@ -42,8 +140,10 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
             raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:
         raise CampaignError(f"of another kind than {first.name}", second, "two products of one kind", REMEDY)
-    told = sections_of(first), sections_of(second)
-    found = {section: _lines(*(one.get(section, {}) for one in told)) for section in SECTIONS if section in told[0]}
+    sections = sections_of(first), sections_of(second)
+    found = {
+        section: _lines(*(one.get(section, {}) for one in sections)) for section in SECTIONS if section in sections[0]
+    }
     if first.is_dir():
         return found | {"values": list(_stages(first, second))}
     if first.suffix in _PIXELS:
@@ -88,7 +188,7 @@ def first_difference(first: Path, second: Path) -> int | None:
 
 
 def _rasters(first: Path, second: Path) -> Iterator[str]:
-    """Yield what tells the pixels of two rasters apart, where their grids lie on each other."""
+    """Yield how the pixels of two rasters differ, where their grids lie on each other."""
     with ExitStack() as stack:
         one, other = (
             stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in (first, second)
@@ -106,7 +206,7 @@ def _rasters(first: Path, second: Path) -> Iterator[str]:
         if (len(rows), len(columns)) != one.shape or one.shape != other.shape:
             yield f"compared where both are: {len(columns)} × {len(rows)} of them"
         tally = Tally.of(_blocks(one, other, (rows[0], columns[0]), shift, (len(rows), len(columns))))
-        yield from told(tally, unit=one.units[0] or "1", power="power" in (one.descriptions[0] or ""))
+        yield from difference_lines(tally, unit=one.units[0] or "1", power="power" in (one.descriptions[0] or ""))
 
 
 def _shift(one: Any, other: Any) -> tuple[int, int] | None:
@@ -136,23 +236,23 @@ def _blocks(
 
 
 def _pictures(first: Path, second: Path) -> Iterator[str]:
-    """Yield what tells two pictures of one size apart."""
+    """Yield how two pictures of one size differ."""
     one, other = (np.asarray(picture(path)) for path in (first, second))
     if one.shape == other.shape:  # else geometry says so
-        yield from told(Tally.of([(one.astype(np.float32), other.astype(np.float32))]), unit="of 255")
+        yield from difference_lines(Tally.of([(one.astype(np.float32), other.astype(np.float32))]), unit="of 255")
 
 
 _PIXELS = {".tif": _rasters, ".png": _pictures}
 
 
 def _stages(first: Path, second: Path) -> Iterator[str]:
-    """Yield what tells the arrays of two stages apart, each with its name."""
+    """Yield how the arrays of two stages differ, each with its name."""
     one, other = (open_stage(folder, folder.stem) for folder in (first, second))
     for name in one.variables:
         if name not in other.variables or one[name].shape != other[name].shape or one[name].dtype.kind not in "fciubM":
             continue  # geometry says so
         tally = Tally.of(_rows(one[name], other[name]))
-        yield from (f"{name}: {line}" for line in told(tally, unit=str(one[name].attrs.get("units", "1"))))
+        yield from (f"{name}: {line}" for line in difference_lines(tally, unit=str(one[name].attrs.get("units", "1"))))
 
 
 def _rows(one: Any, other: Any) -> Iterator[tuple[Pixels, Pixels]]:
@@ -168,21 +268,21 @@ def _numbers(values: Pixels) -> Pixels:
     return values.astype("M8[ns]").astype(np.int64) / 1e9 if values.dtype.kind == "M" else values
 
 
-def told(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
-    """Yield what tells two arrays apart, in words; nothing where they are the same.
+def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
+    """Yield how two arrays differ, in words; nothing where they are the same.
 
     Parameters
     ----------
     tally
         Of both.
     unit
-        Of their values; of those without one differences are told in dB of the peak.
+        Of their values; differences of those without one are in dB of the peak.
     power
         Whether they are powers, and not amplitudes.
 
     Examples
     --------
-    >>> list(told(Tally.of([(np.array([1.0, 2.0]), np.array([1.0, 2.002]))])))
+    >>> list(difference_lines(Tally.of([(np.array([1.0, 2.0]), np.array([1.0, 2.002]))])))
     ['1 of 2 differ, by -60.0 dB of the peak at most, -63.0 dB rms; correlation 1.000000']
     """
     if not tally.differing:
@@ -194,7 +294,7 @@ def told(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]
         count = tally.compared + sum(tally.only)
         yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"
     if any(tally.only):
-        yield f"{tally.only[0]} values are held by the first alone, {tally.only[1]} by the second alone"
+        yield f"{tally.only[0]} values are in the first alone, {tally.only[1]} in the second alone"
 
 
 def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:
@@ -204,7 +304,7 @@ def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:
 
 
 def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
-    """Print what tells two products apart, a line each; return 0 if nothing does, else 1; raises as `differences`."""
+    """Print what differs between two products, a line each; return 0 if nothing does, else 1; as `differences`."""
     found = differences(first, second)
     for section, lines in found.items():
         most = len(lines) if whole else _LINES

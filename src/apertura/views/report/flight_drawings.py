@@ -1,0 +1,371 @@
+"""What was flown and recorded, drawn: geometry of a pair, its pulses over time, its range profiles."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.gridspec import GridSpec
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Floats
+from apertura.formats.export.map_layout import from_origin, number, round_length, round_origin
+from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
+
+_STYLES: Mapping[str, Any] = {
+    "transmitter": {"color": BLUE, "linestyle": "-", "linewidth": 1.6},
+    "receiver": {"color": ORANGE, "linestyle": "--", "linewidth": 1.6},
+}
+_MARGIN, _BELOW = 0.18, 0.1
+"""Left free in plan around tracks and scene, and how much of it below them for scale and north, of their side."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlownGeometry:
+    """What a drawing of a pair's geometry needs.
+
+    Attributes
+    ----------
+    time_s
+        (pulse,) float64, of some pulses, seconds from the first.
+    tracks_m
+        Antenna (transmitter, receiver) → (pulse, 3) float64, easting, northing and height on the map, metres.
+    bounds_m
+        West, south, east, north of the scene.
+    ground_m
+        Height of the ground in its middle, as the tracks' heights count.
+    target_m
+        (3,) float64, the brightest target on the map, metres.
+    footprint
+        Rings (vertex, 2) of map metres about what the pulses make.
+    crs_name
+        Of the map.
+    """
+
+    time_s: NDArray[np.float64]
+    tracks_m: Mapping[str, NDArray[np.float64]]
+    bounds_m: tuple[float, float, float, float]
+    ground_m: float
+    target_m: NDArray[np.float64]
+    footprint: Sequence[NDArray[np.float64]]
+    crs_name: str
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """Middle of the scene on its ground, (3,) float64 metres of the map."""
+        west, south, east, north = self.bounds_m
+        return np.array([(west + east) / 2, (south + north) / 2, self.ground_m])
+
+    @property
+    def towards(self) -> NDArray[np.float64]:
+        """Direction over ground from the middle of the tracks to the target, (2,) float64 of length one."""
+        tracks = np.concatenate([track[:, :2] for track in self.tracks_m.values()])
+        vector = self.target_m[:2] - tracks.mean(axis=0)
+        length = float(np.hypot(*vector))
+        return np.asarray(vector / length) if length else np.array([0.0, 1.0])
+
+
+def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping[str, str]) -> None:
+    """Draw a pair's geometry as a PNG: plan, view from the side, heights over time.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    flown
+        Tracks and scene.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    with sheet(path, 5.6, title=title, tags=tags) as figure:
+        grid = GridSpec(2, 2, figure=figure, height_ratios=(2.2, 1))
+        _draw_plan(figure.add_subplot(grid[0, 0]), flown)
+        _draw_side(figure.add_subplot(grid[0, 1]), flown)
+        _draw_heights(figure.add_subplot(grid[1, :]), flown)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False)
+
+
+def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
+    west, south, east, north = flown.bounds_m
+    corners = np.array([[west, south], [east, north]])
+    places = np.concatenate([corners, *(track[:, :2] for track in flown.tracks_m.values())])
+    low, high = places.min(axis=0), places.max(axis=0)
+    side = float((high - low).max())
+    half, (x, y) = (0.5 + _MARGIN) * side, (low + high) / 2
+    y -= _BELOW * side
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", title="plan")
+    scene = Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene")
+    axes.add_patch(scene)
+    for number_of, ring in enumerate(flown.footprint):
+        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if number_of else "footprint")
+    for name, track in flown.tracks_m.items():
+        axes.plot(*track[:, :2].T, label=name, **_STYLES[name])
+        axes.plot(*track[0, :2], "o", color=_STYLES[name]["color"], markersize=4)
+    axes.plot(*flown.target_m[:2], "*", color=RED, markersize=9, label="brightest target")
+    for name, axis, at in (("Easting", axes.xaxis, x), ("Northing", axes.yaxis, y)):
+        origin = round_origin(at - half, at + half)
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(FuncFormatter(partial(from_origin, origin)))
+        axis.set_label_text(f"{name} − {number(origin)}, m" if origin else f"{name}, m")
+    _draw_scale_and_north(axes)
+    axes.set_xlabel(f"{axes.get_xlabel()}\n{flown.crs_name}")
+
+
+def _draw_scale_and_north(axes: Axes) -> None:
+    """Draw a bar of a round length and an arrow to grid north, inside the lower corners."""
+    low, high = axes.get_xlim()
+    metres = round_length((high - low) / 4)
+    part = metres / (high - low)
+    axes.add_patch(Rectangle((0.05, 0.04), part, 0.015, transform=axes.transAxes, facecolor="black", zorder=5))
+    axes.text(0.05 + part / 2, 0.07, f"{number(metres)} m", transform=axes.transAxes, ha="center", fontsize=7)
+    arrow = {"arrowstyle": "-|>", "color": "black"}
+    axes.annotate("", (0.94, 0.13), (0.94, 0.02), xycoords="axes fraction", arrowprops=arrow)
+    axes.text(0.94, 0.13, "N", transform=axes.transAxes, ha="center", fontsize=8, weight="bold")
+
+
+def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
+    """Draw the view along the flight: heights over the distance towards the target, in true proportions."""
+    origin = flown.target_m[:2]
+    ends = np.array([[x, y] for x in flown.bounds_m[::2] for y in flown.bounds_m[1::2]])
+    reach = (ends - origin) @ flown.towards
+    axes.plot([reach.min(), reach.max()], [0, 0], color=GREY, linewidth=3, solid_capstyle="butt", label="scene")
+    for name, track in flown.tracks_m.items():
+        away, height = (track[:, :2] - origin) @ flown.towards, track[:, 2] - flown.ground_m
+        axes.plot(away, height, label=name, **_STYLES[name])
+        sight = float(np.median(away)), float(np.median(height))
+        axes.plot([sight[0], 0], [sight[1], flown.target_m[2] - flown.ground_m], color=_STYLES[name]["color"], lw=0.6)
+    axes.plot(0, flown.target_m[2] - flown.ground_m, "*", color=RED, markersize=9, label="brightest target")
+    axes.set(title="from the side", xlabel="distance towards the target, m", ylabel="height above the scene, m")
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _draw_heights(axes: Axes, flown: FlownGeometry) -> None:
+    for name, track in flown.tracks_m.items():
+        axes.plot(flown.time_s, track[:, 2] - flown.ground_m, label=name, **_STYLES[name])
+    axes.set(
+        title=f"height above the scene, whose ground lies at {number(round(flown.ground_m, 2))} m",
+        xlabel="time from the first pulse, s",
+        ylabel="height, m",
+    )
+    axes.margins(x=0)
+
+
+_BINS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class PulseRecord:
+    """What is known of the pulses of a pair.
+
+    Attributes
+    ----------
+    sent_s
+        (sent,) float64, when each was sent, seconds from the first.
+    kept
+        (sent,) bool, whether it makes the image.
+    reasons
+        Why others do not → how many, as image.json counts them.
+    time_s
+        (pulse,) float64, of those kept.
+    snr_db
+        (pulse,) float64, of the sidelink per subcarrier; None without one.
+    delay_m
+        (pulse,) float64, by how much the sidelink came later than its length says, metres; None without one.
+    """
+
+    sent_s: Floats
+    kept: NDArray[np.bool_]
+    reasons: Mapping[str, int]
+    time_s: Floats = field(default_factory=lambda: np.empty(0))
+    snr_db: Floats | None = None
+    delay_m: Floats | None = None
+
+
+def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[str, str]) -> None:
+    """Draw pulses kept and left out, and SNR and delay of the sidelink where there is one, as a PNG.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    record
+        What is known of the pulses.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    series = [
+        (values, label, heading)
+        for values, label, heading in (
+            (record.snr_db, "SNR, dB", "sidelink, SNR per subcarrier"),
+            (record.delay_m, "delay − length, m", "sidelink, delay beyond its length"),
+        )
+        if values is not None and np.isfinite(values).any()
+    ]
+    with sheet(path, 2.0 + 1.7 * len(series), title=title, tags=tags) as figure:
+        first, *others = column_of(figure, 1 + len(series))
+        _draw_counts(first, record)
+        for axes, (values, label, heading) in zip(others, series, strict=True):
+            _draw_series(axes, record.time_s, values, label, heading)
+        [first, *others][-1].set_xlabel("time from the first pulse sent, s")
+        first.set_xlim(0.0, max(float(record.sent_s.max(initial=0.0)), 1e-3))
+
+
+def _draw_counts(axes: Axes, record: PulseRecord) -> None:
+    last = float(record.sent_s.max()) if record.sent_s.size else 0.0
+    interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
+    width = interval * max(1, np.ceil(last / interval / _BINS))  # of whole intervals, else columns seem to lack pulses
+    edges = np.arange(-interval / 2, last + width, width)
+    kept, left = (np.histogram(record.sent_s[some], edges)[0] for some in (record.kept, ~record.kept))
+    axes.stairs(kept, edges, fill=True, color=BLUE, label=f"kept: {int(record.kept.sum())}")
+    axes.stairs(
+        kept + left,
+        edges,
+        baseline=kept,
+        fill=True,
+        facecolor=RED,
+        edgecolor="white",
+        hatch="////",
+        linewidth=0,
+        label=f"left out: {int((~record.kept).sum())}{_why(record.reasons)}",
+    )
+    axes.set(title="pulses", ylabel=f"pulses in {width:.2g} s", ylim=(0, 1.45 * max(1, (kept + left).max())))
+    axes.legend(loc="upper right", ncols=2)
+
+
+def _why(reasons: Mapping[str, int]) -> str:
+    """Return the reasons in a few words.
+
+    Examples
+    --------
+    >>> _why({"unpaired": 9, "sidelink_lost": 2}), _why({})
+    (' (9 unpaired, 2 sidelink lost)', '')
+    """
+    counts = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in reasons.items())
+    return f" ({counts})" if counts else ""
+
+
+def _draw_series(axes: Axes, time_s: Floats, values: Floats, label: str, heading: str) -> None:
+    some = thinned(len(values))
+    median = float(np.nanmedian(values))
+    axes.plot(time_s[some], values[some], ".", color=BLUE, markersize=2, rasterized=True)
+    axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
+    spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
+    unlocked = int(np.isnan(values).sum())
+    lost = f"; {unlocked} pulses without lock" if unlocked else ""
+    unit = label.rpartition(", ")[2]
+    axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
+
+
+TIMES, PATHS = 560, 700
+"""Cells of the picture at most, over time and over path."""
+
+_RANGE_DB = 50.0
+
+
+class Waterfall:
+    """Mean power of range profiles in cells of time and path; profiles are added some at a time.
+
+    Parameters
+    ----------
+    start_m
+        (pulse,) float64, total path of sample 0, metres.
+    step_m
+        Between samples.
+    samples
+        Of a profile.
+
+    Examples
+    --------
+    >>> waterfall = Waterfall(np.array([10.0, 10.5]), 0.5, 2)
+    >>> waterfall.add(0, np.array([[1, 2], [3, 4]], np.complex64))
+    >>> waterfall.mean.tolist(), waterfall.span_m
+    ([[1.0, nan], [4.0, 9.0], [nan, 16.0]], (10.0, 11.5))
+    """
+
+    def __init__(self, start_m: NDArray[np.float64], step_m: float, samples: int) -> None:
+        first = float(start_m.min())
+        self._offset = (start_m - first) / step_m
+        whole = int(np.ceil(self._offset.max() - 1e-9)) + samples
+        self._together = -(-whole // PATHS)
+        self._pulses = -(-len(start_m) // TIMES)
+        shape = -(-whole // self._together), -(-len(start_m) // self._pulses)
+        self._sum, self._count = np.zeros(shape), np.zeros(shape)
+        self.span_m = first, first + shape[0] * self._together * step_m
+
+    def add(self, first: int, profiles: NDArray[np.complex64]) -> None:
+        """Add profiles, (pulse, sample) complex64, of the pulses from `first` on."""
+        power = np.abs(profiles.astype(np.complex128)) ** 2
+        size = self._sum.shape[0]
+        for row, line in enumerate(power):
+            at = self._offset[first + row] + np.arange(line.size)
+            lower = np.floor(at + 1e-9).astype(np.int64)
+            upper = np.clip(at - lower, 0, 1)  # its share of the next cell: profiles begin between cells
+            for cells, share in ((lower, 1 - upper), (lower + 1, upper)):
+                into = np.minimum(cells // self._together, size - 1)
+                column = (first + row) // self._pulses
+                self._sum[:, column] += np.bincount(into, share * line, minlength=size)
+                self._count[:, column] += np.bincount(into, share, minlength=size)
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """(path, time) float64 mean power, NaN where no profile reaches."""
+        return np.where(self._count > 0, self._sum / np.maximum(self._count, 1), np.nan)
+
+    def times(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the edges of the cells of time, from those of all pulses, (cell + 1,) float64 seconds."""
+        starts = time_s[:: self._pulses]
+        last = time_s[-1] + (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1)
+        return np.append(starts, last if last > starts[-1] else starts[-1] + 1.0)
+
+
+def draw_waterfall(
+    path: Path,
+    waterfall: Waterfall,
+    time_s: NDArray[np.float64],
+    target_path_m: NDArray[np.float64],
+    *,
+    title: str,
+    tags: Mapping[str, str],
+) -> None:
+    """Draw a waterfall with the total path to the brightest target, as a PNG.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    waterfall
+        To which every profile was added.
+    time_s, target_path_m
+        (pulse,) float64, seconds from the first pulse, and metres.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    mean = waterfall.mean
+    top = float(np.nanmax(mean)) if np.isfinite(mean).any() else 1.0
+    decibel = 10 * np.log10(np.maximum(mean / (top or 1.0), 1e-12))
+    with sheet(path, 3.6, title=title, tags=tags) as figure:
+        axes = figure.add_subplot()
+        edges = np.linspace(*waterfall.span_m, mean.shape[0] + 1)
+        cells = np.ma.masked_invalid(decibel)
+        drawn = axes.pcolormesh(
+            waterfall.times(time_s), edges, cells, cmap="viridis", vmin=-_RANGE_DB, vmax=0, rasterized=True
+        )
+        some = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
+        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9, label="to the brightest target")
+        axes.legend(loc="upper right", labelcolor="white", facecolor="0.25", framealpha=0.7)
+        axes.set(title="range profiles", xlabel="time from the first pulse, s", ylabel="total path, m")
+        axes.yaxis.set_major_locator(MaxNLocator(7))
+        axes.grid(visible=False)
+        figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re strongest cell, dB")

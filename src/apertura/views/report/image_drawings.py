@@ -1,0 +1,359 @@
+"""What an image holds, drawn: phase and cuts of its brightest target, its error budget, images side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.gridspec import GridSpec
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from apertura.core.quality.budget import is_stated
+from apertura.formats.export.map_layout import number, round_length
+from apertura.formats.export.quicklook import below_peak
+from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, SKY, column_of, sheet, thinned
+
+_COLOURS = (ORANGE, BLUE, GREEN)
+
+
+def sidelink_error_rad(
+    phase_rad: NDArray[np.float64], length_m: NDArray[np.float64], *, wavenumber_rad_m: float
+) -> NDArray[np.float64]:
+    """Return the phase that clocks and triggers add to each pulse, from its sidelink.
+
+    Parameters
+    ----------
+    phase_rad
+        (pulse,) float64, of the sidelink at mid-band, radians.
+    length_m
+        (pulse,) float64, of the sidelink by the logs, metres.
+    wavenumber_rad_m
+        2π f_mid/c, radians per metre.
+
+    Returns
+    -------
+    ndarray
+        (pulse,) float64, radians, not wrapped.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "What the sidelink takes out".
+
+    Examples
+    --------
+    >>> sidelink_error_rad(np.array([0.3 - 4.0]), np.array([2.0]), wavenumber_rad_m=2.0).round(6)
+    array([0.3])
+    """
+    return phase_rad + wavenumber_rad_m * length_m
+
+
+def steadiness(phasors: NDArray[np.complex128]) -> tuple[float, float]:
+    """Return how far a target's phase scatters, rms radians about its mean, and |Σz|/Σ|z|; NaN without an echo.
+
+    Parameters
+    ----------
+    phasors
+        (pulse,) complex, what each pulse adds at the target.
+
+    Examples
+    --------
+    >>> steadiness(np.array([1, 1, 1], complex)), round(steadiness(np.exp(1j * np.array([-0.1, 0.1])))[0], 3)
+    ((0.0, 1.0), 0.1)
+    """
+    size = np.abs(phasors)
+    if not size.sum() > 0:
+        return float("nan"), float("nan")
+    mean = phasors.sum()
+    off = np.angle(phasors * np.conj(mean)) if abs(mean) > 0 else np.angle(phasors)
+    return float(np.sqrt((size * off**2).sum() / size.sum())), float(abs(mean) / size.sum())
+
+
+def draw_phase(
+    path: Path,
+    time_s: NDArray[np.float64],
+    phasors: Mapping[str, NDArray[np.complex128]],
+    *,
+    title: str,
+    tags: Mapping[str, str],
+) -> None:
+    """Draw the phase of a target in each pulse, one drawing below the other for each stage of correction, as a PNG.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    time_s
+        (pulse,) float64, seconds from the first pulse.
+    phasors
+        What was corrected so far → (pulse,) complex, what each pulse adds at the target.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    some = thinned(len(time_s))
+    with sheet(path, 0.6 + 1.55 * len(phasors), title=title, tags=tags) as figure:
+        drawn = column_of(figure, len(phasors))
+        for axes, colour, (name, values) in zip(drawn, _COLOURS, phasors.items(), strict=False):
+            rms, together = steadiness(values)
+            phase = np.angle(values[some] * np.conj(values.sum() or 1))
+            axes.plot(time_s[some], phase, ".", color=colour, markersize=2)
+            axes.axhline(0, color=GREY, linewidth=0.6)
+            axes.set(
+                title=f"{name}: {rms:.2f} rad rms, {100 * together:.0f} % add up",
+                ylabel="phase, rad",
+                ylim=(-1.05 * np.pi, 1.05 * np.pi),
+                yticks=[-np.pi, 0, np.pi],
+                yticklabels=["−π", "0", "π"],
+            )
+            axes.margins(x=0)
+        drawn[-1].set_xlabel("time from the first pulse, s")
+
+
+_DEEPEST_DB = -40.0
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnCut:
+    """A line through a peak and what was measured along it.
+
+    Attributes
+    ----------
+    name
+        Of its direction.
+    along_m
+        (sample,) float64, metres from the peak.
+    power
+        (sample,) float64, linear, the peak in the middle.
+    width_m, pslr_db, islr_db
+        −3 dB width, peak and integrated sidelobe ratio; NaN where the line does not hold them.
+    """
+
+    name: str
+    along_m: NDArray[np.float64]
+    power: NDArray[np.float64]
+    width_m: float
+    pslr_db: float
+    islr_db: float
+
+    @property
+    def decibels(self) -> NDArray[np.float64]:
+        """Power relative to the peak, (sample,) float64 dB."""
+        return np.asarray(10 * np.log10(np.maximum(self.power / self.power[self.power.size // 2], 1e-12)))
+
+
+def draw_cuts(path: Path, cuts: Sequence[DrawnCut], *, title: str, tags: Mapping[str, str]) -> None:
+    """Draw cuts side by side on one scale of dB, as a PNG.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    cuts
+        At least one.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    with sheet(path, 2.9, title=title, tags=tags) as figure:
+        grid = GridSpec(1, len(cuts), figure=figure)
+        for number, (cut, colour) in enumerate(zip(cuts, (BLUE, ORANGE), strict=False)):
+            _draw_cut(figure.add_subplot(grid[number]), cut, colour)
+
+
+def _draw_cut(axes: Axes, cut: DrawnCut, colour: str) -> None:
+    axes.plot(cut.along_m, cut.decibels, color=colour, linewidth=1.2)
+    axes.axhline(-3, color=GREY, linewidth=0.7, linestyle="--")
+    if np.isfinite(cut.width_m):
+        left, right = _crossings(cut)
+        axes.plot([left, right], [-3, -3], color=RED, linewidth=2.2, solid_capstyle="butt")
+    width = f"−3 dB: {100 * cut.width_m:.1f} cm" if np.isfinite(cut.width_m) else "−3 dB: beyond the cut"
+    axes.set(
+        title=f"{cut.name} — {width}",
+        xlabel="from the peak, m",
+        ylabel="power re peak, dB",
+        ylim=(_DEEPEST_DB, 3),
+        xlim=(cut.along_m[0], cut.along_m[-1]),
+    )
+    ratios = [
+        f"{name} {value:.1f} dB".replace("-", "−")
+        for name, value in (("PSLR", cut.pslr_db), ("ISLR", cut.islr_db))
+        if np.isfinite(value)
+    ]
+    axes.text(0.98, 0.97, "\n".join(ratios), transform=axes.transAxes, ha="right", va="top", fontsize=7)
+
+
+def _crossings(cut: DrawnCut) -> tuple[float, float]:
+    """Return where the main lobe has fallen to half its power on both sides, metres from the peak."""
+    middle, half = cut.power.size // 2, cut.power[cut.power.size // 2] / 2
+    sides = []
+    for side in (-1, 1):
+        below = np.flatnonzero(cut.power[middle::side] < half)
+        sides.append(float(cut.along_m[middle + side * int(below[0])]) if below.size else float(cut.along_m[middle]))
+    return sides[0], sides[1]
+
+
+_LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
+_LABELS = {"loss_db": "peak lost, dB", "shift_m": "targets shifted, m", "phase_rad": "phase of the image, rad"}
+_STYLES: Mapping[bool, Any] = {
+    True: {"color": BLUE, "label": "stated or measured"},
+    False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is measured at an image's bright points.
+
+    Attributes
+    ----------
+    loss_db, std_db
+        Lost of their peak, negative, and its standard deviation; None where no point is bright enough.
+    expected_db
+        What the budget expects to be lost; None where nothing is stated.
+    """
+
+    loss_db: float | None = None
+    std_db: float | None = None
+    expected_db: float | None = None
+
+
+def draw_budget(
+    path: Path, lines: Sequence[Mapping[str, Any]], measured: Measured, *, title: str, tags: Mapping[str, str]
+) -> None:
+    """Draw what each cause is expected to cost as a PNG; what is not stated is hatched and does not count.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    lines
+        Of the budget in image.json: cause, stated, loss_db, shift_m, phase_rad, None where a cause does not do that.
+    measured
+        At the bright points of the image.
+    title
+        Flight and pair.
+    tags
+        Provenance; lies in the file.
+    """
+    with sheet(path, 1.5 + 0.21 * max(4, len(lines)), title=title, tags=tags) as figure:
+        grid = GridSpec(1, 3, figure=figure, width_ratios=(1.4, 1, 1))
+        for place, measure in enumerate(_LABELS):
+            axes = figure.add_subplot(grid[place])
+            _draw_causes(axes, lines, measure)
+            axes.tick_params(labelleft=place == 0)
+            if measure == "loss_db":
+                _draw_measured(axes, measured)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+
+
+def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
+    least, places = _LEAST[measure], np.arange(len(lines))
+    sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
+    highest = max([10 * least, *sizes])
+    for stated, style in _STYLES.items():
+        some = [place for place, line in enumerate(lines) if is_stated(line) == stated and sizes[place] > least]
+        axes.barh(some, [sizes[place] for place in some], height=0.62, **style)
+    for place, (size, line) in enumerate(zip(sizes, lines, strict=True)):
+        if size <= least:
+            words = "does not apply" if line[measure] is None else f"below {least:g}"
+            axes.text(1.2 * least, place, words, va="center", fontsize=6, color=GREY)
+    axes.set_yticks(places, [line["cause"] for line in lines])
+    axes.set(xscale="log", xlim=(least, 2 * highest), ylim=(len(lines) - 0.4, -0.6), xlabel=_LABELS[measure])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(LogLocator(numticks=5))
+    axes.grid(visible=False, axis="y")
+
+
+def _draw_measured(axes: Axes, measured: Measured) -> None:
+    if measured.expected_db is not None:
+        expected = max(abs(measured.expected_db), _LEAST["loss_db"])
+        axes.axvline(expected, color=BLUE, linestyle=":", label="expected, all stated")
+    if measured.loss_db is not None:
+        loss = max(abs(measured.loss_db), _LEAST["loss_db"])
+        axes.axvline(loss, color=RED, linewidth=1.4, label="measured at bright points")
+        if measured.std_db:
+            axes.axvspan(max(loss - measured.std_db, _LEAST["loss_db"]), loss + measured.std_db, color=RED, alpha=0.15)
+
+
+_RANGE_DB = 40.0
+_COLUMNS = 2
+
+
+def draw_panels(
+    path: Path,
+    powers: Mapping[str, NDArray[np.float64]],
+    *,
+    size_m: tuple[float, float],
+    target_m: tuple[float, float],
+    title: str,
+    tags: Mapping[str, str],
+) -> None:
+    """Draw images of one scene as a PNG, each in dB below its own peak, all over the same range of dB.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    powers
+        What a panel is called → (row, column) float64 mean power, north-up, NaN where nothing was formed.
+    size_m
+        Of the scene, east and north, metres.
+    target_m
+        Brightest target, metres east and north of the lower left corner.
+    title
+        Of the flight.
+    tags
+        Provenance; lies in the file.
+    """
+    rows = -(-len(powers) // _COLUMNS)
+    high = 2.75 * min(1.6, max(0.45, size_m[1] / size_m[0]))
+    with sheet(path, 0.5 + rows * (high + 0.45), title=title, tags=tags) as figure:
+        grid = GridSpec(rows, _COLUMNS, figure=figure)
+        drawn = []
+        for place, (name, power) in enumerate(powers.items()):
+            axes = figure.add_subplot(grid[place // _COLUMNS, place % _COLUMNS])
+            drawn.append((axes, _draw_panel(axes, power, size_m)))
+            axes.set_title(f"({'abcdefgh'[place % 8]}) {name}")
+            axes.plot(*target_m, "o", markersize=10, markerfacecolor="none", markeredgecolor=SKY, markeredgewidth=1.2)
+            if place % _COLUMNS == 0:
+                axes.set_ylabel("north, m")
+            if place >= len(powers) - _COLUMNS:
+                axes.set_xlabel("east, m")
+        _draw_scale(drawn[0][0], size_m)
+        bar = figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], extend="both", shrink=0.8, pad=0.02)
+        bar.set_label("power re peak of the panel, dB")
+
+
+def _draw_panel(axes: Axes, power: NDArray[np.float64], size_m: tuple[float, float]) -> AxesImage:
+    decibel, _ = below_peak(power)
+    axes.grid(visible=False)
+    axes.set_facecolor("white")
+    return axes.imshow(
+        np.ma.masked_invalid(decibel),
+        extent=(0, size_m[0], 0, size_m[1]),
+        cmap="inferno",
+        vmin=-_RANGE_DB,
+        vmax=0,
+        interpolation="nearest",
+    )
+
+
+def _draw_scale(axes: Axes, size_m: tuple[float, float]) -> None:
+    metres = round_length(size_m[0] / 4)
+    axes.add_patch(
+        Rectangle((0.05 * size_m[0], 0.05 * size_m[1]), metres, 0.015 * size_m[1], facecolor="white", edgecolor=GREY)
+    )
+    at = 0.05 * size_m[0] + metres / 2, 0.085 * size_m[1]
+    axes.text(*at, f"{number(metres)} m", color="white", ha="center", fontsize=7)
+    arrow = {"arrowstyle": "-|>", "color": "white"}
+    axes.annotate("", (0.94, 0.19), (0.94, 0.05), xycoords="axes fraction", arrowprops=arrow)
+    axes.text(0.94, 0.2, "N", transform=axes.transAxes, color="white", ha="center", weight="bold")

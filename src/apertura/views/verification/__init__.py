@@ -1,1 +1,0 @@
-"""Products held against what they claim to be made from: their chain to the raw samples, made again, told apart."""
