@@ -9,7 +9,7 @@ from apertura.common.errors import shown
 from apertura.common.flags import FLAGS
 from apertura.formats.export import MAP
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import INTERFEROMETRY
+from apertura.pipeline.rules import INTERFEROMETRY
 from apertura.pipeline.store import open_listed
 
 if TYPE_CHECKING:

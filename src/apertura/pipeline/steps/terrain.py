@@ -1,6 +1,5 @@
 """Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.scene.dem import height_range
 from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.ground import Ground
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
@@ -38,7 +38,7 @@ def terrain(campaign: Campaign) -> Path:
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = resume(wip, _empty(campaign, scene, ground, lineage.modules), "height", windows)
+        missing = resume(wip, _empty(scene, ground, lineage), "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
@@ -55,7 +55,7 @@ def terrain(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(campaign: Campaign, scene: OpenScene, ground: Ground, modules: Sequence[str]) -> xr.Dataset:
+def _empty(scene: OpenScene, ground: Ground, lineage: Lineage) -> xr.Dataset:
     """Return the stamped stage without its heights."""
     return stamped(
         xr.Dataset(
@@ -64,7 +64,7 @@ def _empty(campaign: Campaign, scene: OpenScene, ground: Ground, modules: Sequen
             attrs={"frame": scene.grid.frame, "terrain": {}},
         ),
         "terrain",
-        modules=modules,
-        settings={**campaign.relevant("terrain"), **scene.spec},
+        modules=lineage.modules,
+        settings={**lineage.result.settings, **scene.spec},
         inputs=ground.inputs,
     )

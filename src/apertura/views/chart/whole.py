@@ -18,8 +18,8 @@ from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, SampledWaveform
-from apertura.pipeline.lineage import STUDY, result_of
-from apertura.pipeline.lineage.inputs import with_inputs
+from apertura.pipeline.lineage import result_of, with_inputs
+from apertura.pipeline.rules import STUDY
 from apertura.pipeline.steps import (
     assess,
     calibration,
