@@ -15,6 +15,7 @@ from apertura.common import documents
 from apertura.common.errors import CampaignError
 from apertura.pipeline.config import Processing, Scene, Settings, validated
 from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template, flights_template
+from apertura.pipeline.lineage import result_of
 from apertura.views.cli import app
 
 ROOT = Path(__file__).parents[1]
@@ -111,11 +112,15 @@ def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
 def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
     """A step that depended on the complete config would rerun for nothing."""
     everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}
-    for stage in ("echo", "profile", "image", "scene"):
-        assert set(finished_tiny.relevant(stage, "uav1-uav2")) < everything
-    assert not {"window", "sidelink"} & finished_tiny.relevant("image").keys()
-    assert set(finished_tiny.relevant("echo", "uav1-uav1")["nodes"]) == {"uav1"}
-    assert "window" not in finished_tiny.relevant("echo", "uav1-uav1")
+    of = {"scene": ()}
+    stages = {
+        stage: result_of(finished_tiny, stage, *of.get(stage, ("f01", "uav1-uav1"))).settings
+        for stage in ("echo", "profile", "image", "scene")
+    }
+    assert all(set(settings) < everything for settings in stages.values())
+    assert not {"window", "sidelink"} & stages["image"].keys()
+    assert set(stages["echo"]["nodes"]) == {"uav1"}
+    assert "window" not in stages["echo"]
 
 
 def test_a_layer_that_sees_no_settings_names_no_config_file():

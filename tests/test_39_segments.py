@@ -7,6 +7,7 @@ import pytest
 from folders import ingest_all
 
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.steps import echo
 from apertura.pipeline.store import open_stage
@@ -55,14 +56,14 @@ def test_the_plan_before_the_echo_counts_the_pulses_inside(cut):
 
 
 def test_only_the_rows_of_a_pair_matter_to_its_echo(cut, tiny):
-    own, other = (cut.relevant("echo", pair, flight="f01") for pair in ("uav1-uav1", "uav1-uav2"))
+    own, other = (result_of(cut, "echo", "f01", pair).settings for pair in ("uav1-uav1", "uav1-uav2"))
     assert own["segments"][0] == ["2025-05-14T09:29:00", "2025-05-14T09:30:00.510000"]
     assert own["segments"][1][0] == "2025-05-14T09:30:01.840000"
     assert "segments" not in other
     (tiny / "config" / "segments.tsv").unlink()
     whole = Campaign.load(tiny)
-    assert whole.relevant("echo", "uav1-uav2", flight="f01") == other
-    assert whole.relevant("echo", "uav1-uav1", flight="f01") != own
+    assert result_of(whole, "echo", "f01", "uav1-uav2").settings == other
+    assert result_of(whole, "echo", "f01", "uav1-uav1").settings != own
 
 
 def test_a_simulation_writes_the_segments_of_its_specification(tmp_path):

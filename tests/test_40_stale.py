@@ -14,8 +14,8 @@ from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.pipeline.digests import Sources, digest_of
-from apertura.pipeline.lineage import ON_DEMAND, results_of
-from apertura.pipeline.lineage.code import modules_of
+from apertura.pipeline.lineage import modules_of, results_of
+from apertura.pipeline.rules import RESULTS
 from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
@@ -54,7 +54,7 @@ def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_t
     results = list(results_of(finished_tiny))
     assert len(results) == 22 + 4 + 6
     for name, result in results:
-        if name in ON_DEMAND:
+        if RESULTS[name].on_demand:
             continue
         recorded = json.loads((finished_tiny.root / result.manifest).read_text())
         assert set(recorded) == {"files", "sources", "settings", "code"}

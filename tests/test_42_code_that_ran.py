@@ -9,7 +9,8 @@ import pytest
 from apertura.common.code_imports import PACKAGE, WITHOUT_EFFECT, import_closure
 from apertura.common.provenance import code_sha256
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import RESULTS, places_of, result_of
+from apertura.pipeline.lineage import places_of, result_of
+from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.steps import (
     assess,
     calibration,
@@ -116,7 +117,7 @@ CHANGES = [
     ("pipeline/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
     ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
-    ("pipeline/lineage/products.py", "code", set()),  # sources and settings are compared for themselves
+    ("pipeline/rules.py", "code", set()),  # sources and settings are compared for themselves
     ("core/focus/engines/numba.py", "comment", set()),
     ("core/focus/engines/numba.py", "code", FOCUSED),
     ("common/constants.py", "code", EVERY),

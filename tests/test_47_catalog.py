@@ -18,8 +18,8 @@ from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import RESULTS, on_demand, places_of, result_of, results_of
-from apertura.pipeline.steps.jobs import job_of
+from apertura.pipeline.lineage import on_demand, places_of, result_of, results_of
+from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.steps.ro_crate import ro_crate
 from apertura.pipeline.steps.stac import stac
 from apertura.pipeline.store import read_manifest
@@ -231,13 +231,11 @@ def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
     text = "\n".join(path.read_text() for path in (ROOT / "workflow" / "rules").glob("*.smk"))
     found = re.findall(r'(?s)\nrule (\w+):.*?shell:\s+"apertura (step [^"]+?)(?: --threads| >)', "\n" + text)
     rules = {rule: re.sub(r"{wildcards\.(\w+)}", r"\1", command) for rule, command in found}
-    kinds = {"raw": ("flight", "node"), "track": ("flight", "node"), "fused": ("flight",), "interferogram": ("two",)}
-    kinds |= dict.fromkeys(("calibration", "refined_track", "assessment", "page"), ("flight",))
     for name, where, _ in places_of(finished_tiny):
+        rule = RESULTS[name]
+        assert len(where) == len(rule.of.wildcards)
         if name not in {"speed_accuracy", "whole", "report"}:
-            job = job_of(name, kinds.get(name, ("flight", "pair")[: len(where)]))
-            assert job.command == f"apertura {rules[job.rule]}"
-    assert set(kinds) <= set(RESULTS)
+            assert rule.command_line(rule.of.wildcards) == f"apertura {rules[rule.name]}"
 
 
 def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):

@@ -11,6 +11,7 @@ from folders import complaint, copy_writable, edit_config, quality_of
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.formats.export.layers import OUTSIDE
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.lineage import result_of
 from apertura.pipeline.steps import echo, image, ingest, layers, profile, refine, scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation import (
@@ -222,11 +223,14 @@ def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_
 
 def test_only_the_image_depends_on_what_the_beam_is(beamed):
     wide, narrow, none = (stated(beamed, b) for b in (BEAM | {"beamwidth_deg": [30.0, 60.0]}, BEAM, None))
-    pair = "uav1-uav1"
-    assert wide.relevant("echo", pair) == narrow.relevant("echo", pair) != none.relevant("echo", pair)
-    assert wide.relevant("image", pair) != narrow.relevant("image", pair)
-    assert "antennas" not in none.relevant("image", pair)
-    assert "antennas" not in yaml.safe_dump(none.relevant("echo", pair))
+
+    def settings(campaign, stage):
+        return result_of(campaign, stage, "f01", "uav1-uav1").settings
+
+    assert settings(wide, "echo") == settings(narrow, "echo") != settings(none, "echo")
+    assert settings(wide, "image") != settings(narrow, "image")
+    assert "antennas" not in settings(none, "image")
+    assert "antennas" not in yaml.safe_dump(settings(none, "echo"))
 
 
 def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):

@@ -16,13 +16,11 @@ from apertura.common.errors import CampaignError
 from apertura.common.processes import hold, holder
 from apertura.common.progress import told_at
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.runs.expectation import Outlook, Told, expected_seconds
-from apertura.pipeline.runs.failure import failures
-from apertura.pipeline.runs.inventory import print_list, states
-from apertura.pipeline.runs.journal import Job, Reader, Run, note
-from apertura.pipeline.runs.removal import clean
-from apertura.pipeline.runs.screen import Bar, Screen, bars, table
-from apertura.pipeline.runs.status import print_status
+from apertura.pipeline.resources import Resources
+from apertura.pipeline.runs.journal import Job, Reader, Run, failures, note
+from apertura.pipeline.runs.outlook import Outlook, Told
+from apertura.pipeline.runs.results import clean, print_list, states
+from apertura.pipeline.runs.screen import Bar, Screen, bars, print_status, table
 
 PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}
 
@@ -97,6 +95,10 @@ def test_a_journal_of_a_stranger_is_only_data(journal, line):
 
 def test_names_of_a_stranger_reach_the_terminal_without_control_codes():
     assert Job("a", ("image", "\x1b[31mf01"), "", 0.0).name == r"image \x1b[31mf01"
+
+
+def expected_seconds(campaign, rule, *where):
+    return Resources(campaign).expected_seconds(rule, *where)
 
 
 def test_more_samples_and_more_pixels_take_longer(finished_tiny):

@@ -13,7 +13,8 @@ import pytest
 from folders import ROOT, copy_writable, edit_config
 
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.resources import DEMANDS, Resources
+from apertura.pipeline.resources import Resources
+from apertura.pipeline.rules import RULES
 
 BESIDE_MB = 2 * 135
 """Snakemake, which starts the job, and Snakemake again, which starts the step: measured."""
@@ -24,9 +25,9 @@ PAIR = SimpleNamespace(flight="f01", pair="uav1-uav2")
 def test_every_rule_has_a_row_and_quotes_it():
     rules = (path for path in (ROOT / "workflow" / "rules").glob("*.smk") if path.name != "study.smk")
     text = "\n".join(path.read_text() for path in rules)
-    assert set(re.findall(r"^rule (\w+):", text, re.MULTILINE)) == set(DEMANDS)
-    for what in ("threads: {}.threads", "mem_mb={}.mem_mb", "runtime={}.runtime"):
-        assert all(what.format(f'asked["{rule}"]') in text for rule in DEMANDS)
+    assert set(re.findall(r"^rule (\w+):", text, re.MULTILINE)) == set(RULES)
+    for what in ("threads: {}.threads", "mem_mb={}.mem_mb", "runtime={}.runtime", "{}.sources", "{}.settings"):
+        assert all(what.format(f'header["{rule}"]') in text for rule in RULES)
 
 
 def test_pulses_are_told_from_sizes_alone_and_no_fewer_than_there_are(finished_tiny):
@@ -97,7 +98,7 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
         assert math.isnan(used) or used * 1.048576 + BESIDE_MB <= predicted, (rule, used, predicted)
         assert predicted <= 4 * max(used, 1000), (rule, used, predicted)
         seen.add(rule)
-    assert seen == set(DEMANDS) - {"calibrate", "terrain", "cphd", "interferogram", "speed_accuracy", "whole_chart"}
+    assert seen == set(RULES) - {"calibrate", "terrain", "cphd", "interferogram", "speed_accuracy", "whole_chart"}
 
 
 def job_of(path):

@@ -1,22 +1,21 @@
 rule stac:
     input:
-        lambda wildcards: result_of(campaign, "stac").sources,
+        header["stac"].sources,
     output:
-        "results/stac/catalog.json",
-        "results/stac.manifest.json",
+        header["stac"].output,
     log:
-        "results/logs/stac.log",
+        header["stac"].log,
     benchmark:
-        "results/benchmarks/stac.tsv"
+        header["stac"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["stac"].threads
+    threads: header["stac"].threads
     resources:
-        mem_mb=asked["stac"].mem_mb,
-        runtime=asked["stac"].runtime,
+        mem_mb=header["stac"].mem_mb,
+        runtime=header["stac"].runtime,
     params:
-        settings=lambda wildcards: result_of(campaign, "stac").settings,
-        code=lambda _: result_of(campaign, "stac").code_sha256,
+        settings=header["stac"].settings,
+        code=header["stac"].code,
     message:
         "describing every image in a catalog"
     shell:
@@ -26,23 +25,22 @@ rule stac:
 # Last of all: it tells of every other result.
 rule ro_crate:
     input:
-        lambda wildcards: result_of(campaign, "ro_crate").sources,
+        header["ro_crate"].sources,
     output:
-        "results/ro-crate-metadata.json",
-        "results/ro_crate.manifest.json",
+        header["ro_crate"].output,
     log:
-        "results/logs/ro_crate.log",
+        header["ro_crate"].log,
     benchmark:
-        "results/benchmarks/ro_crate.tsv"
+        header["ro_crate"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["ro_crate"].threads
+    threads: header["ro_crate"].threads
     resources:
-        mem_mb=asked["ro_crate"].mem_mb,
-        runtime=asked["ro_crate"].runtime,
+        mem_mb=header["ro_crate"].mem_mb,
+        runtime=header["ro_crate"].runtime,
     params:
-        settings=lambda wildcards: result_of(campaign, "ro_crate").settings,
-        code=lambda _: result_of(campaign, "ro_crate").code_sha256,
+        settings=header["ro_crate"].settings,
+        code=header["ro_crate"].code,
     message:
         "telling the whole run as an RO-Crate"
     shell:

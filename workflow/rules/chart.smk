@@ -1,27 +1,25 @@
 rule speed_accuracy:
     input:
-        lambda wildcards: result_of(campaign, "speed_accuracy").sources,
+        header["speed_accuracy"].sources,
     output:
-        "results/study/speed_accuracy.csv",
-        report(
-            "results/study/speed_accuracy.png",
-            caption="../report/speed_accuracy.rst",
-            category="study",
-        ),
-        "results/study/speed_accuracy.html",
-        "results/study/speed_accuracy.manifest.json",
+        [
+            report(file, caption="../report/speed_accuracy.rst", category="study")
+            for file in header["speed_accuracy"].pictured
+        ],
+        header["speed_accuracy"].output,
     log:
-        "results/logs/study/speed_accuracy.log",
+        header["speed_accuracy"].log,
     benchmark:
-        "results/benchmarks/study/speed_accuracy.tsv"
+        header["speed_accuracy"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["speed_accuracy"].threads
+    threads: header["speed_accuracy"].threads
     resources:
-        mem_mb=asked["speed_accuracy"].mem_mb,
-        runtime=asked["speed_accuracy"].runtime,
+        mem_mb=header["speed_accuracy"].mem_mb,
+        runtime=header["speed_accuracy"].runtime,
     params:
-        code=lambda _: result_of(campaign, "speed_accuracy").code_sha256,
+        settings=header["speed_accuracy"].settings,
+        code=header["speed_accuracy"].code,
         charted=" ".join(charted(campaign)),
     message:
         "timing and measuring every engine and setting"
@@ -32,24 +30,23 @@ rule speed_accuracy:
 # Everything from raw samples on, under several settings: works in results/study/whole, which it removes.
 rule whole_chart:
     input:
-        lambda wildcards: result_of(campaign, "whole").sources,
+        header["whole_chart"].sources,
     output:
-        "results/study/whole.csv",
-        report("results/study/whole.png", caption="../report/whole.rst", category="study"),
-        "results/study/whole.manifest.json",
+        [report(file, caption="../report/whole.rst", category="study") for file in header["whole_chart"].pictured],
+        header["whole_chart"].output,
     log:
-        "results/logs/study/whole.log",
+        header["whole_chart"].log,
     benchmark:
-        "results/benchmarks/study/whole.tsv"
+        header["whole_chart"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["whole_chart"].threads
+    threads: header["whole_chart"].threads
     resources:
-        mem_mb=asked["whole_chart"].mem_mb,
-        runtime=asked["whole_chart"].runtime,
+        mem_mb=header["whole_chart"].mem_mb,
+        runtime=header["whole_chart"].runtime,
     params:
-        settings=lambda _: campaign.values,
-        code=lambda _: result_of(campaign, "whole").code_sha256,
+        settings=header["whole_chart"].settings,
+        code=header["whole_chart"].code,
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"
     shell:

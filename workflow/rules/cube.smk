@@ -1,20 +1,21 @@
 rule cube:
     input:
-        lambda wildcards: result_of(campaign, "cube").sources,
+        header["cube"].sources,
     output:
-        "results/cube.manifest.json",
+        header["cube"].output,
     log:
-        "results/logs/cube.log",
+        header["cube"].log,
     benchmark:
-        "results/benchmarks/cube.tsv"
+        header["cube"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["cube"].threads
+    threads: header["cube"].threads
     resources:
-        mem_mb=asked["cube"].mem_mb,
-        runtime=asked["cube"].runtime,
+        mem_mb=header["cube"].mem_mb,
+        runtime=header["cube"].runtime,
     params:
-        code=lambda _: result_of(campaign, "cube").code_sha256,
+        settings=header["cube"].settings,
+        code=header["cube"].code,
     message:
         "stacking and adding up every image"
     shell:

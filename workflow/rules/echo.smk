@@ -1,21 +1,21 @@
 rule echo:
     input:
-        lambda wildcards: result_of(campaign, "echo", wildcards.flight, wildcards.pair).sources,
+        header["echo"].sources,
     output:
-        "results/{flight}/{pair}/echo.manifest.json",
+        header["echo"].output,
     log:
-        "results/logs/{flight}/{pair}.echo.log",
+        header["echo"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.echo.tsv"
+        header["echo"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["echo"].threads
+    threads: header["echo"].threads
     resources:
-        mem_mb=asked["echo"].mem_mb,
-        runtime=asked["echo"].runtime,
+        mem_mb=header["echo"].mem_mb,
+        runtime=header["echo"].runtime,
     params:
-        settings=lambda wildcards: campaign.relevant("echo", wildcards.pair, flight=wildcards.flight),
-        code=lambda wildcards: result_of(campaign, "echo", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["echo"].settings,
+        code=header["echo"].code,
     message:
         "{wildcards.flight}: calibrating {wildcards.pair}"
     shell:
@@ -24,23 +24,22 @@ rule echo:
 
 rule calibrate:
     input:
-        lambda wildcards: result_of(campaign, "calibration", wildcards.flight).sources,
+        header["calibrate"].sources,
     output:
-        "results/{flight}/calibration.json",
-        "results/{flight}/calibration.manifest.json",
+        header["calibrate"].output,
     log:
-        "results/logs/{flight}/calibrate.log",
+        header["calibrate"].log,
     benchmark:
-        "results/benchmarks/{flight}/calibrate.tsv"
+        header["calibrate"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["calibrate"].threads
+    threads: header["calibrate"].threads
     resources:
-        mem_mb=asked["calibrate"].mem_mb,
-        runtime=asked["calibrate"].runtime,
+        mem_mb=header["calibrate"].mem_mb,
+        runtime=header["calibrate"].runtime,
     params:
-        settings=lambda _: campaign.relevant("calibration"),
-        code=lambda wildcards: result_of(campaign, "calibration", wildcards.flight).code_sha256,
+        settings=header["calibrate"].settings,
+        code=header["calibrate"].code,
     message:
         "{wildcards.flight}: estimating path offsets from the reflector"
     shell:
@@ -49,22 +48,22 @@ rule calibrate:
 
 rule profile:
     input:
-        lambda wildcards: result_of(campaign, "profile", wildcards.flight, wildcards.pair).sources,
+        header["profile"].sources,
     output:
-        "results/{flight}/{pair}/profile.manifest.json",
+        header["profile"].output,
     log:
-        "results/logs/{flight}/{pair}.profile.log",
+        header["profile"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.profile.tsv"
+        header["profile"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["profile"].threads
+    threads: header["profile"].threads
     resources:
-        mem_mb=asked["profile"].mem_mb,
-        runtime=asked["profile"].runtime,
+        mem_mb=header["profile"].mem_mb,
+        runtime=header["profile"].runtime,
     params:
-        settings=lambda wildcards: campaign.relevant("profile", wildcards.pair),
-        code=lambda wildcards: result_of(campaign, "profile", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["profile"].settings,
+        code=header["profile"].code,
     message:
         "{wildcards.flight}: compressing {wildcards.pair} in range"
     shell:

@@ -1,34 +1,31 @@
 # A row of `apertura.formats.export.EXPORTS` is all that a product needs: the outputs follow from it.
 rule export:
     input:
-        lambda wildcards: result_of(campaign, "export", wildcards.flight, wildcards.pair).sources,
+        header["export"].sources,
     output:
-        [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("pair") if not export.pictured],
         [
             report(
-                f"results/{{flight}}/{{pair}}/{export.file}",
+                file,
                 caption="../report/quicklook.rst",
                 category="{flight}",
                 labels={"image": "{pair}", "shows": "image"},
             )
-            for export in exports_in("pair")
-            if export.pictured
+            for file in header["export"].pictured
         ],
-        "results/{flight}/{pair}/image.json",
-        "results/{flight}/{pair}/export.manifest.json",
+        header["export"].output,
     log:
-        "results/logs/{flight}/{pair}.export.log",
+        header["export"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.export.tsv"
+        header["export"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["export"].threads
+    threads: header["export"].threads
     resources:
-        mem_mb=asked["export"].mem_mb,
-        runtime=asked["export"].runtime,
+        mem_mb=header["export"].mem_mb,
+        runtime=header["export"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda wildcards: result_of(campaign, "export", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["export"].settings,
+        code=header["export"].code,
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
@@ -38,23 +35,22 @@ rule export:
 # As large as the echo: made where somebody asks for it, by its name or by rule phase_history.
 rule cphd:
     input:
-        lambda wildcards: result_of(campaign, "cphd", wildcards.flight, wildcards.pair).sources,
+        header["cphd"].sources,
     output:
-        f"results/{{flight}}/{{pair}}/{PHASE_HISTORY}",
-        "results/{flight}/{pair}/cphd.manifest.json",
+        header["cphd"].output,
     log:
-        "results/logs/{flight}/{pair}.cphd.log",
+        header["cphd"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.cphd.tsv"
+        header["cphd"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["cphd"].threads
+    threads: header["cphd"].threads
     resources:
-        mem_mb=asked["cphd"].mem_mb,
-        runtime=asked["cphd"].runtime,
+        mem_mb=header["cphd"].mem_mb,
+        runtime=header["cphd"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda wildcards: result_of(campaign, "cphd", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["cphd"].settings,
+        code=header["cphd"].code,
     message:
         "{wildcards.flight}: writing the phase history of {wildcards.pair}"
     shell:
@@ -63,34 +59,31 @@ rule cphd:
 
 rule export_fused:
     input:
-        lambda wildcards: result_of(campaign, "fused", wildcards.flight).sources,
+        header["export_fused"].sources,
     output:
-        [f"results/{{flight}}/fused/{export.file}" for export in exports_in("fused") if not export.pictured],
         [
             report(
-                f"results/{{flight}}/fused/{export.file}",
+                file,
                 caption="../report/quicklook.rst",
                 category="{flight}",
                 labels={"image": "fused", "shows": "image"},
             )
-            for export in exports_in("fused")
-            if export.pictured
+            for file in header["export_fused"].pictured
         ],
-        "results/{flight}/fused/image.json",
-        "results/{flight}/fused/export.manifest.json",
+        header["export_fused"].output,
     log:
-        "results/logs/{flight}/fused.export.log",
+        header["export_fused"].log,
     benchmark:
-        "results/benchmarks/{flight}/fused.export.tsv"
+        header["export_fused"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["export_fused"].threads
+    threads: header["export_fused"].threads
     resources:
-        mem_mb=asked["export_fused"].mem_mb,
-        runtime=asked["export_fused"].runtime,
+        mem_mb=header["export_fused"].mem_mb,
+        runtime=header["export_fused"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda wildcards: result_of(campaign, "fused", wildcards.flight).code_sha256,
+        settings=header["export_fused"].settings,
+        code=header["export_fused"].code,
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:
@@ -99,24 +92,23 @@ rule export_fused:
 
 rule coverage:
     input:
-        lambda wildcards: result_of(campaign, "coverage").sources,
+        header["coverage"].sources,
     output:
-        report("results/coverage.png", caption="../report/coverage.rst", category="campaign"),
-        "results/coverage.geojson",
-        "results/coverage.manifest.json",
+        [report(file, caption="../report/coverage.rst", category="campaign") for file in header["coverage"].pictured],
+        header["coverage"].output,
     log:
-        "results/logs/coverage.log",
+        header["coverage"].log,
     benchmark:
-        "results/benchmarks/coverage.tsv"
+        header["coverage"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["coverage"].threads
+    threads: header["coverage"].threads
     resources:
-        mem_mb=asked["coverage"].mem_mb,
-        runtime=asked["coverage"].runtime,
+        mem_mb=header["coverage"].mem_mb,
+        runtime=header["coverage"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda _: result_of(campaign, "coverage").code_sha256,
+        settings=header["coverage"].settings,
+        code=header["coverage"].code,
     message:
         "drawing what the flights cover"
     shell:
@@ -125,23 +117,23 @@ rule coverage:
 
 rule mosaic:
     input:
-        lambda wildcards: result_of(campaign, "mosaic").sources,
+        header["mosaic"].sources,
     output:
         [f"results/{file}" for file in mosaic_files({one.name: one.pairs for one in campaign.image_flights})],
-        "results/mosaic/mosaic.manifest.json",
+        header["mosaic"].output,
     log:
-        "results/logs/mosaic.log",
+        header["mosaic"].log,
     benchmark:
-        "results/benchmarks/mosaic.tsv"
+        header["mosaic"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["mosaic"].threads
+    threads: header["mosaic"].threads
     resources:
-        mem_mb=asked["mosaic"].mem_mb,
-        runtime=asked["mosaic"].runtime,
+        mem_mb=header["mosaic"].mem_mb,
+        runtime=header["mosaic"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda _: result_of(campaign, "mosaic").code_sha256,
+        settings=header["mosaic"].settings,
+        code=header["mosaic"].code,
     message:
         "laying the files of all flights upon one another"
     shell:
@@ -150,23 +142,22 @@ rule mosaic:
 
 rule map:
     input:
-        lambda wildcards: result_of(campaign, "map").sources,
+        header["map"].sources,
     output:
-        f"results/{MAP}",
-        "results/map/map.manifest.json",
+        header["map"].output,
     log:
-        "results/logs/map.log",
+        header["map"].log,
     benchmark:
-        "results/benchmarks/map.tsv"
+        header["map"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["map"].threads
+    threads: header["map"].threads
     resources:
-        mem_mb=asked["map"].mem_mb,
-        runtime=asked["map"].runtime,
+        mem_mb=header["map"].mem_mb,
+        runtime=header["map"].runtime,
     params:
-        settings=lambda _: result_of(campaign, "map").settings,
-        code=lambda _: result_of(campaign, "map").code_sha256,
+        settings=header["map"].settings,
+        code=header["map"].code,
     message:
         "making the map"
     shell:

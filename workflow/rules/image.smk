@@ -5,23 +5,22 @@ scattergather:
 
 rule scene:
     input:
-        lambda wildcards: result_of(campaign, "scene").sources,
+        header["scene"].sources,
     output:
-        "results/scene.json",
-        "results/scene.manifest.json",
+        header["scene"].output,
     log:
-        "results/logs/scene.log",
+        header["scene"].log,
     benchmark:
-        "results/benchmarks/scene.tsv"
+        header["scene"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["scene"].threads
+    threads: header["scene"].threads
     resources:
-        mem_mb=asked["scene"].mem_mb,
-        runtime=asked["scene"].runtime,
+        mem_mb=header["scene"].mem_mb,
+        runtime=header["scene"].runtime,
     params:
-        settings=lambda _: result_of(campaign, "scene").settings,
-        code=lambda _: result_of(campaign, "scene").code_sha256,
+        settings=header["scene"].settings,
+        code=header["scene"].code,
     message:
         "settling the campaign's grid"
     shell:
@@ -30,22 +29,22 @@ rule scene:
 
 rule terrain:
     input:
-        lambda wildcards: result_of(campaign, "terrain").sources,
+        header["terrain"].sources,
     output:
-        "results/terrain.manifest.json",
+        header["terrain"].output,
     log:
-        "results/logs/terrain.log",
+        header["terrain"].log,
     benchmark:
-        "results/benchmarks/terrain.tsv"
+        header["terrain"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["terrain"].threads
+    threads: header["terrain"].threads
     resources:
-        mem_mb=asked["terrain"].mem_mb,
-        runtime=asked["terrain"].runtime,
+        mem_mb=header["terrain"].mem_mb,
+        runtime=header["terrain"].runtime,
     params:
-        settings=lambda _: campaign.relevant("terrain"),
-        code=lambda _: result_of(campaign, "terrain").code_sha256,
+        settings=header["terrain"].settings,
+        code=header["terrain"].code,
     message:
         "bringing the DEM onto the campaign's grid"
     shell:
@@ -54,23 +53,22 @@ rule terrain:
 
 rule layers:
     input:
-        lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).sources,
+        header["layers"].sources,
     output:
-        [f"results/{{flight}}/{{pair}}/{export.file}" for export in exports_in("layers")],
-        "results/{flight}/{pair}/layers.manifest.json",
+        header["layers"].output,
     log:
-        "results/logs/{flight}/{pair}.layers.log",
+        header["layers"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.layers.tsv"
+        header["layers"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["layers"].threads
+    threads: header["layers"].threads
     resources:
-        mem_mb=asked["layers"].mem_mb,
-        runtime=asked["layers"].runtime,
+        mem_mb=header["layers"].mem_mb,
+        runtime=header["layers"].runtime,
     params:
-        settings=lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).settings,
-        code=lambda wildcards: result_of(campaign, "layers", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["layers"].settings,
+        code=header["layers"].code,
     message:
         "{wildcards.flight}: how {wildcards.pair} sees the scene"
     shell:
@@ -79,22 +77,22 @@ rule layers:
 
 rule refine:
     input:
-        lambda wildcards: result_of(campaign, "refined_track", wildcards.flight).sources,
+        header["refine"].sources,
     output:
-        "results/{flight}/refined_track.manifest.json",
+        header["refine"].output,
     log:
-        "results/logs/{flight}/refine.log",
+        header["refine"].log,
     benchmark:
-        "results/benchmarks/{flight}/refine.tsv"
+        header["refine"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["refine"].threads
+    threads: header["refine"].threads
     resources:
-        mem_mb=asked["refine"].mem_mb,
-        runtime=asked["refine"].runtime,
+        mem_mb=header["refine"].mem_mb,
+        runtime=header["refine"].runtime,
     params:
-        settings=lambda _: campaign.relevant("refined_track"),
-        code=lambda wildcards: result_of(campaign, "refined_track", wildcards.flight).code_sha256,
+        settings=header["refine"].settings,
+        code=header["refine"].code,
     message:
         "{wildcards.flight}: refining the tracks of its nodes where that pays"
     shell:
@@ -103,7 +101,7 @@ rule refine:
 
 rule tiles:
     input:
-        lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).sources,
+        header["tiles"].sources,
     output:
         temp("results/{flight}/{pair}/tiles/{scatteritem}.json"),
     log:
@@ -112,13 +110,13 @@ rule tiles:
         "results/benchmarks/{flight}/{pair}.tiles.{scatteritem}.tsv"
     conda:
         "../../environment.yml"
-    threads: asked["tiles"].threads
+    threads: header["tiles"].threads
     resources:
-        mem_mb=asked["tiles"].mem_mb,
-        runtime=asked["tiles"].runtime,
+        mem_mb=header["tiles"].mem_mb,
+        runtime=header["tiles"].runtime,
     params:
-        settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["tiles"].settings,
+        code=header["tiles"].code,
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -128,27 +126,27 @@ rule tiles:
 # One job alone forms the tiles and finishes the image; the shares of many are gathered.
 rule image:
     input:
-        lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).sources,
+        header["image"].sources,
         [
             share
             for share in gather.tiles("results/{{flight}}/{{pair}}/tiles/{scatteritem}.json")
             if "-of-1." not in share
         ],
     output:
-        "results/{flight}/{pair}/image.manifest.json",
+        header["image"].output,
     log:
-        "results/logs/{flight}/{pair}.image.log",
+        header["image"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.image.tsv"
+        header["image"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["image"].threads
+    threads: header["image"].threads
     resources:
-        mem_mb=asked["image"].mem_mb,
-        runtime=asked["image"].runtime,
+        mem_mb=header["image"].mem_mb,
+        runtime=header["image"].runtime,
     params:
-        settings=lambda wildcards: campaign.relevant("image", wildcards.pair),
-        code=lambda wildcards: result_of(campaign, "image", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["image"].settings,
+        code=header["image"].code,
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:
@@ -157,23 +155,22 @@ rule image:
 
 rule assess:
     input:
-        lambda wildcards: result_of(campaign, "assessment", wildcards.flight).sources,
+        header["assess"].sources,
     output:
-        "results/{flight}/assessment.json",
-        "results/{flight}/assessment.manifest.json",
+        header["assess"].output,
     log:
-        "results/logs/{flight}/assess.log",
+        header["assess"].log,
     benchmark:
-        "results/benchmarks/{flight}/assess.tsv"
+        header["assess"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["assess"].threads
+    threads: header["assess"].threads
     resources:
-        mem_mb=asked["assess"].mem_mb,
-        runtime=asked["assess"].runtime,
+        mem_mb=header["assess"].mem_mb,
+        runtime=header["assess"].runtime,
     params:
-        settings=lambda _: campaign.relevant("assess"),
-        code=lambda wildcards: result_of(campaign, "assessment", wildcards.flight).code_sha256,
+        settings=header["assess"].settings,
+        code=header["assess"].code,
     message:
         "{wildcards.flight}: comparing the images with each other"
     shell:

@@ -1,28 +1,21 @@
 rule ingest:
     input:
-        lambda wildcards: [
-            source
-            for stage in ("raw", "track")
-            for source in result_of(campaign, stage, wildcards.flight, wildcards.node).sources
-        ],
+        header["ingest"].sources,
     output:
-        "results/{flight}/{node}/raw.manifest.json",
-        "results/{flight}/{node}/track.manifest.json",
+        header["ingest"].output,
     log:
-        "results/logs/{flight}/{node}.ingest.log",
+        header["ingest"].log,
     benchmark:
-        "results/benchmarks/{flight}/{node}.ingest.tsv"
+        header["ingest"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["ingest"].threads
+    threads: header["ingest"].threads
     resources:
-        mem_mb=asked["ingest"].mem_mb,
-        runtime=asked["ingest"].runtime,
+        mem_mb=header["ingest"].mem_mb,
+        runtime=header["ingest"].runtime,
     params:
-        settings=lambda wildcards: campaign.relevant("raw") | campaign.log_settings(wildcards.node),
-        code=lambda wildcards: [
-            result_of(campaign, part, wildcards.flight, wildcards.node).code_sha256 for part in ("raw", "track")
-        ],
+        settings=header["ingest"].settings,
+        code=header["ingest"].code,
     message:
         "{wildcards.flight}: reading the recording and flight log of {wildcards.node}"
     shell:

@@ -1,37 +1,30 @@
 rule interferogram:
     input:
-        lambda wildcards: result_of(campaign, "interferogram", wildcards.two).sources,
+        header["interferogram"].sources,
     output:
         [
-            f"results/interferometry/{{two}}/{export.file}"
-            for export in exports_in("interferogram")
-            if not export.pictured
-        ],
-        [
             report(
-                f"results/interferometry/{{two}}/{export.file}",
+                file,
                 caption="../report/interferogram.rst",
                 category="interferometry",
                 labels={"image": "{two}"},
             )
-            for export in exports_in("interferogram")
-            if export.pictured
+            for file in header["interferogram"].pictured
         ],
-        "results/interferometry/{two}/interferogram.json",
-        "results/interferometry/{two}/interferogram.manifest.json",
+        header["interferogram"].output,
     log:
-        "results/logs/interferometry/{two}.interferogram.log",
+        header["interferogram"].log,
     benchmark:
-        "results/benchmarks/interferometry/{two}.interferogram.tsv"
+        header["interferogram"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["interferogram"].threads
+    threads: header["interferogram"].threads
     resources:
-        mem_mb=asked["interferogram"].mem_mb,
-        runtime=asked["interferogram"].runtime,
+        mem_mb=header["interferogram"].mem_mb,
+        runtime=header["interferogram"].runtime,
     params:
-        settings=lambda _: campaign.relevant("interferogram"),
-        code=lambda wildcards: result_of(campaign, "interferogram", wildcards.two).code_sha256,
+        settings=header["interferogram"].settings,
+        code=header["interferogram"].code,
     message:
         "{wildcards.two}: comparing two images in phase"
     shell:

@@ -1,7 +1,7 @@
 # What the report shows and says, made where somebody asks for it: `apertura report`, or rule pages.
 rule pictures:
     input:
-        lambda wildcards: result_of(campaign, "pictures", wildcards.flight, wildcards.pair).sources,
+        header["pictures"].sources,
     output:
         [
             report(
@@ -12,20 +12,20 @@ rule pictures:
             )
             for name in PICTURES
         ],
-        "results/{flight}/{pair}/pictures.manifest.json",
+        header["pictures"].output,
     log:
-        "results/logs/{flight}/{pair}.pictures.log",
+        header["pictures"].log,
     benchmark:
-        "results/benchmarks/{flight}/{pair}.pictures.tsv"
+        header["pictures"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["pictures"].threads
+    threads: header["pictures"].threads
     resources:
-        mem_mb=asked["pictures"].mem_mb,
-        runtime=asked["pictures"].runtime,
+        mem_mb=header["pictures"].mem_mb,
+        runtime=header["pictures"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda wildcards: result_of(campaign, "pictures", wildcards.flight, wildcards.pair).code_sha256,
+        settings=header["pictures"].settings,
+        code=header["pictures"].code,
     message:
         "{wildcards.flight}: drawing {wildcards.pair} for the report"
     shell:
@@ -34,7 +34,7 @@ rule pictures:
 
 rule page:
     input:
-        lambda wildcards: result_of(campaign, "page", wildcards.flight).sources,
+        header["page"].sources,
     output:
         report(
             f"results/{{flight}}/{PAGE}",
@@ -48,20 +48,20 @@ rule page:
             category="{flight}",
             labels={"image": "all", "shows": "pairs and their sums"},
         ),
-        "results/{flight}/page.manifest.json",
+        header["page"].output,
     log:
-        "results/logs/{flight}/page.log",
+        header["page"].log,
     benchmark:
-        "results/benchmarks/{flight}/page.tsv"
+        header["page"].benchmark
     conda:
         "../../environment.yml"
-    threads: asked["page"].threads
+    threads: header["page"].threads
     resources:
-        mem_mb=asked["page"].mem_mb,
-        runtime=asked["page"].runtime,
+        mem_mb=header["page"].mem_mb,
+        runtime=header["page"].runtime,
     params:
-        settings=lambda _: campaign.settings.campaign,
-        code=lambda wildcards: result_of(campaign, "page", wildcards.flight).code_sha256,
+        settings=header["page"].settings,
+        code=header["page"].code,
     message:
         "{wildcards.flight}: writing the page of the report"
     shell:

@@ -1,7 +1,7 @@
 """Names of recorders, flight logs and phase histories: which file is of which format, and which function reads it.
 
 Rows name their readers and import none: who asks what a file is called pays for no format, and the code hash of a
-result (`apertura.pipeline.lineage.code`) holds the readers of its own campaign alone. To add a format: one file with
+result (`apertura.pipeline.lineage`) holds the readers of its own campaign alone. To add a format: one file with
 its reader, one row here.
 """
 

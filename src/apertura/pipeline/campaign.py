@@ -1,7 +1,6 @@
 """A campaign folder as one value: its settings, its flights, and where everything in it lies."""
 
-from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -148,63 +147,6 @@ class Campaign(RawFolder):
     @cached_property
     def _clocks(self) -> dict[tuple[str, str], ClockRow]:
         return {(clock.flight, clock.node): clock for clock in self.clocks}
-
-    def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
-        """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
-        settings, processing = self.values, self.values["processing"]
-        beams = self.antennas(pair) if pair else {}
-        stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
-        antennas = {"antennas": stated} if stated else {}
-        chosen: dict[str, dict[str, Any]] = {
-            "echo": self._relevant_to_echo(flight, pair, beams),
-            "calibration": {"calibration": settings["calibration"], "crs": settings["scene"]["crs"]},
-            "raw": {"waveform": settings["waveform"], "false_alarms_per_s": processing["false_alarms_per_s"]},
-            "scene": {
-                "scene": {key: value for key, value in settings["scene"].items() if key != "reference_points"},
-            },
-            "terrain": {name: settings["scene"][name] for name in ("dem", "dem_datum", "geoid")},
-            "profile": {name: processing[name] for name in ("window", "integration")} | antennas,
-            "refined_track": {
-                **{key: processing[key] for key in ("autofocus", "autofocus_method")},
-                "reference_points": settings["scene"]["reference_points"],
-            },
-            "assess": {"fusion": processing["fusion"]},
-            "image": {
-                name: value
-                for name, value in processing.items()
-                if name not in {"window", "sidelink", "false_alarms_per_s", "fusion", "autofocus", "autofocus_method"}
-            }
-            | antennas,
-            "layers": {"integration": processing["integration"], **antennas},
-            "interferogram": {
-                "window_px": settings["interferometry"]["window_px"],
-                "reference_points": settings["scene"]["reference_points"],
-                "integration": processing["integration"],
-            },
-        }
-        return chosen.get(stage, {})
-
-    def _relevant_to_echo(self, flight: str, pair: str, beams: Collection[str]) -> dict[str, Any]:
-        """Return what matters for a pair's echo: whether there are beams, not what they are."""
-        settings = self.values
-        nodes = {
-            node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
-            for node in pair.split("-")
-            if node
-        }
-        stated = {
-            "beams": sorted(beams),
-            "segments": [list(segment) for segment in self.segments_of(flight, pair)],
-            "clocks": [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks],
-        }
-        asked = {key: settings["processing"][key] for key in ("sidelink", "accuracy_db")}
-        always = {"waveform": settings["waveform"], "nodes": nodes, **asked}
-        return always | {name: value for name, value in stated.items() if value}
-
-    def log_settings(self, node: str) -> dict[str, Any]:
-        """Return the settings that a node's log is read by, as JSON values."""
-        stated: dict[str, Any] = self.values["nodes"][node]["log"]
-        return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
 
     def flight(self, name: str) -> Flight:
         """Return the flight called `name`; raise CampaignError with the names there are if it is none of them."""

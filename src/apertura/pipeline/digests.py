@@ -151,7 +151,7 @@ class Result:
     settings
         What of the config matters to it.
     modules
-        Modules whose import closure is the code that makes it, as `apertura.pipeline.lineage.result_of` knows them.
+        Modules whose import closure is the code that makes it, as `apertura.pipeline.lineage.result_of` returns them.
     """
 
     manifest: str

@@ -1,11 +1,10 @@
-"""What a job of each rule asks of a cluster before it runs: memory, minutes, threads, by sizes of files and the config.
+"""What a job of each rule takes, by sizes of files and the config: of a cluster, and of time on this machine.
 
 Nothing here opens a recording: each job of a thousand flights is asked about while the workflow is put together.
 Estimates are from above; a job that was killed for want of memory or time asks for twice as much.
 """
 
 import math
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -16,9 +15,11 @@ from apertura.common.documents import DAMAGED, read_json
 from apertura.common.errors import CampaignError
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.rules import RULES, Cost, Demand
 
 _CAPTURE_BYTES = 64  # of a recording's metadata at least
 _UNKNOWN_PIXELS = 4096**2  # of a grid that is settled by the first flight
+_USUAL_MPX = 0.25  # of such a grid, as most are
 _AT_ONCE_PIXELS = 4096**2  # more are read and written by blocks
 _AT_ONCE_BYTES = 1_000_000_000  # of range profiles; more are formed by blocks of pulses
 _OVERSAMPLING = 2  # of range profiles
@@ -52,81 +53,6 @@ class Work:
     images: int = 1
 
 
-@dataclass(frozen=True)
-class Demand:
-    """What a job of one rule takes: a constant, and what grows with its work. One row a rule, from measured runs.
-
-    Attributes
-    ----------
-    base_mb
-        Resident memory whatever the work; what was measured on small work, and half as much again.
-    pulse_bytes, pixel_bytes, tile_bytes, image_bytes
-        Memory per pulse, per pixel in memory at once, per tile to be formed, and per image that is described.
-    profile_share
-        Memory per byte of range profiles in memory at once.
-    threads
-        As many as it can use.
-    recorded_s
-        Seconds per GB recorded.
-    pixel_s
-        Seconds per million pixels and image.
-    sum_s
-        Seconds of one thread per 1e9 pixels times pulses.
-    """
-
-    base_mb: float
-    pulse_bytes: float = 0.0
-    pixel_bytes: float = 0.0
-    tile_bytes: float = 0.0
-    image_bytes: float = 0.0
-    profile_share: float = 0.0
-    threads: int = 1
-    recorded_s: float = 0.0
-    pixel_s: float = 0.0
-    sum_s: float = 0.0
-
-
-_IMAGE = Demand(
-    900,
-    pulse_bytes=1000,
-    pixel_bytes=30,
-    tile_bytes=15_000,
-    profile_share=3.0,
-    threads=4,
-    recorded_s=30,
-    pixel_s=5,
-    sum_s=3,
-)
-
-DEMANDS: Mapping[str, Demand] = {
-    "ingest": Demand(250, pulse_bytes=100, recorded_s=60),
-    "echo": Demand(400, pulse_bytes=400, recorded_s=120),
-    "calibrate": Demand(500, pulse_bytes=1000, recorded_s=60),
-    "scene": Demand(400, pulse_bytes=500),
-    "terrain": Demand(500, pixel_bytes=50, pixel_s=10),
-    "layers": Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
-    "coverage": Demand(600, pulse_bytes=500, pixel_s=1),
-    "profile": Demand(500, pulse_bytes=500, recorded_s=120),
-    "refine": Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
-    "tiles": _IMAGE,
-    "image": _IMAGE,
-    "assess": Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
-    "cube": Demand(500, pixel_bytes=50, pixel_s=10),
-    "interferogram": Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
-    "cphd": Demand(500, pulse_bytes=500, recorded_s=120),
-    "export": Demand(500, pixel_bytes=50, pixel_s=30),
-    "export_fused": Demand(500, pixel_bytes=50, pixel_s=30),
-    "mosaic": Demand(500),
-    "stac": Demand(400, image_bytes=200_000),
-    "ro_crate": Demand(350, image_bytes=1_000_000),
-    "pictures": Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
-    "page": Demand(500, pixel_s=5),
-    "map": Demand(500, pixel_s=1),
-    "speed_accuracy": Demand(2000, profile_share=3.0, recorded_s=600),
-    "whole_chart": Demand(2000, profile_share=3.0, recorded_s=1200),
-}
-"""Rule → what its jobs take."""
-
 _BESIDE_MB = 300  # Snakemake, twice: a batch system counts them as the job's
 _LEAST_MINUTES = 10  # the start on a busy node, and a file system that is slow to answer
 _SLOWER = 3  # than the machine that the constants are from
@@ -148,7 +74,38 @@ class Resources:
 
     def __getitem__(self, rule: str) -> "RuleResources":
         """Return what the jobs of a rule ask for."""
-        return RuleResources(DEMANDS[rule], self)
+        demand = RULES[rule].demand
+        if demand is None:
+            raise LookupError(rule)
+        return RuleResources(demand, self)
+
+    def expected_seconds(self, rule: str, *where: str) -> float:
+        """Return what a job of a rule is expected to take on this machine, seconds.
+
+        Parameters
+        ----------
+        rule
+            The rule's name; any other counts as one that is soon done.
+        *where
+            Words of its job, first the values of its wildcards; what the campaign does not have counts for nothing.
+        """
+        row = RULES.get(rule)
+        cost = row.cost if row else Cost()
+        wildcards = row.of.wildcards if row else ()
+        counts = cost.mb_s or cost.mb_mpx_s
+        recorded_mb = self._recorded_mb(dict(zip(wildcards, where, strict=False))) if counts else 0.0
+        rows, columns = self._shape or (0, 0)
+        mpx = rows * columns / 1e6 if self._shape else _USUAL_MPX
+        return cost.begin_s + cost.mb_s * recorded_mb + cost.mpx_s * mpx + cost.mb_mpx_s * recorded_mb * mpx
+
+    def _recorded_mb(self, stated: dict[str, str]) -> float:
+        """Return how much was recorded by the nodes that a job names; 0 of what the campaign does not have."""
+        flight, pair, node = (stated.get(word) for word in ("flight", "pair", "node"))
+        named = [name for name in (node, *(pair or "").split("-")) if name]
+        known = flight in {each.name for each in self.campaign.flights} and {*named} <= {*self.campaign.settings.nodes}
+        with suppress(CampaignError, OSError):  # not there yet
+            return self.work(flight, pair, node).recorded_bytes / 1e6 if known else 0.0
+        return 0.0
 
     def work(self, flight: str | None, pair: str | None, node: str | None, jobs: int = 1) -> Work:
         """Return what a job works on: a node's recording, a pair, a flight, or all of them.
@@ -169,7 +126,7 @@ class Resources:
             nodes = [node for node in nodes if node in first.nodes]
         recorded = [self._recorded(first.name, name) for name in nodes]
         pulses = max((pulses for _, pulses in recorded), default=0)
-        rows, columns = self._shape
+        rows, columns = self._shape or (math.isqrt(_UNKNOWN_PIXELS), math.isqrt(_UNKNOWN_PIXELS))
         side = campaign.settings.processing.tile_px
         tiles = math.ceil(rows / side) * math.ceil(columns / side)
         return Work(
@@ -199,15 +156,15 @@ class Resources:
         )
 
     @cached_property
-    def _shape(self) -> tuple[int, int]:
-        """Rows and columns: as settled, as asked for, or of a large image where nobody knows yet."""
+    def _shape(self) -> tuple[int, int] | None:
+        """Rows and columns: as settled, or as the config says; None where nobody knows yet."""
         asked = self.campaign.settings.scene
         with suppress(CampaignError, LookupError, TypeError, ValueError):  # not there, or damaged
             settled = read_json(self.campaign.result("scene.json"), expected="a settled scene", remedy=DAMAGED)
             rows, columns = map(int, settled["grid"]["shape"])
             return rows, columns
         if asked.bounds_m == "auto" or asked.spacing_m == "auto":
-            return math.isqrt(_UNKNOWN_PIXELS), math.isqrt(_UNKNOWN_PIXELS)
+            return None
         xmin, ymin, xmax, ymax = asked.bounds_m
         return math.ceil((ymax - ymin) / asked.spacing_m), math.ceil((xmax - xmin) / asked.spacing_m)
 

@@ -24,9 +24,8 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
 from apertura.pipeline.check.stale import forms_results, stale_lines, stale_results
 from apertura.pipeline.lineage import on_demand
-from apertura.pipeline.runs.expectation import Outlook
-from apertura.pipeline.runs.failure import failures
-from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, Reader, note
+from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, Reader, failures, note
+from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
 
 Show = Literal["errors", "steps", "snakemake"]

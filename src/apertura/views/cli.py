@@ -16,7 +16,6 @@ from typer.core import TyperCommand
 from apertura import __version__
 from apertura.common.errors import CampaignError, explained
 from apertura.common.processes import INTERRUPTED, Interrupted, as_typed, ended_by_signals, given, leave_status
-from apertura.views import product_commands, raw_commands
 from apertura.views.step_commands import Threads
 from apertura.views.step_commands import app as step
 
@@ -27,15 +26,6 @@ app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders."
 app.add_typer(step, name="step")
 for _further in entry_points(group="apertura.commands"):  # of other distributions: research/ has `study`
     app.add_typer(_further.load(), name=_further.name)
-app.command()(raw_commands.inspect)
-app.command()(raw_commands.align)
-app.command()(product_commands.score)
-app.command()(product_commands.verify)
-app.command()(product_commands.reproduce)
-app.command()(product_commands.diff)
-app.command()(product_commands.check_crate)
-app.command()(product_commands.report)
-app.command("map")(product_commands.map_page)
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
@@ -121,6 +111,48 @@ def _options(
     pass
 
 
+@app.command()
+def inspect(
+    path: Annotated[Path, typer.Argument(help="a recording, a flight log, phase history, a DEM, a folder, a campaign")],
+    *,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="what a log cannot say of itself, as nodes.<n>.log does"),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+) -> None:
+    """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
+    picture = None if plot is None else given(plot)
+    from apertura.views.inspect.look import inspect_path
+
+    raise typer.Exit(inspect_path(given(path), settings or (), name=path, plot=picture, as_json=as_json))
+
+
+@app.command()
+def align(
+    campaign: CampaignFolder,
+    flight: Annotated[str, typer.Argument(help="flight")],
+    node: Annotated[str, typer.Argument(help="node that sends and receives")],
+    *,
+    point: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="reflector: easting, northing in scene.crs, ellipsoidal height (z in a local frame), m"),
+    ] = None,
+    search_s: Annotated[float | None, typer.Option(min=0, help="how far the clock may be off, s")] = None,
+    search_m: Annotated[float, typer.Option(min=0, help="how long the path may be, m of total path")] = 10.0,
+    drift: Annotated[bool, typer.Option("--drift", help="find by how much the clock runs slow, too")] = False,
+    keep_path: Annotated[bool, typer.Option("--keep-path", help="the path is as the config says")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
+) -> None:
+    """Find the clock and the range of a recorder against its flight log: where echoes add up best."""
+    opened = _opened(campaign)
+    from apertura.pipeline.steps.align import print_alignment
+
+    asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}
+    print_alignment(opened, flight, node, write=write, **asked)
+
+
 @app.command(cls=_PassesOn, context_settings=PASS_ON)
 def run(
     context: typer.Context,
@@ -149,7 +181,7 @@ def run(
 def status(campaign: CampaignFolder = HERE) -> None:
     """Tell what a run does, from another terminal: steps done, under way and left, time left, the last error."""
     opened = _opened(campaign)
-    from apertura.pipeline.runs.status import print_status
+    from apertura.pipeline.runs.screen import print_status
 
     print_status(opened)
 
@@ -158,7 +190,7 @@ def status(campaign: CampaignFolder = HERE) -> None:
 def list_results(campaign: CampaignFolder = HERE) -> None:
     """List flights and pairs, and which of their results are finished, stale or missing, with their sizes."""
     opened = _opened(campaign)
-    from apertura.pipeline.runs.inventory import print_list
+    from apertura.pipeline.runs.results import print_list
 
     print_list(opened)
 
@@ -171,7 +203,7 @@ def clean(
 ) -> None:
     """Remove what the workflow has made, and nothing else; not while a run holds the campaign."""
     opened = _opened(campaign)
-    from apertura.pipeline.runs.removal import clean as remove_results
+    from apertura.pipeline.runs.results import clean as remove_results
 
     remove_results(opened, unfinished_only=wip, agreed=yes)
 
@@ -215,6 +247,110 @@ def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = 
     from apertura.views.summary import print_summary
 
     print_summary(opened)
+
+
+@app.command()
+def score(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
+) -> None:
+    """Compare where point targets are found with where they were put, and print the products' paths."""
+    opened = _opened(campaign)
+    from apertura.views.score import print_findings
+
+    print_findings(opened, paths=paths)
+
+
+@app.command()
+def verify(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    campaign: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
+) -> None:
+    """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    there = None if campaign is None else given(campaign)
+    from apertura.views.verify.chain import print_verified
+
+    raise typer.Exit(print_verified(given(product), there, quiet=quiet))
+
+
+@app.command()
+def reproduce(
+    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    *,
+    cores: Cores = ALL_CORES,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="a new folder to make it in, which stays; else in TMPDIR")
+    ] = None,
+) -> None:
+    """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
+    kept = None if keep is None else given(keep)
+    from apertura.views.verify.reproduce import print_reproduced
+
+    raise typer.Exit(print_reproduced(given(product), cores=cores, keep=kept))
+
+
+@app.command()
+def diff(
+    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+    *,
+    whole: Annotated[bool, typer.Option("--all", help="every line of a section, however many")] = False,
+) -> None:
+    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    from apertura.views.verify.diff import print_differences
+
+    raise typer.Exit(print_differences(given(first), given(second), whole=whole))
+
+
+@app.command()
+def check_crate(
+    folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
+) -> None:
+    """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
+    from apertura.views.verify.crate import print_checked
+
+    raise typer.Exit(print_checked(given(folder)))
+
+
+@app.command()
+def report(
+    campaign: CampaignFolder,
+    cores: Cores = ALL_CORES,
+) -> None:
+    """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
+    from apertura.pipeline.campaign import Campaign
+    from apertura.pipeline.workflow import run_workflow
+    from apertura.views.report import PAGE
+    from apertura.views.report.step import open_report
+
+    campaign = given(campaign)
+    status = run_workflow(campaign, cores, "all", "pages")
+    if status:
+        raise SystemExit(status)
+    opened = Campaign.load(campaign)
+    with open_report(opened) as (temporary, style):
+        asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
+        status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
+        if status:
+            raise SystemExit(status)
+    for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
+        typer.echo(as_typed(path))
+
+
+@app.command("map")
+def map_page(
+    campaign: Annotated[Path, typer.Argument(help="campaign folder with results")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
+) -> None:
+    """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    opened = _opened(campaign)
+    from apertura.views.webmap.server import served
+
+    served(opened, port=port).show(in_browser=open_)
 
 
 @app.command()

@@ -8,7 +8,7 @@ from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.formats.export import MAP, exports_in
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import INTERFEROMETRY
+from apertura.pipeline.rules import INTERFEROMETRY
 from apertura.pipeline.store import open_listed
 from apertura.views.image_report import FUSED, ImageValues, Report, decibels, printable, raised_flags, read_reports
 

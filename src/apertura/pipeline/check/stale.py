@@ -11,11 +11,10 @@ from typing import Any
 from apertura.common.atomic import date
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
-from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result, digest_of
-from apertura.pipeline.lineage import results_of
+from apertura.pipeline.lineage import products_of, results_of
+from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.store import compare, compare_origin, damaged_files, read_manifest, states_origin
 
 _ONLY_LOOKS = (
@@ -23,6 +22,8 @@ _ONLY_LOOKS = (
     r"report.*|unlock|cleanup.*|containerize|export-cwl|archive|compilation|print-compilation|delete-.*|help|version)"
 )
 """Options with which snakemake reads a workflow and runs none of it."""
+
+_SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to it"}
 
 
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
@@ -41,7 +42,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     for name, result in results_of(campaign):
         path = inside(campaign.root, result.manifest, where=campaign.root)
         if not path.is_file():
-            if any((path.parent / file).is_file() for file in _PRODUCTS.get(name, ())):
+            if any((path.parent / file).is_file() for file in products_of(RESULTS[name])):
                 stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
             continue
         try:
@@ -151,23 +152,6 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
                     f", nor are {len(files) - 1} others" if len(files) > 1 else ""
                 )
     return damaged
-
-
-_PRODUCTS = {
-    "coverage": COVERAGE,
-    "cphd": (PHASE_HISTORY,),
-    "stac": (f"stac/{CATALOG}",),
-    "ro_crate": (CRATE,),
-    "map": (Path(MAP).name,),
-    **{
-        name: tuple(row.file for row in exports_in(kind))
-        for name, kind in {"export": "pair", **{kind: kind for kind in ("fused", "layers", "interferogram")}}.items()
-    },
-}
-"""Result → the files that people open."""
-
-
-_SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to it"}
 
 
 def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:

@@ -39,7 +39,7 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:
         inputs = merged(inputs, calibration["inputs"])
-    relevant = {**campaign.relevant("echo", pair, flight=flight), "calibration": calibration_spec(calibration)}
+    relevant = {**lineage.result.settings, "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
     stage = stamped(formed.promised, "echo", **how)

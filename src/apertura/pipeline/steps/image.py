@@ -159,6 +159,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
     plan = plan_pair(campaign, opened, scene, threads=threads)
     plan = replace(plan, decisions=(*plan.decisions, *track.decisions))
     formation = Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px)
+    result = result_of(campaign, "image", flight, pair)
     # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(
@@ -168,10 +169,10 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
             attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
         ),
         "image",
-        modules=result_of(campaign, "image", flight, pair).modules,
+        modules=result.modules,
         parents=[echo, profile, track.stage, *scene.parents],
         inputs=pattern_digests(campaign, pair),
-        settings={**campaign.relevant("image", pair), **scene.spec, "plan": choices},
+        settings={**result.settings, **scene.spec, "plan": choices},
     )
     scheduler = campaign.settings.processing.scheduler
     folder = campaign.stage("image", flight, pair)

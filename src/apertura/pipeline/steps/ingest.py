@@ -1,6 +1,8 @@
 """Rule `ingest`: what a node recorded in a flight, as `raw` and `track`."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
@@ -28,18 +30,19 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     """
     logged = result_of(campaign, "track", flight, node).begin(campaign.root)
     log = read_log(campaign, flight, node)
-    read_by = campaign.log_settings(node)
-    track = stamped(log, "track", modules=logged.modules, settings=read_by, inputs=logged.sources.digests)
+    how: dict[str, Any] = {"settings": logged.result.settings, "inputs": logged.sources.digests}
+    track = stamped(log, "track", modules=logged.modules, **how)
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
     preamble = () if recording.framing is None else (_preamble(recording, campaign),)
     recorded = result_of(campaign, "raw", flight, node).begin(
         campaign.root, further=[campaign.relative(path) for path in preamble]
     )
+    settings: Mapping[str, Any] = {} if recording.framing is None else recorded.result.settings
     if recording.framing is None:
-        dataset, settings = recording.cut(recording.captures, node=node), {}
+        dataset = recording.cut(recording.captures, node=node)
     else:
-        dataset, settings = _triggered(recording, campaign, node=node), campaign.relevant("raw")
+        dataset = _triggered(recording, campaign, node=node)
     dataset.attrs["samples"] = campaign.relative(recording.samples.path)
     raw = stamped(dataset, "raw", modules=recorded.modules, settings=settings, inputs=recorded.sources.digests)
     folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)

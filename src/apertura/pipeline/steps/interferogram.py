@@ -14,9 +14,10 @@ from apertura.formats.export import write_exports
 from apertura.methods.interferometry.comparison import Compared, compared, raised
 from apertura.methods.interferometry.heights import Level
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import INTERFEROMETRY, result_of
+from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.two_images import TwoImages, open_two
+from apertura.pipeline.rules import INTERFEROMETRY
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import record_files
 
@@ -46,7 +47,7 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     origin = Provenance.of(
         lineage.modules,
         dict(zip(two.names, two.images, strict=True)),
-        settings={"interferometry": campaign.relevant("interferogram"), "images": list(two.names)},
+        settings=lineage.result.settings,
     )
     report = _report(found, two)
     folder = campaign.result(INTERFEROMETRY, name)

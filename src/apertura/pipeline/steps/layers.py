@@ -42,7 +42,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     origin = Provenance.of(
         lineage.modules,
         [echo, profile, *scene.parents],
-        settings={**campaign.relevant("layers", pair), **scene.spec},
+        settings={**lineage.result.settings, **scene.spec},
         inputs=pattern_digests(campaign, pair) | scene.inputs,
     )
     rasters = _rasters(scene, looks, noise, threads=threads)

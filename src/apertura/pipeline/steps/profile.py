@@ -51,7 +51,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "oversampling": window.unambiguous / len(frequency),
         "window": asked,
     }
-    settings, parents = {**campaign.relevant("profile", pair), **scene.spec}, [source, *scene.parents]
+    settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)

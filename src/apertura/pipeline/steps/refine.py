@@ -45,7 +45,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     print("; ".join([*(f"{one.name} {one.value}: {one.reason}" for one in decisions), found.why]), flush=True)
     patterns = [pattern_digests(campaign, pair) for pair in names]
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
-    settings = {**campaign.relevant("refined_track"), "refined": found.accepted}
+    settings = {**lineage.result.settings, "refined": found.accepted}
     # Images that are formed from the logs stand on their own echoes alone, whatever was looked at here.
     how: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if found.accepted else {})}
     save_stage(stamped(stage, "refined_track", **how), folder, lineage=lineage)

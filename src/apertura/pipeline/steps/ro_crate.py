@@ -14,7 +14,7 @@ from apertura.formats.catalog.stac import RECORDED
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result
 from apertura.pipeline.lineage import on_demand, places_of, result_of
-from apertura.pipeline.steps.jobs import RuleRun, job_of
+from apertura.pipeline.rules import RESULTS, RULES
 from apertura.pipeline.store import read_manifest, record_files, remake
 
 
@@ -82,15 +82,15 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
     known
         File of the campaign → sha256, of inputs as the first result found them, of results as they are.
     """
-    jobs = dict[RuleRun, list[_Made]]()
+    jobs = dict[tuple[str, tuple[str, ...]], list[_Made]]()
     for one in made:
-        jobs.setdefault(job_of(one.name, one.where), []).append(one)
-    for job, parts in jobs.items():
+        jobs.setdefault((RESULTS[one.name].name, one.where), []).append(one)
+    for (rule, where), parts in jobs.items():
         doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, known)]
         yield CrateJob(
-            job.rule,
-            job.where,
-            job.command,
+            rule,
+            where,
+            RULES[rule].command_line(where),
             parts[0].recorded["code"],
             {name: value for one in parts for name, value in one.result.settings.items()},
             list(dict.fromkeys(source for one in parts for source in one.recorded["sources"])),

@@ -1,6 +1,5 @@
 """Rules `scene` and `terrain`: the campaign's one grid, every `auto` settled once, and the height of each pixel."""
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.dem import height_range
 from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import ConfiguredGround, Flown, OpenScene, settled, settled_scene
 from apertura.pipeline.steps.stamping import stamped
@@ -70,7 +70,7 @@ def terrain(campaign: Campaign) -> Path:
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = resume(wip, _empty(campaign, scene, ground, lineage.modules), "height", windows)
+        missing = resume(wip, _empty(scene, ground, lineage), "height", windows)
         print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
@@ -87,7 +87,7 @@ def terrain(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(campaign: Campaign, scene: OpenScene, ground: ConfiguredGround, modules: Sequence[str]) -> xr.Dataset:
+def _empty(scene: OpenScene, ground: ConfiguredGround, lineage: Lineage) -> xr.Dataset:
     """Return the stamped stage without its heights."""
     return stamped(
         xr.Dataset(
@@ -96,7 +96,7 @@ def _empty(campaign: Campaign, scene: OpenScene, ground: ConfiguredGround, modul
             attrs={"frame": scene.grid.frame, "terrain": {}},
         ),
         "terrain",
-        modules=modules,
-        settings={**campaign.relevant("terrain"), **scene.spec},
+        modules=lineage.modules,
+        settings={**lineage.result.settings, **scene.spec},
         inputs=ground.inputs,
     )

@@ -20,11 +20,12 @@ from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import SettingSearch
 from apertura.core.quality.error_check import Brightness, error_bound, random_pixels
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import STUDY, result_of
+from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import asked_accuracy, job_of, plan_job
 from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.rules import STUDY
 from apertura.pipeline.store import open_stage, record_files
 from apertura.views.chart.pareto import Point, draw_points, with_front, write_page
 

@@ -21,8 +21,8 @@ from apertura.common.tables import write_table
 from apertura.core.quality.budget import is_stated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, SampledWaveform
-from apertura.pipeline.lineage import STUDY, result_of
-from apertura.pipeline.lineage.inputs import with_inputs
+from apertura.pipeline.lineage import result_of, with_inputs
+from apertura.pipeline.rules import STUDY
 from apertura.pipeline.steps import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
 from apertura.pipeline.store import record_files
 from apertura.views.chart.png import save_png

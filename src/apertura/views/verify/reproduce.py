@@ -9,8 +9,7 @@ from apertura.common.errors import CampaignError, shown
 from apertura.common.paths import inside
 from apertura.common.processes import holder
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import on_demand, results_of
-from apertura.pipeline.lineage.inputs import with_inputs
+from apertura.pipeline.lineage import on_demand, results_of, with_inputs
 from apertura.pipeline.store import read_manifest
 from apertura.pipeline.workflow import run_workflow
 from apertura.views.verify.diff import differences, first_difference

@@ -1,0 +1,222 @@
+"""What every result is made from: files, other results, settings, code. Rules, steps and checks ask here.
+
+A result is what one rule writes. Its manifest, written last, names its files and what they were made from; another
+file, setting or code makes it stale, whatever the times of files say. All of it follows from `apertura.pipeline.rules`.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from apertura.common.code_imports import import_closure
+from apertura.core.focus.engines import ENGINES
+from apertura.formats.export import EXPORTS, export_modules, exports_in
+from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.digests import Result
+from apertura.pipeline.rules import EVERY, RESULTS, Of, Place, Rule, Setting, Source, is_sampled
+
+_READS = "apertura.formats.reading"
+"""Calls the readers of rows: a result whose step imports it may read what was recorded."""
+
+_FOCUSES = frozenset(
+    {
+        "apertura.core.focus.tiles",
+        "apertura.methods.autofocus.patches",
+        "apertura.methods.synchronisation.scene_alignment",
+    }
+)
+"""Call engines: a result whose step imports one of them may stand on pixels that any engine has formed."""
+
+_INPUTS = ("config", "raw")
+"""Folders of a campaign that are inputs with all that is in them."""
+
+
+def result_of(campaign: Campaign, result: str, *where: str) -> Result:
+    """Return a result of a campaign.
+
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
+    result
+        A key of `apertura.pipeline.rules.RESULTS`.
+    *where
+        What it is of: values of the wildcards of its row.
+    """
+    rule = RESULTS[result]
+    place = Place(campaign, rule.of, where)
+    sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(place, one)))
+    settings = {name: value for one in rule.settings for name, value in _stated(place, one).items()}
+    return Result(_manifest(rule, where), sources, settings, modules_of(campaign, result, *where))
+
+
+def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
+    """Yield every result of a campaign with its name, each after those it is made from."""
+    for result, _, made in places_of(campaign):
+        yield result, made
+
+
+def places_of(campaign: Campaign) -> Iterator[tuple[str, tuple[str, ...], Result]]:
+    """Yield every result as `results_of` does, with what it is of, as `result_of` takes it."""
+    for rule, where in _jobs(campaign):
+        yield rule.result, where, result_of(campaign, rule.result, *where)
+
+
+def on_demand(manifest: str) -> bool:
+    """Return whether a manifest is that of a result made when it is asked for.
+
+    Examples
+    --------
+    >>> on_demand("results/f01/a-b/cphd.manifest.json"), on_demand("results/f01/a-b/echo.manifest.json")
+    (True, False)
+    """
+    rule = RESULTS.get(manifest.rpartition("/")[2].removesuffix(".manifest.json"))
+    return rule is not None and rule.on_demand
+
+
+def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
+    """Return what each job of a rule runs on, values of its wildcards; calibration flights first."""
+    return [where for kind in ("calibration", "image") for where in _places(campaign, rule, kind)]
+
+
+def products_of(rule: Rule) -> list[str]:
+    """Return the files beside the manifest of a rule that people open."""
+    return [*rule.products, *(row.file for row in (exports_in(rule.exports) if rule.exports else ()))]
+
+
+def _jobs(campaign: Campaign) -> Iterator[tuple[Rule, tuple[str, ...]]]:
+    """Yield rule and place of every result: calibration flights first, which correct the echoes of others."""
+    for kind in ("calibration", "image"):
+        for rule in RESULTS.values():
+            yield from ((rule, where) for where in _places(campaign, rule, kind))
+
+
+def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
+    """Return the places of a rule that belong to flights of a kind; those of the campaign belong to its images."""
+    if kind not in rule.kinds or not rule.needed(campaign):
+        return []
+    if rule.of in {Of.CAMPAIGN, Of.CHARTED}:
+        return [()]
+    if rule.of is Of.TWO:
+        return [(name,) for name in campaign.settings.interferometry.pairs]
+    flights = [flight for flight in campaign.flights if flight.kind == kind]
+    if rule.of is Of.FLIGHT:
+        return [(flight.name,) for flight in flights]
+    pairs = rule.of is Of.PAIR
+    return [(flight.name, one) for flight in flights for one in (flight.pairs if pairs else flight.participants)]
+
+
+def _manifest(rule: Rule, where: Iterable[str]) -> str:
+    name = rule.manifest.format(**dict(zip(rule.of.wildcards, where, strict=True)))
+    return f"results/{name}.manifest.json"
+
+
+def _read(place: Place, source: Source) -> Iterable[str]:
+    """Return what a source of a row names at a place."""
+    if callable(source):
+        return source(place)
+    if source == EVERY:
+        return [_manifest(rule, where) for rule, where in _jobs(place.campaign) if not _describes_all(rule)]
+    rule = RESULTS[source]
+    return [_manifest(rule, where) for where in place.below(rule.of)] if rule.needed(place.campaign) else []
+
+
+def _describes_all(rule: Rule) -> bool:
+    return rule.on_demand or EVERY in rule.sources
+
+
+def _stated(place: Place, setting: Setting) -> dict[str, Any]:
+    """Return what a setting of a row says at a place, by the last word of its key."""
+    if callable(setting):
+        return dict(setting(place))
+    value: Any = place.campaign.values
+    for word in setting.split("."):
+        value = value[word]
+    return {setting.rpartition(".")[2]: value}
+
+
+def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
+    """Return the modules whose import closure is the code that makes a result, as dotted names.
+
+    Of readers those count that the files in raw/ name: another format's reader makes nothing again.
+
+    Parameters
+    ----------
+    campaign, result, *where
+        As `result_of`.
+    """
+    rule = RESULTS[result]
+    step = (rule.module, *_written(rule))
+    runs = _closure(step)
+    engines = tuple(ENGINES.values()) if _FOCUSES & runs else ()
+    readers = sorted(set(_readers(campaign, rule, where))) if _READS in runs else ()
+    return (*step, *engines, *readers)
+
+
+def _written(rule: Rule) -> tuple[str, ...]:
+    styles = {row.module for row in EXPORTS if row.style} if rule.styles else set()
+    return (*sorted(styles), *(export_modules(rule.exports) if rule.exports else ()))
+
+
+@cache
+def _closure(modules: tuple[str, ...]) -> frozenset[str]:
+    return frozenset(import_closure(modules))
+
+
+def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator[str]:
+    """Yield the modules that read what the nodes of a place have recorded, and their logs."""
+    stated = dict(zip(rule.of.wildcards, where, strict=True))
+    flights = [campaign.flight(stated["flight"])] if "flight" in stated else campaign.flights
+    named = {node for word in ("node", "pair") for node in stated.get(word, "").split("-")}
+    for flight in flights:
+        for node in named & {*flight.participants} or flight.participants:
+            if not is_sampled(campaign):
+                yield _module(PHASE_HISTORIES[campaign.settings.waveform.format].reader)  # type: ignore[union-attr]
+            elif "recordings" in rule.reads:
+                first = campaign.recording_files(flight.name, node)[0].name
+                rows = [row for row in RECORDERS if first.endswith(row[0])]
+                yield from (_module(table[row]) for table in (RECORDERS, FINDERS) for row in rows if row in table)
+            if "logs" in rule.reads and campaign.logged(flight.name, node):
+                options = campaign.settings.nodes[node].log.options
+                yield _module(TRACKS[log_format(campaign.track_file(flight.name, node), options)].reader)
+
+
+def _module(function: str) -> str:
+    return function.partition(":")[0]
+
+
+def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
+    """Fill a folder with what a campaign's results are made from; return it.
+
+    What stays is copied: who edits it later must not edit the recordings of the campaign.
+
+    Parameters
+    ----------
+    campaign
+        Of whose folder plain files are taken: those of config/ and raw/, and others that its configuration names.
+    target
+        The folder, made where it is missing.
+    link
+        Give recordings as hard links where that is possible.
+    """
+    sources = {source for _, result in results_of(campaign) for source in result.sources}
+    named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_INPUTS}]
+    for path in sorted({*named, *(path for folder in _INPUTS for path in (campaign.root / folder).rglob("*"))}):
+        if path.is_file() and not path.is_symlink():
+            here = path.relative_to(campaign.root)
+            (target / here).parent.mkdir(parents=True, exist_ok=True)
+            _put(path, target / here, link=link and here.parts[0] == "raw")
+    return target
+
+
+def _put(path: Path, target: Path, *, link: bool) -> None:
+    if link:
+        with suppress(OSError):  # another disk, or a file of somebody else's
+            os.link(path, target)
+            return
+    shutil.copy2(path, target)
