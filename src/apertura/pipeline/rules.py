@@ -507,7 +507,7 @@ _ROWS = (
         "terrain",
         Of.CAMPAIGN,
         "Bring the DEM onto the campaign's grid, terrain.zarr.",
-        f"{_STEPS}.terrain:terrain",
+        f"{_STEPS}.scene:terrain",
         sources=("scene", _heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
         needed=lambda campaign: bool(campaign.settings.scene.dem),
