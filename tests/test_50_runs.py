@@ -17,8 +17,8 @@ from apertura.common.processes import hold, holder
 from apertura.common.progress import told_at
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.resources import Resources
-from apertura.pipeline.runs.journal import Job, Reader, Run, failures, note
-from apertura.pipeline.runs.outlook import Outlook, Told
+from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, failures, note
+from apertura.pipeline.runs.outlook import Outlook, StepProgress
 from apertura.pipeline.runs.results import clean, print_list, states
 from apertura.pipeline.runs.screen import Bar, Screen, bars, print_status, table
 
@@ -42,7 +42,7 @@ def journal(tmp_path):
 
 
 def test_a_journal_tells_what_is_done_under_way_and_to_come(journal):
-    run = Reader(journal).news()
+    run = JournalReader(journal).news()
     assert [job.name for job in run.finished] == ["ingest f01 uav1"]
     assert [job.name for job in run.running] == ["image f01 uav1-uav1"]
     assert run.waiting == {"ingest": 1, "image": 1, "cube": 1}
@@ -50,7 +50,7 @@ def test_a_journal_tells_what_is_done_under_way_and_to_come(journal):
 
 
 def test_a_line_that_is_being_written_is_read_when_it_is_whole(journal):
-    reader = Reader(journal)
+    reader = JournalReader(journal)
     reader.news()
     line = json.dumps({"at": 5, "event": "finished", "job": 2}) + "\n"
     for part in (line[:9], line[9:]):
@@ -63,9 +63,9 @@ def test_a_line_that_is_being_written_is_read_when_it_is_whole(journal):
 
 def test_a_step_that_is_tried_again_is_under_way_and_not_failed(journal):
     note(journal, "failed", job=2)
-    assert len(Reader(journal).news().failed) == 1
+    assert len(JournalReader(journal).news().failed) == 1
     begun(journal, 2, "image", "f01", "uav1-uav1")
-    run = Reader(journal).news()
+    run = JournalReader(journal).news()
     assert not run.failed
     assert len(run.running) == 1
 
@@ -87,14 +87,14 @@ def test_a_step_that_is_tried_again_is_under_way_and_not_failed(journal):
     ],
 )
 def test_a_journal_of_a_stranger_is_only_data(journal, line):
-    before = Reader(journal).news()
+    before = JournalReader(journal).news()
     with journal.open("a") as stream:
         stream.write(line + "\n")
-    assert Reader(journal).news() == before
+    assert JournalReader(journal).news() == before
 
 
 def test_names_of_a_stranger_reach_the_terminal_without_control_codes():
-    assert Job("a", ("image", "\x1b[31mf01"), "", 0.0).name == r"image \x1b[31mf01"
+    assert JobRecord("a", ("image", "\x1b[31mf01"), "", 0.0).name == r"image \x1b[31mf01"
 
 
 def expected_seconds(campaign, rule, *where):
@@ -111,8 +111,8 @@ def test_more_samples_and_more_pixels_take_longer(finished_tiny):
 def timed(campaign, factor):
     """A run whose first image took so many times what was expected, and whose second is to come."""
     seconds = factor * expected_seconds(campaign, "image", "f01", "uav1-uav1")
-    done = Job("image", ("image", "f01", "uav1-uav1"), "", 0.0, seconds)
-    return Run(planned={"image": 2}, jobs={1: done})
+    done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, seconds)
+    return RunRecord(planned={"image": 2}, jobs={1: done})
 
 
 def test_time_left_follows_what_has_been_measured(finished_tiny):
@@ -128,7 +128,7 @@ def test_what_was_timed_before_counts_until_the_run_has_times_of_its_own(finishe
     benchmark = root / "results/benchmarks/f01/uav1-uav1.image.tsv"
     benchmark.parent.mkdir(parents=True, exist_ok=True)
     benchmark.write_text(f"s\th:m:s\n{7 * expected}\t0:00:07\n")
-    waiting = Run(planned={"image": 1})
+    waiting = RunRecord(planned={"image": 1})
     mean = (expected + expected_seconds(campaign, "image", "f01", "uav1-uav2")) / 2
     assert Outlook(campaign, cores=2).of_run(waiting, {}) == pytest.approx(7 * mean)
     assert Outlook(campaign, cores=2).of_run(timed(campaign, 1), {}) == pytest.approx(mean)
@@ -137,9 +137,9 @@ def test_what_was_timed_before_counts_until_the_run_has_times_of_its_own(finishe
 def test_a_share_of_an_images_tiles_takes_its_share_of_the_time(finished_tiny):
     outlook, shares = Outlook(finished_tiny, cores=0), (8, 80)
     runs = [
-        Run(
+        RunRecord(
             planned={"tiles": 2 * count},
-            jobs={1: Job("tiles", ("tiles", "f01", "uav1-uav1", f"1-of-{count}"), "", 0.0)},
+            jobs={1: JobRecord("tiles", ("tiles", "f01", "uav1-uav1", f"1-of-{count}"), "", 0.0)},
         )
         for count in shares
     ]
@@ -158,10 +158,10 @@ def test_what_the_campaign_does_not_have_is_not_looked_for(finished_tiny):
 @pytest.mark.parametrize("text", ["", "s\n", "s\nnan\n", "s\n1e300\n", "s\nx\n", "t\n1\n", "\x00", "s\n\n"])
 def test_a_benchmark_that_makes_no_sense_is_none(finished_tiny, tmp_path, text):
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
-    before = Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {})
+    before = Outlook(campaign, cores=2).of_run(RunRecord(planned={"image": 1}), {})
     (campaign.results / "benchmarks").mkdir(exist_ok=True)
     (campaign.results / "benchmarks/scene.tsv").write_text(text)
-    assert Outlook(campaign, cores=2).of_run(Run(planned={"image": 1}), {}) == before
+    assert Outlook(campaign, cores=2).of_run(RunRecord(planned={"image": 1}), {}) == before
 
 
 def tell(campaign, step, **report):
@@ -173,8 +173,8 @@ def tell(campaign, step, **report):
 def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_path, finished_tiny):
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
     now = time.time()
-    job = Job("image", ("image", "f01", "uav1-uav1"), "", now - 100)
-    run = Run(planned={"image": 1}, jobs={1: job})
+    job = JobRecord("image", ("image", "f01", "uav1-uav1"), "", now - 100)
+    run = RunRecord(planned={"image": 1}, jobs={1: job})
     tell(campaign, job.step, what="tiles", done=10, total=40, since=now - 90, at=now)
     bar, whole = bars(campaign, run, Outlook(campaign, cores=2))
     assert (bar.told, bar.fraction) == ("10 of 40 tiles", 0.25)
@@ -195,15 +195,15 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
 )
 def test_a_report_that_makes_no_sense_is_none(tmp_path, finished_tiny, report):
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
-    job = Job("image", ("image", "f01", "uav1-uav1"), "", 1e9)
+    job = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 1e9)
     path = campaign.result(*told_at(job.step))
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(report))
-    assert Told.by(campaign, job) is None
+    assert StepProgress.of(campaign, job) is None
 
 
 def test_a_step_that_names_another_folder_is_not_followed(finished_tiny):
-    assert Told.by(finished_tiny, Job("image", ("..", "..", "config", "x"), "", 0.0)) is None
+    assert StepProgress.of(finished_tiny, JobRecord("image", ("..", "..", "config", "x"), "", 0.0)) is None
 
 
 class Terminal(io.StringIO):
@@ -214,7 +214,7 @@ class Terminal(io.StringIO):
 
 
 def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_ends(finished_tiny, journal):
-    stream, reader = io.StringIO(), Reader(journal)
+    stream, reader = io.StringIO(), JournalReader(journal)
     with Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream) as screen:
         screen.update(reader.news())
         note(journal, "failed", job=2)
@@ -236,7 +236,7 @@ def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, 
     stream = Terminal()
     screen = Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream)
     with pytest.raises(AttributeError), screen:  # whatever ends it
-        [screen.update(run) for run in (Reader(journal).news(), None)]
+        [screen.update(run) for run in (JournalReader(journal).news(), None)]
     said = stream.getvalue()
     assert "━" in said
     assert "1 of 5 steps" in said
@@ -246,8 +246,8 @@ def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, 
 def test_a_quiet_run_shows_nothing(finished_tiny, journal):
     stream = Terminal()
     with Screen(finished_tiny, Outlook(finished_tiny, 2), quiet=True, stream=stream) as screen:
-        screen.update(Reader(journal).news())
-        screen.ended(Reader(journal).news())
+        screen.update(JournalReader(journal).news())
+        screen.ended(JournalReader(journal).news())
     assert not stream.getvalue()
 
 
@@ -264,10 +264,10 @@ def test_bars_fit_the_terminal(columns):
 
 
 def failed(tmp_path, *logs):
-    run = Run()
+    run = RunRecord()
     for number, text in enumerate(logs):
         (tmp_path / f"{number}.log").write_text(text)
-        run.jobs[number] = Job("echo", ("echo",), f"{number}.log", 0.0, 1.0, failed=True)
+        run.jobs[number] = JobRecord("echo", ("echo",), f"{number}.log", 0.0, 1.0, failed=True)
     return "\n".join(failures(tmp_path, run, tmp_path / "snakemake.log"))
 
 
@@ -286,7 +286,7 @@ def test_a_defect_and_a_killed_step_are_told_apart(tmp_path):
 
 
 def test_what_the_workflow_says_is_told_where_no_step_failed(tmp_path):
-    run = Run(said=["MissingRuleException:\nno rule for \x1b[31mx"])
+    run = RunRecord(said=["MissingRuleException:\nno rule for \x1b[31mx"])
     assert next(failures(tmp_path, run, tmp_path / "a.log")) == r"error: MissingRuleException: no rule for \x1b[31mx"
 
 

@@ -22,7 +22,7 @@ rule stac:
         "apertura step stac > {log} 2>&1"
 
 
-# Last of all: it tells of every other result.
+# Last of all: it describes every other result.
 rule ro_crate:
     input:
         header["ro_crate"].sources,
@@ -42,6 +42,6 @@ rule ro_crate:
         settings=header["ro_crate"].settings,
         code=header["ro_crate"].code,
     message:
-        "telling the whole run as an RO-Crate"
+        "describing the whole run as an RO-Crate"
     shell:
         "apertura step ro-crate > {log} 2>&1"

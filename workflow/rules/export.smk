@@ -135,7 +135,7 @@ rule mosaic:
         settings=header["mosaic"].settings,
         code=header["mosaic"].code,
     message:
-        "laying the files of all flights upon one another"
+        "writing mosaics of all flights"
     shell:
         "apertura step mosaic > {log} 2>&1"
 

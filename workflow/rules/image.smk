@@ -22,7 +22,7 @@ rule scene:
         settings=header["scene"].settings,
         code=header["scene"].code,
     message:
-        "settling the campaign's grid"
+        "choosing the campaign's grid"
     shell:
         "apertura step scene > {log} 2>&1"
 
@@ -46,7 +46,7 @@ rule terrain:
         settings=header["terrain"].settings,
         code=header["terrain"].code,
     message:
-        "bringing the DEM onto the campaign's grid"
+        "resampling the DEM to the campaign's grid"
     shell:
         "apertura step terrain > {log} 2>&1"
 
@@ -70,7 +70,7 @@ rule layers:
         settings=header["layers"].settings,
         code=header["layers"].code,
     message:
-        "{wildcards.flight}: how {wildcards.pair} sees the scene"
+        "{wildcards.flight}: angles, mask, looks and noise of {wildcards.pair}"
     shell:
         "apertura step layers {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 

@@ -19,6 +19,7 @@ WITHOUT_EFFECT = (
     "apertura.common.processes",  # where a process may look for code, and how it ends
     "apertura.pipeline.lineage",  # sources, settings and code of a result: a manifest records each, for itself
     "apertura.pipeline.rules",  # the rows that these follow from
+    "apertura.pipeline.rule_inputs",
     "apertura.pipeline.digests",  # their hashes
 )
 """Modules, and those below them, that no result's code hash holds: nothing that they compute is in a result."""

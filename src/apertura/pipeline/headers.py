@@ -24,16 +24,15 @@ class Headers:
 
     def __getitem__(self, rule: str) -> "Header":
         """Return the header of a rule."""
-        return Header(self.campaign, RULES[rule], self._resources[rule])
+        resources = self._resources[rule]
+        return Header(resources.demand, resources.of, RULES[rule])
 
 
 @dataclass(frozen=True)
-class Header:
+class Header(RuleResources):
     """The header of one rule; methods take the wildcards of a job, as Snakemake calls them."""
 
-    campaign: Campaign
     rule: Rule
-    resources: RuleResources
 
     @property
     def output(self) -> list[str]:
@@ -71,18 +70,6 @@ class Header:
         """Return the hashes of the code of a job."""
         return [result.code_sha256 for result in self._results(wildcards)]
 
-    def threads(self, wildcards: Any) -> int:
-        """Return how many threads a job can use."""
-        return self.resources.threads(wildcards)
-
-    def mem_mb(self, wildcards: Any, attempt: int) -> int:
-        """Return the memory of a job, MB."""
-        return self.resources.mem_mb(wildcards, attempt)
-
-    def runtime(self, wildcards: Any, attempt: int) -> int:
-        """Return the time limit of a job, minutes."""
-        return self.resources.runtime(wildcards, attempt)
-
     @property
     def _rows(self) -> list[Rule]:
         """The rows of what it makes, or of what it does a share of."""
@@ -90,7 +77,7 @@ class Header:
 
     def _results(self, wildcards: Any) -> list[Result]:
         where = [getattr(wildcards, word) for word in self.rule.of.wildcards]
-        return [result_of(self.campaign, row.result, *where) for row in self._rows]
+        return [result_of(self.of.campaign, row.result, *where) for row in self._rows]
 
     def _beside(self, file: str) -> str:
         return "/".join(filter(None, ("results", self.rule.folder, file)))

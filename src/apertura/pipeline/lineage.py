@@ -18,7 +18,8 @@ from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result
-from apertura.pipeline.rules import EVERY, RESULTS, Of, Place, Rule, Setting, Source, is_sampled
+from apertura.pipeline.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled
+from apertura.pipeline.rules import EVERY, RESULTS, Rule
 
 _READS = "apertura.formats.reading"
 """Calls the readers of rows: a result whose step imports it may read what was recorded."""
@@ -49,7 +50,7 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         What it is of: values of the wildcards of its row.
     """
     rule = RESULTS[result]
-    place = Place(campaign, rule.of, where)
+    place = JobPlace(campaign, rule.of, where)
     sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(place, one)))
     settings = {name: value for one in rule.settings for name, value in _stated(place, one).items()}
     return Result(_manifest(rule, where), sources, settings, modules_of(campaign, result, *where))
@@ -100,14 +101,14 @@ def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
     """Return the places of a rule that belong to flights of a kind; those of the campaign belong to its images."""
     if kind not in rule.kinds or not rule.needed(campaign):
         return []
-    if rule.of in {Of.CAMPAIGN, Of.CHARTED}:
+    if rule.of in {Scope.CAMPAIGN, Scope.CHARTED}:
         return [()]
-    if rule.of is Of.TWO:
+    if rule.of is Scope.TWO:
         return [(name,) for name in campaign.settings.interferometry.pairs]
     flights = [flight for flight in campaign.flights if flight.kind == kind]
-    if rule.of is Of.FLIGHT:
+    if rule.of is Scope.FLIGHT:
         return [(flight.name,) for flight in flights]
-    pairs = rule.of is Of.PAIR
+    pairs = rule.of is Scope.PAIR
     return [(flight.name, one) for flight in flights for one in (flight.pairs if pairs else flight.participants)]
 
 
@@ -116,7 +117,7 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
     return f"results/{name}.manifest.json"
 
 
-def _read(place: Place, source: Source) -> Iterable[str]:
+def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
     """Return what a source of a row names at a place."""
     if callable(source):
         return source(place)
@@ -130,7 +131,7 @@ def _describes_all(rule: Rule) -> bool:
     return rule.on_demand or EVERY in rule.sources
 
 
-def _stated(place: Place, setting: Setting) -> dict[str, Any]:
+def _stated(place: JobPlace, setting: SettingSpec) -> dict[str, Any]:
     """Return what a setting of a row says at a place, by the last word of its key."""
     if callable(setting):
         return dict(setting(place))

@@ -5,9 +5,11 @@ They name modules as text, since the command line reads them, too: what a row ne
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
-from enum import Enum
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+
+from apertura.pipeline import rule_inputs as inputs
+from apertura.pipeline.rule_inputs import Scope
 
 if TYPE_CHECKING:
     from apertura.pipeline.campaign import Campaign
@@ -20,73 +22,6 @@ STUDY = "study"
 
 EVERY = "*"
 """Source of a result that describes all results that are not made on demand."""
-
-
-class Of(Enum):
-    """What a rule runs on, and the wildcards of its jobs, as Snakemake has them."""
-
-    NODE = "node", ("flight", "node")
-    PAIR = "pair", ("flight", "pair")
-    FLIGHT = "flight", ("flight",)
-    TWO = "two images", ("two",)
-    CAMPAIGN = "campaign", ()
-    CHARTED = "charted pair", ()
-
-    def __init__(self, _: str, wildcards: tuple[str, ...]) -> None:
-        self.wildcards = wildcards
-
-
-@dataclass(frozen=True)
-class Place:
-    """What one job runs on.
-
-    Attributes
-    ----------
-    campaign
-        Settings and flights.
-    of
-        Kind of the place.
-    where
-        Values of the wildcards.
-    """
-
-    campaign: "Campaign"
-    of: Of
-    where: tuple[str, ...]
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Flight and pair of every image that the place covers."""
-        campaign = self.campaign
-        if self.of is Of.PAIR:
-            return [(self.where[0], self.where[1])]
-        if self.of is Of.FLIGHT:
-            return [(self.where[0], pair) for pair in campaign.flight(self.where[0]).pairs]
-        if self.of is Of.TWO:
-            return [(flight, pair) for flight, pair in campaign.settings.interferometry.images(self.where[0])]
-        if self.of is Of.CHARTED:
-            return [charted(campaign)]
-        return [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
-
-    def below(self, of: Of) -> list[tuple[str, ...]]:
-        """Return the places of another kind that belong to this one, each once.
-
-        Examples
-        --------
-        >>> Place(None, Of.PAIR, ("f01", "uav1-uav2")).below(Of.NODE)
-        [('f01', 'uav1'), ('f01', 'uav2')]
-        """
-        if of is self.of:
-            return [self.where]
-        if of is Of.CAMPAIGN:
-            return [()]
-        if of is Of.NODE:
-            found: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
-        elif of is Of.FLIGHT:
-            found = ((name,) for name, _ in self.pairs)
-        else:
-            found = self.pairs
-        return list(dict.fromkeys(found))
 
 
 @dataclass(frozen=True)
@@ -147,10 +82,6 @@ class Cost:
     last: bool = False
 
 
-Source = str | Callable[[Place], Iterable[str]]
-Setting = str | Callable[[Place], Mapping[str, Any]]
-
-
 @dataclass(frozen=True)
 class Rule:
     """One rule of the workflow.
@@ -205,11 +136,11 @@ class Rule:
     """
 
     name: str
-    of: Of
+    of: Scope
     help: str
     step: str
-    sources: tuple[Source, ...]
-    settings: tuple[Setting, ...] = ()
+    sources: tuple[inputs.SourceSpec, ...]
+    settings: tuple[inputs.SettingSpec, ...] = ()
     demand: Demand | None = None
     cost: Cost = Cost()
     result: str = ""
@@ -261,7 +192,9 @@ class Rule:
         ('{flight}/{pair}.echo', '{flight}/calibrate', 'cube')
         """
         above, _, place = self.folder.rpartition("/")
-        return f"{above}/{place}.{self.name}" if above else f"{place}/{self.name}".removeprefix("/")
+        if not self.of.wildcards:
+            return self.name
+        return f"{above}/{place}.{self.name}" if above else f"{place}/{self.name}"
 
     def command_line(self, where: Iterable[str]) -> str:
         """Return the command that a person can paste.
@@ -279,144 +212,7 @@ class Rule:
         return " ".join(["apertura step", self.command, *where, *self.last_words])
 
 
-def charted(campaign: "Campaign") -> tuple[str, str]:
-    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is."""
-    return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
-
-
-def is_sampled(campaign: "Campaign") -> bool:
-    """Return whether samples were recorded, and not phase histories."""
-    from apertura.pipeline.config import SampledWaveform
-
-    return isinstance(campaign.settings.waveform, SampledWaveform)
-
-
-def _recording(place: Place) -> Iterable[str]:
-    return map(place.campaign.relative, place.campaign.recording_files(*place.where))
-
-
-def _log(place: Place) -> Iterable[str]:
-    return [place.campaign.relative(place.campaign.track_file(*place.where))]
-
-
-def _transmitted_and_received(place: Place) -> Iterable[str]:
-    """Return the files that an echo is read from, and the calibration that it is corrected by."""
-    campaign, (flight, pair) = place.campaign, place.where
-    nodes = list(dict.fromkeys(pair.split("-")))
-    if not is_sampled(campaign):
-        logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
-        return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
-    samples = [campaign.recording_files(flight, node)[-1] for node in nodes]
-    files = [campaign.relative(path) for path in (campaign.sent_file, *samples)]
-    calibration = campaign.settings.calibration
-    if calibration is not None and campaign.flight(flight).kind == "image":
-        files.append(campaign.manifest("calibration", calibration.flight))
-    return files
-
-
-def _echoes_that_bound_the_scene(place: Place) -> Iterable[str]:
-    campaign, stated = place.campaign, place.campaign.settings.scene
-    first = campaign.image_flights[0]
-    by_flight = "auto" in {stated.crs, stated.spacing_m, stated.bounds_m}
-    return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if by_flight else []
-
-
-def _heights(place: Place) -> Iterable[str]:
-    return map(place.campaign.relative, place.campaign.height_files().values())
-
-
-def _patterns(place: Place) -> Iterable[str]:
-    files = (path for _, pair in place.pairs for path in place.campaign.pattern_files(pair).values())
-    return map(place.campaign.relative, files)
-
-
-def _autofocused(place: Place) -> Iterable[str]:
-    """Return what autofocus forms images from; nothing where it is off."""
-    if place.campaign.settings.processing.autofocus == "off":
-        return []
-    stages = [place.campaign.manifest(stage, *pair) for pair in place.pairs for stage in ("echo", "profile")]
-    return [*stages, *_patterns(place)]
-
-
-def _transmitter_raw(place: Place) -> Iterable[str]:
-    campaign, (flight, pair) = place.campaign, place.where
-    return [campaign.manifest("raw", flight, pair.partition("-")[0])] if is_sampled(campaign) else []
-
-
-def _truth(place: Place) -> Iterable[str]:
-    return ["truth.json"] if (place.campaign.root / "truth.json").is_file() else []
-
-
-def _everything_recorded(place: Place) -> Iterable[str]:
-    campaign = place.campaign
-    nodes = [(flight.name, node) for flight in campaign.flights for node in flight.nodes]
-    return [campaign.relative(path) for at in nodes for path in campaign.raw_files(*at).values()]
-
-
-def _config_files(place: Place) -> Iterable[str]:
-    from apertura.pipeline.config import CLOCKS, CONFIG, FLIGHTS, SEGMENTS
-
-    files = (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
-    return [path.as_posix() for path in files if (place.campaign.root / path).is_file()]
-
-
-def _everything(place: Place) -> Mapping[str, Any]:
-    return place.campaign.values
-
-
-def _log_settings(place: Place) -> Mapping[str, Any]:
-    stated = place.campaign.values["nodes"][place.where[1]]["log"]
-    return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
-
-
-def _antennas(place: Place) -> Mapping[str, Any]:
-    beams = {point: beam.model_dump(mode="json") for point, (_, beam) in _beams(place).items()}
-    return {"antennas": beams} if beams else {}
-
-
-def _beams(place: Place) -> Mapping[str, tuple[str, Any]]:
-    return {point: beam for _, pair in place.pairs for point, beam in place.campaign.antennas(pair).items()}
-
-
-def _pair_settings(place: Place) -> Mapping[str, Any]:
-    """Return what matters for a pair's echo: its nodes, whether there are beams, not what they are."""
-    campaign, (flight, pair) = place.campaign, place.where
-    nodes = {
-        node: {key: value for key, value in campaign.values["nodes"][node].items() if key != "antennas"}
-        for node in pair.split("-")
-    }
-    stated = {
-        "beams": sorted(_beams(place)),
-        "segments": [list(segment) for segment in campaign.segments_of(flight, pair)],
-        "clocks": [asdict(one) for one in campaign.clocks if one.flight == flight and one.node in nodes],
-    }
-    return {"nodes": nodes, **{name: value for name, value in stated.items() if value}}
-
-
-def _grid(place: Place) -> Mapping[str, Any]:
-    stated = place.campaign.values["scene"]
-    return {"scene": {key: value for key, value in stated.items() if key != "reference_points"}}
-
-
-_BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
-_AFTER_THE_IMAGE = frozenset({"fusion"})
-
-
-def _imaging(place: Place) -> Mapping[str, Any]:
-    """Return all settings of the processing but those of other rules: a new one counts for the image."""
-    processing = place.campaign.values["processing"]
-    return {name: value for name, value in processing.items() if name not in _BEFORE_THE_IMAGE | _AFTER_THE_IMAGE}
-
-
-def _two_images(place: Place) -> Mapping[str, Any]:
-    return {"images": place.pairs}
-
-
-def _charted_pair(place: Place) -> Mapping[str, Any]:
-    return {"pair": list(charted(place.campaign))}
-
-
-def _workflow(_: Place) -> Mapping[str, Any]:
+def _workflow(_: inputs.JobPlace) -> Mapping[str, Any]:
     from apertura.common.paths import shipped
     from apertura.common.provenance import canonical_json, sha256_text, sha256_tree
 
@@ -426,27 +222,27 @@ def _workflow(_: Place) -> Mapping[str, Any]:
 
 _STEPS = "apertura.pipeline.steps"
 _GROUND = ("scene", "terrain")
-_FORMED = ("echo", "profile", *_GROUND, _patterns)
-_IMAGE_SETTINGS = (_imaging, _antennas)
+_FORMED = ("echo", "profile", *_GROUND, inputs.patterns)
+_IMAGE_SETTINGS = (inputs.imaging, inputs.antennas)
 
 _INGEST = Rule(
     "ingest",
-    Of.NODE,
+    Scope.NODE,
     "Read a node's recording and flight log into raw.zarr and track.zarr.",
     f"{_STEPS}.ingest:ingest",
     result="raw",
-    sources=(_recording,),
+    sources=(inputs.recording,),
     settings=("waveform", "processing.false_alarms_per_s"),
     reads=("recordings",),
     kinds=("calibration", "image"),
-    needed=is_sampled,
+    needed=inputs.is_sampled,
     demand=Demand(250, pulse_bytes=100, recorded_s=60),
     cost=Cost(1.3, mb_s=0.01),
 )
 
 _IMAGE = Rule(
     "image",
-    Of.PAIR,
+    Scope.PAIR,
     "Focus a pair's image, image.zarr.",
     f"{_STEPS}.image:image",
     sources=(*_FORMED, "refined_track"),
@@ -468,21 +264,23 @@ _IMAGE = Rule(
 
 _ROWS = (
     _INGEST,
-    replace(_INGEST, result="track", manifest="", sources=(_log,), settings=(_log_settings,), reads=("logs",)),
+    replace(
+        _INGEST, result="track", manifest="", sources=(inputs.log,), settings=(inputs.log_settings,), reads=("logs",)
+    ),
     Rule(
         "echo",
-        Of.PAIR,
+        Scope.PAIR,
         "Turn recordings of a pair into calibrated transfer functions, echo.zarr.",
         f"{_STEPS}.echo:echo",
-        sources=("raw", "track", _transmitted_and_received),
-        settings=("waveform", "processing.sidelink", "processing.accuracy_db", _pair_settings),
+        sources=("raw", "track", inputs.transmitted_and_received),
+        settings=("waveform", "processing.sidelink", "processing.accuracy_db", inputs.pair_settings),
         kinds=("calibration", "image"),
         demand=Demand(400, pulse_bytes=400, recorded_s=120),
         cost=Cost(2.8, mb_s=0.02),
     ),
     Rule(
         "calibrate",
-        Of.FLIGHT,
+        Scope.FLIGHT,
         "Estimate the path offsets of a calibration flight's pairs, calibration.json.",
         f"{_STEPS}.calibration:calibrate",
         result="calibration",
@@ -494,42 +292,42 @@ _ROWS = (
     ),
     Rule(
         "scene",
-        Of.CAMPAIGN,
-        "Settle the campaign's grid, scene.json.",
+        Scope.CAMPAIGN,
+        "Choose the campaign's grid, scene.json.",
         f"{_STEPS}.scene:scene",
-        sources=(_echoes_that_bound_the_scene, _heights),
-        settings=("campaign", _grid),
+        sources=(inputs.echoes_that_bound_the_scene, inputs.heights),
+        settings=("campaign", inputs.grid),
         documents=("scene.json",),
         demand=Demand(400, pulse_bytes=500),
         cost=Cost(last=True),
     ),
     Rule(
         "terrain",
-        Of.CAMPAIGN,
-        "Bring the DEM onto the campaign's grid, terrain.zarr.",
-        f"{_STEPS}.scene:terrain",
-        sources=("scene", _heights),
+        Scope.CAMPAIGN,
+        "Resample the DEM to the campaign's grid, terrain.zarr.",
+        f"{_STEPS}.terrain:terrain",
+        sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
         needed=lambda campaign: bool(campaign.settings.scene.dem),
         demand=Demand(500, pixel_bytes=50, pixel_s=10),
     ),
     Rule(
         "profile",
-        Of.PAIR,
+        Scope.PAIR,
         "Compress a pair in range over the scene, profile.zarr.",
         f"{_STEPS}.profile:profile",
-        sources=("echo", *_GROUND, _patterns),
-        settings=("processing.window", "processing.integration", _antennas),
+        sources=("echo", *_GROUND, inputs.patterns),
+        settings=("processing.window", "processing.integration", inputs.antennas),
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
         cost=Cost(1.8, mb_s=0.01),
     ),
     Rule(
         "refine",
-        Of.FLIGHT,
+        Scope.FLIGHT,
         "Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr.",
         f"{_STEPS}.refine:refine",
         result="refined_track",
-        sources=(_autofocused, *_GROUND),
+        sources=(inputs.autofocused, *_GROUND),
         settings=("processing.autofocus", "processing.autofocus_method", "scene.reference_points"),
         demand=Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
         cost=Cost(2.5, mb_s=0.02, mpx_s=0.5),
@@ -548,11 +346,11 @@ _ROWS = (
     _IMAGE,
     Rule(
         "layers",
-        Of.PAIR,
+        Scope.PAIR,
         "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs.",
         f"{_STEPS}.layers:layers",
         sources=_FORMED,
-        settings=("campaign", "processing.integration", _antennas),
+        settings=("campaign", "processing.integration", inputs.antennas),
         exports="layers",
         demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
         cost=Cost(1.4, mpx_s=0.5, last=True),
@@ -560,7 +358,7 @@ _ROWS = (
     ),
     Rule(
         "assess",
-        Of.FLIGHT,
+        Scope.FLIGHT,
         "Compare the images of a flight with each other, and choose what is added up, assessment.json.",
         f"{_STEPS}.assess:assess",
         result="assessment",
@@ -572,7 +370,7 @@ _ROWS = (
     ),
     Rule(
         "export",
-        Of.PAIR,
+        Scope.PAIR,
         "Write GeoTIFFs and the quicklook of a pair, or of 'fused'.",
         f"{_STEPS}.export:export",
         sources=("image", "assessment", "scene"),
@@ -584,7 +382,7 @@ _ROWS = (
     ),
     Rule(
         "cphd",
-        Of.PAIR,
+        Scope.PAIR,
         "Write the calibrated transfer functions of a pair for other processors, phase_history.cphd.",
         f"{_STEPS}.cphd:cphd",
         sources=("echo", "scene"),
@@ -596,7 +394,7 @@ _ROWS = (
     ),
     Rule(
         "coverage",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Draw what every flight and pair covers, coverage.png and coverage.geojson.",
         f"{_STEPS}.coverage:coverage",
         sources=("echo", "layers", "scene"),
@@ -606,7 +404,7 @@ _ROWS = (
     ),
     Rule(
         "cube",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Stack and add up every image, cube.zarr.",
         f"{_STEPS}.cube:cube",
         sources=("image", "assessment", "scene"),
@@ -616,7 +414,7 @@ _ROWS = (
     ),
     Rule(
         "export_fused",
-        Of.FLIGHT,
+        Scope.FLIGHT,
         "Write GeoTIFFs and the quicklook of what the pairs of a flight add up to.",
         f"{_STEPS}.export:export",
         result="fused",
@@ -632,13 +430,13 @@ _ROWS = (
     ),
     Rule(
         "interferogram",
-        Of.TWO,
+        Scope.TWO,
         "Compare two images in phase: coherence, unwrapped phase and heights, by a name of interferometry.pairs.",
         f"{_STEPS}.interferogram:interferogram",
         sources=(*_FORMED, "image", "layers"),
         settings=(
             "campaign",
-            _two_images,
+            inputs.two_images,
             "interferometry.window_px",
             "scene.reference_points",
             "processing.integration",
@@ -652,8 +450,8 @@ _ROWS = (
     ),
     Rule(
         "mosaic",
-        Of.CAMPAIGN,
-        "Lay each product of all flights upon one another, mosaic/<pair>/<product>.vrt.",
+        Scope.CAMPAIGN,
+        "Write a mosaic of each product of all flights, mosaic/<pair>/<product>.vrt.",
         f"{_STEPS}.mosaic:mosaic",
         sources=("layers", "export", "fused"),
         settings=("campaign",),
@@ -663,7 +461,7 @@ _ROWS = (
     ),
     Rule(
         "stac",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Describe every image in a static STAC catalog, stac/catalog.json.",
         f"{_STEPS}.stac:stac",
         sources=("echo", "layers", "export", "fused", "scene"),
@@ -673,10 +471,10 @@ _ROWS = (
     ),
     Rule(
         "pictures",
-        Of.PAIR,
+        Scope.PAIR,
         "Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget.",
         "apertura.views.report.pictures:pictures",
-        sources=("echo", "profile", "image", "layers", _transmitter_raw, "refined_track", *_GROUND),
+        sources=("echo", "profile", "image", "layers", inputs.transmitter_raw, "refined_track", *_GROUND),
         settings=("campaign",),
         on_demand=True,
         demand=Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
@@ -684,30 +482,30 @@ _ROWS = (
     ),
     Rule(
         "page",
-        Of.FLIGHT,
+        Scope.FLIGHT,
         "Write what the report says of a flight, report.html, which prints.",
         "apertura.views.report.step:page",
         sources=("pictures", "export", "image", "fused", "scene"),
-        settings=(_everything,),
+        settings=(inputs.everything,),
         on_demand=True,
         demand=Demand(500, pixel_s=5),
         cost=Cost(2.5, mpx_s=0.5),
     ),
     Rule(
         "report",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Write the first page of Snakemake's report, which `apertura report` asks for.",
         "apertura.views.report.step:landing",
         sources=("page", "coverage"),
-        settings=(_everything,),
+        settings=(inputs.everything,),
         on_demand=True,
     ),
     Rule(
         "map",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Write what `apertura map` shows of every image in a browser, map/map.json.",
         "apertura.views.webmap.step:webmap",
-        sources=("layers", "export", "fused", "coverage", "scene", _truth),
+        sources=("layers", "export", "fused", "coverage", "scene", inputs.truth),
         settings=("campaign", "calibration", "scene.reference_points"),
         products=("map.json",),
         manifest="map/map",
@@ -716,11 +514,11 @@ _ROWS = (
     ),
     Rule(
         "speed_accuracy",
-        Of.CHARTED,
+        Scope.CHARTED,
         "Time and measure every engine and setting on a pair, for at most so many seconds.",
         "apertura.views.chart.speed_accuracy:speed_accuracy",
         sources=(*_FORMED, "refined_track"),
-        settings=(_charted_pair, *_IMAGE_SETTINGS),
+        settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
         products=("speed_accuracy.csv", "speed_accuracy.png", "speed_accuracy.html"),
         manifest=f"{STUDY}/speed_accuracy",
         on_demand=True,
@@ -731,12 +529,12 @@ _ROWS = (
     ),
     Rule(
         "whole_chart",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png.",
         "apertura.views.chart.whole:whole_chart",
         result="whole",
-        sources=(_everything_recorded, _heights),
-        settings=(_everything,),
+        sources=(inputs.everything_recorded, inputs.heights),
+        settings=(inputs.everything,),
         products=("whole.csv", "whole.png"),
         manifest=f"{STUDY}/whole",
         on_demand=True,
@@ -745,10 +543,10 @@ _ROWS = (
     ),
     Rule(
         "ro_crate",
-        Of.CAMPAIGN,
+        Scope.CAMPAIGN,
         "Describe the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json.",
         f"{_STEPS}.ro_crate:ro_crate",
-        sources=(_config_files, EVERY),
+        sources=(inputs.config_files, EVERY),
         settings=("campaign", _workflow),
         products=("ro-crate-metadata.json",),
         demand=Demand(350, image_bytes=1_000_000),

@@ -24,7 +24,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
 from apertura.pipeline.check.stale import forms_results, stale_lines, stale_results
 from apertura.pipeline.lineage import on_demand
-from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, Reader, failures, note
+from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
 
@@ -143,7 +143,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
 
 def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen, *, aloud: bool) -> int:
     """Run snakemake with its output in a file, and show what its journal tells."""
-    reader, killed, status = Reader(files.journal), _killed_for_memory(), INTERRUPTED
+    reader, killed, status = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED
     try:
         with files.log.open("wb") as output, files.log.open("rb") as said, screen:
 
@@ -173,7 +173,7 @@ def _looked_at(root: Path, command: Sequence[str], files: "_Files", *, told: boo
     """Have snakemake look at the workflow, and say briefly what a run would do where that is to be `told`."""
     with files.log.open("wb") as output:
         status = files.status_of(_supervised(command, files.environment, output))
-    run = Reader(files.journal).news()
+    run = JournalReader(files.journal).news()
     if status:
         _say(*failures(root, run, files.log))
     elif told:

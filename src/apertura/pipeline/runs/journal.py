@@ -43,7 +43,7 @@ def step_of(command: str | None, rule: str, wildcards: Sequence[str]) -> tuple[s
 
 
 @dataclass
-class Job:
+class JobRecord:
     """A job that began.
 
     Attributes
@@ -81,7 +81,7 @@ class Job:
 
 
 @dataclass
-class Run:
+class RunRecord:
     """A run as its journal tells it.
 
     Attributes
@@ -101,7 +101,7 @@ class Run:
     """
 
     planned: dict[str, int] = field(default_factory=dict)
-    jobs: dict[int, Job] = field(default_factory=dict)
+    jobs: dict[int, JobRecord] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     cores: int = 0
     status: int | None = None
@@ -109,17 +109,17 @@ class Run:
     ended_s: float | None = None
 
     @property
-    def finished(self) -> list[Job]:
+    def finished(self) -> list[JobRecord]:
         """Jobs that ended well."""
         return [job for job in self.jobs.values() if not job.running and not job.failed]
 
     @property
-    def running(self) -> list[Job]:
+    def running(self) -> list[JobRecord]:
         """Jobs under way, the oldest first."""
         return [job for job in self.jobs.values() if job.running]
 
     @property
-    def failed(self) -> list[Job]:
+    def failed(self) -> list[JobRecord]:
         """Jobs that failed, and were not tried again."""
         return [job for job in self.jobs.values() if job.failed]
 
@@ -144,7 +144,7 @@ class Run:
             self.planned = {str(rule): int(count) for rule, count in line["jobs"].items() if rule not in _NO_STEPS}
         elif event == "begun" and line["rule"] not in _NO_STEPS:
             step = tuple(str(word) for word in line["step"])
-            self.jobs[int(line["job"])] = Job(str(line["rule"]), step, str(line["log"]), at)
+            self.jobs[int(line["job"])] = JobRecord(str(line["rule"]), step, str(line["log"]), at)
         elif event in {"finished", "failed"} and line["job"] in self.jobs:
             job = self.jobs[line["job"]]
             job.ended_s, job.failed = at, event == "failed"
@@ -156,7 +156,7 @@ class Run:
             self.status, self.ended_s = int(line["status"]), at
 
 
-class Reader:
+class JournalReader:
     """Follows a journal as it grows.
 
     Parameters
@@ -166,10 +166,10 @@ class Reader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.run = path, Run()
+        self.path, self.run = path, RunRecord()
         self._read, self._rest = 0, b""
 
-    def news(self) -> Run:
+    def news(self) -> RunRecord:
         """Return the run as it is told by now."""
         with suppress(OSError), self.path.open("rb") as journal:
             journal.seek(self._read)
@@ -193,7 +193,7 @@ _TAIL = 1 << 16
 _SAID = "error: "
 
 
-def failures(root: Path, run: Run, log: Path) -> Iterator[str]:
+def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
     """Yield what to tell of a run that failed: messages of steps, or what the workflow said, and the logs.
 
     Parameters

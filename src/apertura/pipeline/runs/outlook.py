@@ -17,7 +17,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import places
 from apertura.pipeline.resources import Resources
 from apertura.pipeline.rules import RULES, Cost
-from apertura.pipeline.runs.journal import LAST_S, Job, Run
+from apertura.pipeline.runs.journal import LAST_S, JobRecord, RunRecord
 
 _MOST_BENCHMARKS = 500
 _LONGEST_S = 1e8
@@ -25,7 +25,7 @@ _UNREADABLE = (OSError, ValueError, KeyError, TypeError, StopIteration, csv.Erro
 
 
 @dataclass(frozen=True)
-class Told:
+class StepProgress:
     """How far a step says it is: `done` of `total` since an instant, seconds since the epoch."""
 
     what: str
@@ -35,7 +35,7 @@ class Told:
     at_s: float
 
     @classmethod
-    def by(cls, campaign: Campaign, job: Job) -> "Told | None":
+    def of(cls, campaign: Campaign, job: JobRecord) -> "StepProgress | None":
         """Return what a job tells; None if nothing."""
         with suppress(CampaignError, OSError, ValueError, KeyError, TypeError):
             said = json.loads(campaign.result(*told_at(job.step)).read_text("utf-8"))
@@ -67,9 +67,10 @@ class Outlook:
         sizes = Resources(campaign)
         self._expected = cache(lambda rule, where: sizes.expected_seconds(rule, *where))
 
-    def _expects(self, run: Run, rule: str, where: tuple[str, ...]) -> float:
+    def _expects(self, run: RunRecord, rule: str, where: tuple[str, ...]) -> float:
         """Return the seconds of a job before anything was timed; the tiles of a pair may be the work of many."""
-        shares = run.planned.get(rule, 0) / max(len(self._places(rule)), 1) if rule == "tiles" else 1.0
+        shared = rule in RULES and RULES[rule].shares
+        shares = run.planned.get(rule, 0) / max(len(self._places(rule)), 1) if shared else 1.0
         return self._expected(rule, where[:2]) / max(shares, 1.0)
 
     @cached_property
@@ -80,7 +81,7 @@ class Outlook:
             ratios[rule].append(seconds / self._expected(rule, where))
         return ratios
 
-    def _ratios(self, run: Run) -> dict[str, float]:
+    def _ratios(self, run: RunRecord) -> dict[str, float]:
         """Return rule → how much longer than expected its jobs take; the rule '' stands for all others."""
         now: dict[str, list[float]] = defaultdict(list)
         for job in run.finished[-_MOST_BENCHMARKS:]:
@@ -88,7 +89,7 @@ class Outlook:
         known = {rule: median(ratios) for rule, ratios in {**self._before, **now}.items()}
         return {**known, "": median(known.values()) if known else 1.0}
 
-    def of_jobs(self, run: Run, now_s: float, told: dict[int, Told | None]) -> dict[int, float]:
+    def of_jobs(self, run: RunRecord, now_s: float, told: dict[int, StepProgress | None]) -> dict[int, float]:
         """Return number of a job → seconds that it will still run, of those that do."""
         ratios, left = self._ratios(run), {}
         for number, job in run.jobs.items():
@@ -99,7 +100,7 @@ class Outlook:
                 left[number] = max(whole - job.seconds(now_s), 0.0) if paced is None else paced
         return left
 
-    def of_run(self, run: Run, running: dict[int, float]) -> float:
+    def of_run(self, run: RunRecord, running: dict[int, float]) -> float:
         """Return the seconds until all is done: all work over all cores, and no less than one step after the other."""
         ratios = self._ratios(run)
         waiting = {

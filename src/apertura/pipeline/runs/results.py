@@ -22,8 +22,6 @@ from apertura.pipeline.store import read_manifest
 _HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
 _COLOURS = {"finished": "green", "stale": "yellow", "missing": ""}
 
-Place = tuple[str, ...]
-
 _LOCK = ".zarr.lock"
 _OWN = {"logs": ".log", "benchmarks": ".tsv", ".hashes": ".json", RUN: ""}
 """Folder of the results → how the names of the files end that a run leaves there."""
@@ -58,10 +56,10 @@ def print_list(campaign: Campaign) -> None:
     )
 
 
-def states(campaign: Campaign) -> dict[Place, dict[str, list[str]]]:
+def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
     """Return place below the results → finished, stale, missing → names of results."""
     stale = stale_results(campaign)
-    found: dict[Place, dict[str, list[str]]] = defaultdict(lambda: {state: [] for state in _COLOURS})
+    found: dict[tuple[str, ...], dict[str, list[str]]] = defaultdict(lambda: {state: [] for state in _COLOURS})
     for name, result in results_of(campaign):
         there = (campaign.root / result.manifest).is_file()
         place = Path(result.manifest).parent.parts[1:]
@@ -71,7 +69,7 @@ def states(campaign: Campaign) -> dict[Place, dict[str, list[str]]]:
     return dict(found)
 
 
-def _sizes(results: Path, places: set[Place]) -> dict[Place, int]:
+def _sizes(results: Path, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     """Return how many bytes lie in each place; what lies in no other counts for the campaign."""
     sizes = dict.fromkeys({*places, ()}, 0)
     for folder, _, names in os.walk(results):

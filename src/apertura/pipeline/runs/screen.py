@@ -11,8 +11,8 @@ from apertura.common.errors import shown
 from apertura.common.processes import INTERRUPTED, holder
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.runs.journal import Job, Reader, Run, failures
-from apertura.pipeline.runs.outlook import Outlook, Told
+from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, failures
+from apertura.pipeline.runs.outlook import Outlook, StepProgress
 from apertura.pipeline.runs.results import states
 
 if TYPE_CHECKING:
@@ -68,10 +68,10 @@ class Bar:
         return f"about {about(self.left_s)} left"
 
 
-def bars(campaign: Campaign, run: Run, outlook: Outlook) -> list[Bar]:
+def bars(campaign: Campaign, run: RunRecord, outlook: Outlook) -> list[Bar]:
     """Return a bar for each job under way, the oldest first, and in the end one of the whole run."""
     now_s = time.time()
-    told = {number: Told.by(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
+    told = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
     left = outlook.of_jobs(run, now_s, told)
     steps = [_bar(job, told.get(number), left[number], now_s) for number, job in _running(run).items()]
     done = len(run.finished) + sum(bar.fraction for bar in steps)
@@ -79,11 +79,11 @@ def bars(campaign: Campaign, run: Run, outlook: Outlook) -> list[Bar]:
     return [*steps, whole]
 
 
-def _running(run: Run) -> dict[int, Job]:
+def _running(run: RunRecord) -> dict[int, JobRecord]:
     return {number: job for number, job in run.jobs.items() if job.running}
 
 
-def _bar(job: Job, told: Told | None, left_s: float, now_s: float) -> Bar:
+def _bar(job: JobRecord, told: StepProgress | None, left_s: float, now_s: float) -> Bar:
     if told:
         return Bar(job.name, f"{told.done} of {told.total} {told.what}", told.done / told.total, left_s)
     passed = max(job.seconds(now_s), 0.0)
@@ -145,7 +145,7 @@ class Screen:
         if self._live:
             self._live.stop()
 
-    def update(self, run: Run) -> None:
+    def update(self, run: RunRecord) -> None:
         """Show what is new."""
         whole: Bar | None = None  # of many jobs; the same for all that have ended since
         for number, job in [] if self._quiet else run.jobs.items():
@@ -162,12 +162,12 @@ class Screen:
             rows = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
             self._live.update(Constrain(rows, self._live.console.width - _MARGIN), refresh=True)
 
-    def ended(self, run: Run) -> None:
+    def ended(self, run: RunRecord) -> None:
         """Say that all is done."""
         done = f"{run.total} steps done in {span((run.ended_s or time.time()) - run.begun_s)}"
         self._line(done if run.planned else NOTHING)
 
-    def _ended(self, job: Job, whole: Bar | None) -> None:
+    def _ended(self, job: JobRecord, whole: Bar | None) -> None:
         word = "failed" if job.failed else "done"
         if self._live:
             self._live.console.print(_line(word, job))
@@ -180,7 +180,7 @@ class Screen:
             print(line, file=self._stream, flush=True)
 
 
-def _line(word: str, job: Job) -> "Table":
+def _line(word: str, job: JobRecord) -> "Table":
     """Return the line of a job that has ended, for a terminal."""
     from rich.table import Table
     from rich.text import Text
@@ -209,7 +209,7 @@ def _clock(at_s: float) -> str:
 
 def print_status(campaign: Campaign) -> None:
     """Print whether a run is under way, who holds it, its steps and the time left; or how the last one ended."""
-    run = Reader(campaign.result(RUN, "journal.jsonl")).news()
+    run = JournalReader(campaign.result(RUN, "journal.jsonl")).news()
     held = holder(campaign.root)
     if held:
         print(f"a run is under way: {held}")
@@ -228,7 +228,7 @@ def print_status(campaign: Campaign) -> None:
         print(", ".join(f"{count} results {state}" for state, count in counts.items() if count))
 
 
-def _print_steps(campaign: Campaign, run: Run) -> None:
+def _print_steps(campaign: Campaign, run: RunRecord) -> None:
     from rich.console import Console
 
     print(f"done: {listed(Counter(job.rule for job in run.finished)) or 'nothing yet'}")
@@ -243,7 +243,7 @@ def _print_steps(campaign: Campaign, run: Run) -> None:
         print(f"to come: {listed(run.waiting)}")
 
 
-def _how_it_ended(run: Run) -> str:
+def _how_it_ended(run: RunRecord) -> str:
     if not run.begun_s:
         return "no run is under way, and none is remembered"
     begun = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.begun_s))

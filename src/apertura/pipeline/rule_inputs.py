@@ -1,0 +1,236 @@
+"""What the rows of rules quote: what a job runs on, and the files and settings there that no name of a result says.
+
+Nothing is imported here but what a function needs when it is called: the command line reads the rows.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from apertura.pipeline.campaign import Campaign
+
+
+class Scope(Enum):
+    """What a rule runs on, and the wildcards of its jobs, as Snakemake has them."""
+
+    NODE = "node", ("flight", "node")
+    PAIR = "pair", ("flight", "pair")
+    FLIGHT = "flight", ("flight",)
+    TWO = "two images", ("two",)
+    CAMPAIGN = "campaign", ()
+    CHARTED = "charted pair", ()
+
+    def __init__(self, _: str, wildcards: tuple[str, ...]) -> None:
+        self.wildcards = wildcards
+
+
+@dataclass(frozen=True)
+class JobPlace:
+    """What one job runs on.
+
+    Attributes
+    ----------
+    campaign
+        Settings and flights.
+    of
+        Kind of the place.
+    where
+        Values of the wildcards.
+    """
+
+    campaign: "Campaign"
+    of: Scope
+    where: tuple[str, ...]
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Flight and pair of every image that the place covers."""
+        campaign = self.campaign
+        if self.of is Scope.PAIR:
+            return [(self.where[0], self.where[1])]
+        if self.of is Scope.FLIGHT:
+            return [(self.where[0], pair) for pair in campaign.flight(self.where[0]).pairs]
+        if self.of is Scope.TWO:
+            return [(flight, pair) for flight, pair in campaign.settings.interferometry.images(self.where[0])]
+        if self.of is Scope.CHARTED:
+            return [charted(campaign)]
+        return [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
+
+    def below(self, of: Scope) -> list[tuple[str, ...]]:
+        """Return the places of another kind that belong to this one, each once.
+
+        Examples
+        --------
+        >>> JobPlace(None, Scope.PAIR, ("f01", "uav1-uav2")).below(Scope.NODE)
+        [('f01', 'uav1'), ('f01', 'uav2')]
+        """
+        if of is self.of:
+            return [self.where]
+        if of is Scope.CAMPAIGN:
+            return [()]
+        if of is Scope.NODE:
+            found: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
+        elif of is Scope.FLIGHT:
+            found = ((name,) for name, _ in self.pairs)
+        else:
+            found = self.pairs
+        return list(dict.fromkeys(found))
+
+
+SourceSpec = str | Callable[[JobPlace], Iterable[str]]
+SettingSpec = str | Callable[[JobPlace], Mapping[str, Any]]
+"""What a row states of a result: a name, or a function of the place that returns further ones."""
+
+
+def charted(campaign: "Campaign") -> tuple[str, str]:
+    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is."""
+    return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
+
+
+def is_sampled(campaign: "Campaign") -> bool:
+    """Return whether samples were recorded, and not phase histories."""
+    from apertura.pipeline.config import SampledWaveform
+
+    return isinstance(campaign.settings.waveform, SampledWaveform)
+
+
+def recording(place: JobPlace) -> Iterable[str]:
+    """Return the files of what a node recorded."""
+    return map(place.campaign.relative, place.campaign.recording_files(*place.where))
+
+
+def log(place: JobPlace) -> Iterable[str]:
+    """Return a node's flight log."""
+    return [place.campaign.relative(place.campaign.track_file(*place.where))]
+
+
+def transmitted_and_received(place: JobPlace) -> Iterable[str]:
+    """Return the files that an echo is read from, and the calibration that it is corrected by."""
+    campaign, (flight, pair) = place.campaign, place.where
+    nodes = list(dict.fromkeys(pair.split("-")))
+    if not is_sampled(campaign):
+        logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
+        return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
+    samples = [campaign.recording_files(flight, node)[-1] for node in nodes]
+    files = [campaign.relative(path) for path in (campaign.sent_file, *samples)]
+    calibration = campaign.settings.calibration
+    if calibration is not None and campaign.flight(flight).kind == "image":
+        files.append(campaign.manifest("calibration", calibration.flight))
+    return files
+
+
+def echoes_that_bound_the_scene(place: JobPlace) -> Iterable[str]:
+    """Return the echoes that decide the grid, where the config leaves it open."""
+    campaign, stated = place.campaign, place.campaign.settings.scene
+    first = campaign.image_flights[0]
+    by_flight = "auto" in {stated.crs, stated.spacing_m, stated.bounds_m}
+    return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if by_flight else []
+
+
+def heights(place: JobPlace) -> Iterable[str]:
+    """Return the files of the DEM and of the geoid."""
+    return map(place.campaign.relative, place.campaign.height_files().values())
+
+
+def patterns(place: JobPlace) -> Iterable[str]:
+    """Return the files of the sampled patterns of the pairs' antennas."""
+    files = (path for _, pair in place.pairs for path in place.campaign.pattern_files(pair).values())
+    return map(place.campaign.relative, files)
+
+
+def autofocused(place: JobPlace) -> Iterable[str]:
+    """Return what autofocus forms images from; nothing where it is off."""
+    if place.campaign.settings.processing.autofocus == "off":
+        return []
+    stages = [place.campaign.manifest(stage, *pair) for pair in place.pairs for stage in ("echo", "profile")]
+    return [*stages, *patterns(place)]
+
+
+def transmitter_raw(place: JobPlace) -> Iterable[str]:
+    """Return the manifest of what the transmitter recorded."""
+    campaign, (flight, pair) = place.campaign, place.where
+    return [campaign.manifest("raw", flight, pair.partition("-")[0])] if is_sampled(campaign) else []
+
+
+def truth(place: JobPlace) -> Iterable[str]:
+    """Return where targets were put, of a simulation."""
+    return ["truth.json"] if (place.campaign.root / "truth.json").is_file() else []
+
+
+def everything_recorded(place: JobPlace) -> Iterable[str]:
+    """Return every file that was recorded."""
+    campaign = place.campaign
+    nodes = [(flight.name, node) for flight in campaign.flights for node in flight.nodes]
+    return [campaign.relative(path) for at in nodes for path in campaign.raw_files(*at).values()]
+
+
+def config_files(place: JobPlace) -> Iterable[str]:
+    """Return the files of the config that are there."""
+    from apertura.pipeline.config import CLOCKS, CONFIG, FLIGHTS, SEGMENTS
+
+    files = (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
+    return [path.as_posix() for path in files if (place.campaign.root / path).is_file()]
+
+
+def everything(place: JobPlace) -> Mapping[str, Any]:
+    """Return all settings."""
+    return place.campaign.values
+
+
+def log_settings(place: JobPlace) -> Mapping[str, Any]:
+    """Return how a node's log is read."""
+    stated = place.campaign.values["nodes"][place.where[1]]["log"]
+    return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
+
+
+def antennas(place: JobPlace) -> Mapping[str, Any]:
+    """Return the beams of the pairs' antennas."""
+    beams = {point: beam.model_dump(mode="json") for point, (_, beam) in _beams(place).items()}
+    return {"antennas": beams} if beams else {}
+
+
+def _beams(place: JobPlace) -> Mapping[str, tuple[str, Any]]:
+    return {point: beam for _, pair in place.pairs for point, beam in place.campaign.antennas(pair).items()}
+
+
+def pair_settings(place: JobPlace) -> Mapping[str, Any]:
+    """Return what matters for a pair's echo: its nodes, whether there are beams, not what they are."""
+    campaign, (flight, pair) = place.campaign, place.where
+    nodes = {
+        node: {key: value for key, value in campaign.values["nodes"][node].items() if key != "antennas"}
+        for node in pair.split("-")
+    }
+    stated = {
+        "beams": sorted(_beams(place)),
+        "segments": [list(segment) for segment in campaign.segments_of(flight, pair)],
+        "clocks": [asdict(one) for one in campaign.clocks if one.flight == flight and one.node in nodes],
+    }
+    return {"nodes": nodes, **{name: value for name, value in stated.items() if value}}
+
+
+def grid(place: JobPlace) -> Mapping[str, Any]:
+    """Return what decides the grid."""
+    stated = place.campaign.values["scene"]
+    return {"scene": {key: value for key, value in stated.items() if key != "reference_points"}}
+
+
+_BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
+_AFTER_THE_IMAGE = frozenset({"fusion"})
+
+
+def imaging(place: JobPlace) -> Mapping[str, Any]:
+    """Return all settings of the processing but those of other rules: a new one counts for the image."""
+    processing = place.campaign.values["processing"]
+    return {name: value for name, value in processing.items() if name not in _BEFORE_THE_IMAGE | _AFTER_THE_IMAGE}
+
+
+def two_images(place: JobPlace) -> Mapping[str, Any]:
+    """Return flight and pair of the images compared."""
+    return {"images": place.pairs}
+
+
+def charted_pair(place: JobPlace) -> Mapping[str, Any]:
+    """Return the pair that is charted."""
+    return {"pair": list(charted(place.campaign))}
