@@ -19,13 +19,13 @@ EVERY_SECOND = np.timedelta64(50, "ms") * np.arange(0, 80, 2)
 START = np.datetime64("2025-05-14T09:30", "ns")
 
 
-def told(root, **options):
+def reported(root, **options):
     return [as_line(problem).replace(f"{root}/", "") for problem in problems(root, **options)]
 
 
 def only(root):
     """The one problem there is."""
-    lines = told(root)
+    lines = reported(root)
     assert len(lines) == 1, lines
     return lines[0]
 
@@ -55,19 +55,19 @@ def renumber(first, node):
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_is_without_problems(tmp_path, name):
     short = simulate(tmp_path / "campaign", preset(name, pulses=8))
-    assert told(short, without=["segments"]) == []  # of the whole flight
+    assert reported(short, without=["segments"]) == []  # of the whole flight
 
 
 def test_the_sample_is_without_problems(shared):
-    assert told(shared / "campaign-sample", without=["results"]) == []
+    assert reported(shared / "campaign-sample", without=["results"]) == []
 
 
-def test_problems_of_every_kind_are_told_at_once(tiny):
+def test_problems_of_every_kind_are_reported_at_once(tiny):
     (tiny / "raw/f01/uav2.sigmf-data").unlink()
     np.save(tiny / "raw/codes.npy", np.ones(5, np.complex64))
     edit_config(tiny, lambda document: document["scene"].update(crs="EPSG:4326"))
     edit_meta(tiny, "uav1", lambda meta: meta["global"].update({"core:sample_rate": 1.0e9}))
-    lines = told(tiny)
+    lines = reported(tiny)
     for beginning in (
         "raw/f01/uav2.sigmf-data: no such file",
         "raw/codes.npy: complex64 of shape (5,)",
@@ -78,11 +78,11 @@ def test_problems_of_every_kind_are_told_at_once(tiny):
     assert len(lines) == 4
 
 
-def test_config_flights_and_segments_are_told_of_together(tiny):
+def test_config_flights_and_segments_are_reported_of_together(tiny):
     edit_config(tiny, lambda document: document["scene"].update(spacing=0.1))
     (tiny / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\tpicture\tuav1\tuav1\n")
     (tiny / "config/segments.tsv").write_text("flight\tpair\tstart\tend\nf01\tuav1-uav9\t2025-05-14\t2025-05-15\n")
-    config, flights, segments = told(tiny)
+    config, flights, segments = reported(tiny)
     assert "scene.spacing: unknown key (did you mean 'spacing_m'?)" in config
     assert "kind 'picture' is neither image nor calibration" in flights
     assert "flight f01 has no pair 'uav1-uav9'" in segments
@@ -107,7 +107,7 @@ def test_each_line_is_one_problem_and_they_are_counted(tiny):
 
 def test_a_check_that_is_left_out_tells_nothing(tiny):
     (tiny / "raw/codes.npy").unlink()
-    assert told(tiny, without=["files"]) == []
+    assert reported(tiny, without=["files"]) == []
 
 
 def test_an_exception_of_a_check_is_a_defect_and_not_a_problem(tiny, monkeypatch):
@@ -118,7 +118,7 @@ def test_an_exception_of_a_check_is_a_defect_and_not_a_problem(tiny, monkeypatch
 
 def test_samples_are_not_read(tiny):
     edit_data(tiny, "uav1", lambda samples: samples.fill(0))  # ingest refuses captures of zeros
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
 @pytest.mark.slow
@@ -130,11 +130,11 @@ def test_no_library_is_imported_that_headers_do_not_need(tiny):
     assert sorted(set(heavy) & set(done.stdout.split())) == []
 
 
-def test_every_missing_file_is_told(tiny):
+def test_every_missing_file_is_reported(tiny):
     gone = ["raw/codes.npy", "raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-meta", "raw/f01/uav2.track.pos"]
     for name in gone:
         (tiny / name).unlink()
-    lines = told(tiny)
+    lines = reported(tiny)
     assert len(lines) == len(gone)
     for name in gone[:3]:
         assert sum(line.startswith(f"{name}: no such file") for line in lines) == 1
@@ -142,36 +142,36 @@ def test_every_missing_file_is_told(tiny):
 
 
 @pytest.mark.parametrize("name", ["raw/codes.npy", "raw/f01/uav1.sigmf-data", "raw/f01/uav2.track.pos"])
-def test_an_empty_file_is_told_once(tiny, name):
+def test_an_empty_file_is_reported_once(tiny, name):
     (tiny / name).write_bytes(b"")
     assert only(tiny).startswith(f"{name}: empty, 0 bytes")
 
 
 def test_a_transmitter_that_does_not_receive_must_have_recorded_as_well(tiny):
     (tiny / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav2\n")
-    assert told(tiny) == []
+    assert reported(tiny) == []
     (tiny / "raw/f01/uav1.sigmf-meta").unlink()
     assert only(tiny).startswith("raw/f01/uav1.sigmf-meta: no such file")
 
 
-def test_a_campaign_without_a_flight_to_image_is_told(tiny):
+def test_a_campaign_without_a_flight_to_image_is_reported(tiny):
     (tiny / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\tcalibration\tuav1\tuav1\n")
-    assert "config/flights.tsv: 1 flights, none of kind image" in told(tiny)[0]
+    assert "config/flights.tsv: 1 flights, none of kind image" in reported(tiny)[0]
 
 
-def test_results_that_are_no_folder_are_told(tiny):
+def test_results_that_are_no_folder_are_reported(tiny):
     (tiny / "results").write_text("")
     assert only(tiny).startswith("results: is no folder")
 
 
 def test_a_carrier_that_is_not_the_recorded_one_names_each_recording(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(carrier_hz=1.205e9))
-    lines = told(tiny)
+    lines = reported(tiny)
     assert [line.split(":")[0] for line in lines] == ["raw/f01/uav1.sigmf-meta", "raw/f01/uav2.sigmf-meta"]
     assert "core:frequency 1200000000.000000; expected 1205000000.000000" in lines[0]
 
 
-def test_metadata_that_are_not_sigmf_are_told_by_their_reader(tiny):
+def test_metadata_that_are_not_sigmf_are_reported_by_their_reader(tiny):
     edit_meta(tiny, "uav1", lambda meta: meta["captures"][-1].update({"core:sample_start": 10**9}))
     assert "starts at sample 1000000000" in only(tiny)
 
@@ -185,7 +185,7 @@ def test_only_a_node_that_does_not_transmit_needs_a_sidelink(tiny):
 def test_captures_may_be_as_long_as_prefix_and_window_and_no_shorter(tiny):
     for samples, problem in ((1440, False), (1441, True)):  # captures have 4000, the window 2560
         edit_config(tiny, lambda d, samples=samples: d["waveform"].update(cyclic_prefix_s=samples / 1.024e9))
-        lines = told(tiny)
+        lines = reported(tiny)
         assert [f"captures of 4000 samples; expected at least {2560 + samples}" in line for line in lines] == (
             [True, True] if problem else []
         )
@@ -209,7 +209,7 @@ def test_tags_of_a_right_recording_have_the_spacing_of_its_prf(times, prf_hz):
 
 
 @pytest.mark.parametrize(("prf_hz", "ratio"), [(20.0, 2), (30.0, 3), (5.0, 0.5), (13.0, 1.3), (7.5, 0.75)])
-def test_tags_of_another_spacing_are_told(prf_hz, ratio):
+def test_tags_of_another_spacing_are_reported(prf_hz, ratio):
     assert odd_interval_s(START + EVERY_SECOND, prf_hz) == pytest.approx(ratio / prf_hz)
 
 
@@ -221,14 +221,14 @@ def test_every_second_pulse_missing_is_said_so(tiny):
     assert "expected 0.025 s, 1/waveform.prf_hz (40 Hz)" in line
 
 
-def test_a_receiver_whose_tags_fit_no_pulses_is_told(tiny):
+def test_a_receiver_whose_tags_fit_no_pulses_is_reported(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(prf_hz=27.0))
-    assert [line.split(":")[0] for line in told(tiny)] == ["raw/f01/uav1.sigmf-meta", "raw/f01/uav2.sigmf-meta"]
+    assert [line.split(":")[0] for line in reported(tiny)] == ["raw/f01/uav1.sigmf-meta", "raw/f01/uav2.sigmf-meta"]
 
 
-def test_nodes_an_hour_apart_are_told_of_and_half_a_second_is_left_to_a_flag(tiny):
+def test_nodes_an_hour_apart_are_reported_of_and_half_a_second_is_left_to_a_flag(tiny):
     retag(np.timedelta64(500, "ms"))(tiny)
-    assert told(tiny) == []
+    assert reported(tiny) == []
     retag(np.timedelta64(3600, "s"))(tiny)
     line = only(tiny)
     assert line.startswith("raw/f01/uav1.sigmf-meta and uav2.sigmf-meta: recorded 2025-")
@@ -239,15 +239,15 @@ def test_frame_numbers_join_what_tags_do_not(tiny):
     retag(np.timedelta64(3600, "s"))(tiny)
     for node in ("uav1", "uav2"):
         renumber(0, node)(tiny)
-    assert told(tiny) == []
+    assert reported(tiny) == []
     renumber(1000, "uav2")(tiny)
     assert "none in common" in only(tiny)
 
 
-def test_a_segment_without_a_pulse_is_told(tiny):
+def test_a_segment_without_a_pulse_is_reported(tiny):
     table = tiny / "config/segments.tsv"
     table.write_text("flight\tpair\tstart\tend\nf01\tuav1-uav2\t2025-05-14\t2035-05-15\n")
-    assert told(tiny) == []
+    assert reported(tiny) == []
     table.write_text("flight\tpair\tstart\tend\nf01\tuav1-uav2\t2025-05-13\t2025-05-14\n")
     assert "no pulse of flight f01, pair uav1-uav2 inside 2025-05-13T00:00:00…2025-05-14T00:00:00" in only(tiny)
 
@@ -269,16 +269,16 @@ CODES = np.exp(1j * np.arange(1024)).astype(np.complex64)
 )
 def test_codes_are_complex_one_per_subcarrier_finite_and_not_zero(tiny, codes, found):
     np.save(tiny / "raw/codes.npy", codes)
-    assert told(tiny) == [] if found is None else found in only(tiny)
+    assert reported(tiny) == [] if found is None else found in only(tiny)
 
 
 @pytest.mark.parametrize("content", [b"PK\x03\x04 an archive", b"\x93NUMPY\x01\x00", b"\x00"])
-def test_codes_that_are_no_npy_are_told(tiny, content):
+def test_codes_that_are_no_npy_are_reported(tiny, content):
     (tiny / "raw/codes.npy").write_bytes(content)
     assert "not a .npy file" in only(tiny)
 
 
-def test_codes_of_a_shape_that_no_disk_holds_are_told_by_their_header(tiny):
+def test_codes_of_a_shape_that_no_disk_holds_are_reported_by_their_header(tiny):
     np.save(tiny / "raw/codes.npy", CODES)
     whole = (tiny / "raw/codes.npy").read_bytes()
     (tiny / "raw/codes.npy").write_bytes(whole.replace(b"(1024,), }           ", b"(1099511627776, 8), }"))
@@ -292,11 +292,11 @@ def test_the_page_of_checks_has_a_row_for_each_and_for_no_other():
     assert list(dict.fromkeys(rows)) == list(CHECKS)
 
 
-def test_a_file_from_the_future_is_told_with_what_to_do(tiny):
+def test_a_file_from_the_future_is_reported_with_what_to_do(tiny):
     path = tiny / "raw/f01/uav1.sigmf-meta"
     for ahead_s, count in ((2, 0), (7200, 1)):
         os.utime(path, (time.time() + ahead_s,) * 2)
-        lines = told(tiny)
+        lines = reported(tiny)
         assert len(lines) == count
     assert "dated 2.0 h in the future; expected a time that has been, by this machine's clock" in lines[0]
     assert "run `touch raw/f01/uav1.sigmf-meta`" in lines[0]

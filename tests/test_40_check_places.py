@@ -22,13 +22,13 @@ Usage = namedtuple("Usage", "total used free")
 TX, RX = "raw/f01/uav1.track.csv", "raw/f01/uav2.track.pos"
 
 
-def told(root, **options):
+def reported(root, **options):
     return [as_line(problem).replace(f"{root}/", "") for problem in problems(root, **options)]
 
 
 def only(root):
     """The one problem there is."""
-    lines = told(root)
+    lines = reported(root)
     assert len(lines) == 1, lines
     return lines[0]
 
@@ -80,7 +80,7 @@ def test_a_shift_in_time_looks_like_what_makes_it(shift_s, cause):
 
 def test_a_log_may_end_with_the_last_pulse_and_not_before(tiny):
     shift_times(tiny, -1.9)
-    assert told(tiny) == []
+    assert reported(tiny) == []
     shift_times(tiny, -0.2)
     line = only(tiny)
     assert line.startswith(f"{TX}: the log ends 0.")
@@ -93,45 +93,45 @@ def test_a_log_that_ends_with_poor_solutions_is_left_to_what_is_asked_of_it(tiny
         return [*cut[:-3], *(line.replace("   1  18", "   5  18") for line in cut[-3:])]
 
     edit_track(tiny, "uav2", single)
-    assert told(tiny) == []
+    assert reported(tiny) == []
     edit_track(tiny, "uav2", lambda lines: [line.replace("   5  18", "   1  18") for line in lines])
     assert only(tiny).startswith(f"{RX}: the log ends ")
 
 
-def test_a_log_that_is_poor_while_pulses_are_sent_is_told_unless_that_is_allowed(tiny):
+def test_a_log_that_is_poor_while_pulses_are_sent_is_reported_unless_that_is_allowed(tiny):
     def single(lines, first):
         late = [not line.startswith("%") and line.split()[1] > first for line in lines]
         return [line.replace("   1  18", "   2  18") if out else line for line, out in zip(lines, late, strict=True)]
 
     edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:19"))  # pulses from 09:30:18 to 09:30:20 GPST
-    assert told(tiny) == []
+    assert reported(tiny) == []
     edit_track(tiny, "uav2", lambda lines: single(lines, "09:30:17"))
     assert "epochs while pulses were sent have a solution poorer than fix" in only(tiny)
     edit_config(tiny, lambda document: document["nodes"]["uav2"].update(worst_fix="float"))
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
-def test_a_log_that_cannot_be_read_is_told_by_its_reader(tiny):
+def test_a_log_that_cannot_be_read_is_reported_by_its_reader(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     assert "the same time as the epoch before" in only(tiny)
 
 
 def test_an_epoch_at_no_place_is_left_out_of_the_log(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:30], zero(lines[30]), *lines[31:]])
-    assert told(tiny) == []
+    assert reported(tiny) == []
     track = read_log(Campaign.load(tiny), "f01", "uav1")
     assert track.sizes["epoch"] == 60
     assert track.attrs["dropped"] == {"no fix": 1}
 
 
 @pytest.mark.parametrize(("epoch", "time"), [(1, "09:29:30"), (-1, "09:30:30")])
-def test_epochs_at_no_place_long_before_or_after_are_not_told(tiny, epoch, time):
+def test_epochs_at_no_place_long_before_or_after_are_not_reported(tiny, epoch, time):
     def moved(lines):
         lines[epoch] = zero(f"2025-05-14T{time}.000000Z,{lines[epoch].split(',', 1)[1]}")
         return lines
 
     edit_track(tiny, "uav1", moved)
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
 def zero(line):
@@ -139,17 +139,17 @@ def zero(line):
     return f"{time},0.0,0.0,{rest}"
 
 
-def test_a_log_without_heights_is_told_of(tiny):
+def test_a_log_without_heights_is_reported_of(tiny):
     edit_place(tiny, lambda latitude, longitude, _: (latitude, longitude, 0.0))
-    lines = told(tiny)
+    lines = reported(tiny)
     assert lines[0].startswith(f"{TX}: height 0 at every epoch")
 
 
 def test_nobody_flies_faster_than_sound(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto"))
-    for stretched, told_of in ((500, False), (3, True)):  # from half a metre per second
+    for stretched, reported_of in ((500, False), (3, True)):  # from half a metre per second
         edit_place(tiny, lambda latitude, *rest, by=stretched: (48.4226 + by * (latitude - 48.4226), *rest))
-        assert any(line.startswith(f"{TX}: a median speed of") for line in told(tiny)) is told_of
+        assert any(line.startswith(f"{TX}: a median speed of") for line in reported(tiny)) is reported_of
 
 
 def test_an_attitude_is_missed_where_an_arm_needs_it(tiny):
@@ -158,12 +158,12 @@ def test_an_attitude_is_missed_where_an_arm_needs_it(tiny):
     assert line.startswith(f"{TX}: no roll, pitch and yaw")
     assert "nodes.uav1.attitude is log" in line
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
 def test_latitude_and_longitude_swapped_in_one_log_puts_the_earth_between_nodes(tiny):
     edit_place(tiny, lambda latitude, longitude, up: (longitude, latitude, up), node="uav2")
-    lines = told(tiny)
+    lines = reported(tiny)
     assert f"{RX}: 5393 km from uav1: latitude 9.95" in "\n".join(lines)
     assert "expected nodes in sight of each other" in "\n".join(lines)
 
@@ -211,7 +211,7 @@ def test_bounds_in_degrees_look_like_degrees(tiny):
     assert "These look like degrees" in line
 
 
-def test_bounds_with_northing_first_are_told_so(tiny):
+def test_bounds_with_northing_first_are_reported_so(tiny):
     xmin, ymin, xmax, ymax = bounds_of(tiny)
     state(tiny, "scene", bounds_m=[ymin, xmin, ymax, xmax])
     assert "easting before northing" in only(tiny)
@@ -221,9 +221,9 @@ def test_a_scene_is_far_where_no_echo_of_it_arrives_inside_the_prefix(tiny):
     xmin, ymin, xmax, ymax = bounds_of(tiny)
     for north_m, far in ((90.0, False), (130.0, True)):  # 234 m of total path
         state(tiny, "scene", bounds_m=[xmin, ymin + north_m, xmax, ymax + north_m])
-        assert bool(told(tiny)) is far
+        assert bool(reported(tiny)) is far
     state(tiny, "waveform", cyclic_prefix_s=1.4e-6)
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
 @pytest.mark.parametrize(
@@ -245,9 +245,9 @@ def test_a_crs_must_be_projected_in_metres(tiny, crs, found):
         assert "Set scene.crs to EPSG:32632, and scene.bounds_m in metres of it" in line
 
 
-def test_a_zone_that_the_track_is_not_in_is_told_where_bounds_are_auto(tiny):
+def test_a_zone_that_the_track_is_not_in_is_reported_where_bounds_are_auto(tiny):
     state(tiny, "scene", crs="EPSG:32633", bounds_m="auto")  # 2° outside: of use there
-    assert told(tiny) == []
+    assert reported(tiny) == []
     state(tiny, "scene", crs="EPSG:32635")
     assert "EPSG:32635 (WGS 84 / UTM zone 35N) is not made for where the track lies" in only(tiny)
 
@@ -265,7 +265,7 @@ def test_a_zone_that_the_track_is_not_in_is_told_where_bounds_are_auto(tiny):
 )
 def test_what_is_auto_and_what_is_near_is_no_problem(tiny, keys):
     state(tiny, "scene", **keys)
-    assert told(tiny) == []
+    assert reported(tiny) == []
 
 
 def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
@@ -279,14 +279,14 @@ def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
     )
     (tmp_path / "config/config.yaml").write_text(config)
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tradar\tradar\n")
-    assert told(tmp_path) == []
+    assert reported(tmp_path) == []
     state(tmp_path, "scene", crs="EPSG:32616")
     assert "EPSG:32616 for positions in metres of a frame of their own; expected local" in only(tmp_path)
 
 
 def test_a_track_must_be_above_the_ground(tiny):
     state(tiny, "scene", height_m=624.0)
-    assert told(tiny) == []
+    assert reported(tiny) == []
     state(tiny, "scene", height_m=626.0)
     line = only(tiny)
     assert line.startswith("config/config.yaml: scene.height_m: flight f01, uav1, uav2: -1.")
@@ -296,7 +296,7 @@ def test_a_track_must_be_above_the_ground(tiny):
 def test_a_track_is_not_30_km_above_the_ground(tiny):
     for height_m, high in ((-29_000.0, False), (-30_000.0, True)):
         state(tiny, "scene", height_m=height_m)
-        lines = told(tiny)
+        lines = reported(tiny)
         assert any("m above the ground: check heights in the logs" in line for line in lines)  # no echo comes back
         assert any("expected a node above the ground, by at most 30 km" in line for line in lines) is high
 
@@ -332,9 +332,9 @@ def with_post(height_m, row=30, column=30):
     ],
     ids=["flat", "cliff", "mast", "spike", "pit", "far beside", "beside"],
 )
-def test_a_post_that_stands_out_by_kilometres_is_told_and_a_cliff_is_not(tiny, heights, spike):
+def test_a_post_that_stands_out_by_kilometres_is_reported_and_a_cliff_is_not(tiny, heights, spike):
     write_dem(tiny, heights)
-    lines = [line for line in told(tiny) if "stand out so" in line]
+    lines = [line for line in reported(tiny) if "stand out so" in line]
     assert bool(lines) is spike
     assert all(line.startswith("dem.tif: ") and "where the land about it has 600 m" in line for line in lines)
 
@@ -352,25 +352,25 @@ def test_needles_are_narrower_than_a_window_and_higher_than_asked():
     assert not needles(spiked, taller_than_m=500.0).any()
 
 
-def test_a_dem_that_ends_inside_the_scene_is_told(tiny):
+def test_a_dem_that_ends_inside_the_scene_is_reported(tiny):
     write_dem(tiny, FLAT, east_m=28.0)
     assert "% of the scene lies outside the DEM, to the west" in only(tiny)
 
 
 def test_heights_that_are_not_on_earth_matter_under_the_scene_alone(tiny):
     write_dem(tiny, with_post(-32767.0, row=25))  # 5 m north of the middle of 6 m
-    assert told(tiny) == []
+    assert reported(tiny) == []
     write_dem(tiny, with_post(-32767.0))
     assert "have no height on Earth" in only(tiny)
 
 
-def test_a_track_below_the_dem_is_told(tiny):
+def test_a_track_below_the_dem_is_reported(tiny):
     write_dem(tiny, FLAT + 27)
     edit_place(tiny, lambda *place: (DEMO_ORIGIN.latitude_deg, DEMO_ORIGIN.longitude_deg, place[2]))
     assert only(tiny).startswith("config/config.yaml: scene.dem: flight f01, uav1: -2.")
 
 
-def test_a_dem_that_is_none_is_told(tiny):
+def test_a_dem_that_is_none_is_reported(tiny):
     write_dem(tiny, FLAT)
     (tiny / "dem.tif").write_bytes(b"no raster")
     assert "dem.tif: not readable" in only(tiny)
@@ -389,7 +389,7 @@ def test_a_calibration_flight_calibrates_every_pair(tiny):
     fly_calibration(tiny)
     assert "no section calibration" in only(tiny)
     edit_config(tiny, lambda document: document.update(calibration=CALIBRATION))
-    assert told(tiny) == []
+    assert reported(tiny) == []
     fly_nodes = (tiny / "config/flights.tsv").read_text().replace("c01\tcalibration\tuav1\tuav1,uav2", "{}")
     (tiny / "config/flights.tsv").write_text(fly_nodes.format("c01\tcalibration\tuav1\tuav1"))
     assert "flight f01 has pairs uav1-uav2, which c01 did not calibrate" in only(tiny)
@@ -399,7 +399,7 @@ def test_a_calibration_flight_calibrates_every_pair(tiny):
     assert "calibration.flight: flight c01 is not in the table" in only(tiny)
 
 
-def test_a_reflector_out_of_reach_is_told(tiny):
+def test_a_reflector_out_of_reach_is_reported(tiny):
     fly_calibration(tiny)
     swapped = CALIBRATION | {"reflector_m": [5363700.0, 570660.0, 620.0]}
     edit_config(tiny, lambda document: document.update(calibration=swapped))
@@ -409,7 +409,7 @@ def test_a_reflector_out_of_reach_is_told(tiny):
     assert "unknown to PROJ" in only(tiny)
 
 
-def test_a_beam_pattern_that_is_none_is_told(tiny):
+def test_a_beam_pattern_that_is_none_is_reported(tiny):
     (tiny / "config/horn.csv").write_text("cut,angle_deg,gain_db\nazimuth,0,0\n")
     antenna = {"boresight_deg": [90, -20], "pattern": "config/horn.csv"}
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(antennas={"radar_rx": antenna}))
@@ -425,13 +425,13 @@ def swell(root, size):
 def test_memory_must_hold_the_metadata_of_the_longest_recording_and_no_samples(tiny, monkeypatch):
     swell(tiny, 4_000_000_000)
     monkeypatch.setattr(resources, "free_memory", lambda: 400_000_000)
-    assert told(tiny, without=["disk"]) == []
+    assert reported(tiny, without=["disk"]) == []
     monkeypatch.setattr(resources, "_CAPTURE_BYTES", 400_000_000)
-    line = told(tiny, without=["disk"])
+    line = reported(tiny, without=["disk"])
     assert re.search(
         r"\d+ captures of uav\d in f01 take at least .* GB of memory; expected at most the 0.4 GB", line[0]
     )
-    assert told(tiny, without=["disk", "memory"]) == []
+    assert reported(tiny, without=["disk", "memory"]) == []
 
 
 def test_free_memory_is_what_is_available_and_no_more_than_the_limit(tmp_path):
@@ -443,7 +443,7 @@ def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):
     swell(tiny, 400_000_000)  # samples stay where they are
     free = {"bytes": 400_000_000}
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, free["bytes"]))
-    assert told(tiny) == []
+    assert reported(tiny) == []
     free["bytes"] = 1_000
     line = only(tiny)
     assert re.search(r"results take at least \d+ MB more \(.*echo \d+ MB", line)

@@ -44,7 +44,7 @@ def drawn(report, path):
     return image.imread(path)
 
 
-def test_a_csv_log_is_told_as_its_own_columns_say(shared):
+def test_a_csv_log_is_reported_as_its_own_columns_say(shared):
     rows = rows_of(F01 / "uav1.track.csv")
     report = look(F01 / "uav1.track.csv")
     assert (report.kind, report.format, report.problem) == ("flight log", "csv", None)
@@ -83,7 +83,7 @@ def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_p
 
 
 @pytest.mark.parametrize("file", ["uav1.sigmf-meta", "uav1.sigmf-data"])
-def test_a_recording_is_told_as_its_metadata_and_samples_say(shared, file):
+def test_a_recording_is_reported_as_its_metadata_and_samples_say(shared, file):
     meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
     report = look(F01 / file)
     length = meta["captures"][1]["core:sample_start"]
@@ -121,7 +121,7 @@ def test_a_recording_of_one_capture_is_no_pulses(shared):
     assert any(sentence.startswith("pulses: it is one capture") for sentence in report.missing)
 
 
-def test_phase_history_is_told_as_its_fields_say(shared):
+def test_phase_history_is_reported_as_its_fields_say(shared):
     path = SHARED / "gotcha_afrl/data_3dsar_pass1_az001_HH.mat"
     fields = scipy.io.loadmat(path, squeeze_me=True)["data"]
     frequency, x = (np.ravel(fields[name].item()) for name in ("freq", "x"))
@@ -155,7 +155,7 @@ def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set
     assert raised == pytest.approx(10.0, abs=1e-6)
 
 
-def test_a_ulog_is_told_as_its_own_messages_say(shared):
+def test_a_ulog_is_reported_as_its_own_messages_say(shared):
     path = SHARED / "px4_real_flight/esc_status_log.ulg"
     gps = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
     report = look(path)
@@ -174,22 +174,22 @@ def test_a_dem_says_what_its_heights_lack(shared):
     assert any("scene.dem_datum" in sentence for sentence in report.missing)
 
 
-def test_a_campaign_is_told_node_by_node(shared):
+def test_a_campaign_is_reported_node_by_node(shared):
     report = look(SHARED / "campaign-sample")
     assert (report.kind, report.missing) == ("campaign folder", ())
-    told = {part.path.name: part.facts for part in report.parts}
+    reported = {part.path.name: part.facts for part in report.parts}
     for node in ("uav1", "uav2"):
         meta = json.loads((F01 / f"{node}.sigmf-meta").read_text())
         times = np.array([one["core:datetime"][:-1] for one in meta["captures"]], "datetime64[ns]")
         steps = np.diff(times) / np.timedelta64(50, "ms")
-        assert told[node]["captures"] == len(times)
-        assert told[node]["lost"] == round(steps.sum() - steps.size)
-        assert told[node]["prf_hz"] == pytest.approx(20.0)
-        assert told[node]["captures_inside_log_share"] == 1.0
-    assert told["uav2"]["fix"] == {"fix": 108}
+        assert reported[node]["captures"] == len(times)
+        assert reported[node]["lost"] == round(steps.sum() - steps.size)
+        assert reported[node]["prf_hz"] == pytest.approx(20.0)
+        assert reported[node]["captures_inside_log_share"] == 1.0
+    assert reported["uav2"]["fix"] == {"fix": 108}
 
 
-def test_a_campaign_of_phase_history_is_told_by_the_clock_that_was_aligned(shared, tmp_path):
+def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(shared, tmp_path):
     root = copy_writable(EXAMPLES / "rail_pass", tmp_path / "rail")
     flight, node = (root / "config/flights.tsv").read_text().splitlines()[1].split("\t")[::3]
     raw = root / f"raw/{flight}"
@@ -272,10 +272,8 @@ def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
         assert doctest.OutputChecker().check_output(wanted, printed, flags), printed
 
 
-def test_beats_of_a_campaign_are_told_with_the_times_beside(tmp_path):
-    flight = FmcwFlight(
-        FrequencySweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),)
-    )
+def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
+    flight = FmcwFlight(Sweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),))
     raw = write_fmcw_campaign(tmp_path / "campaign", flight, waveform={}) / "raw/f01"
     times = np.load(raw / "uav1.time.npy")
     for name in ("uav1.npy", "uav1.time.npy"):
@@ -293,9 +291,9 @@ def test_beats_of_a_campaign_are_told_with_the_times_beside(tmp_path):
 def test_times_of_a_campaign_are_whole_on_a_narrow_terminal_and_for_machines(shared):
     meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
     report = look(SHARED / "campaign-sample")
-    told = next(part.facts for part in report.parts if part.path.name == "uav1")
-    assert np.datetime64(told["recorded"]["first_utc"][:-1]) == np.datetime64(meta["captures"][0]["core:datetime"][:-1])
-    assert len(told["logged"]["last_utc"]) == len("2025-05-14T09:30:08.700000000Z")
+    node = next(part.facts for part in report.parts if part.path.name == "uav1")
+    assert np.datetime64(node["recorded"]["first_utc"][:-1]) == np.datetime64(meta["captures"][0]["core:datetime"][:-1])
+    assert len(node["logged"]["last_utc"]) == len("2025-05-14T09:30:08.700000000Z")
     printed = run(SHARED / "campaign-sample", env={**os.environ, "COLUMNS": "50"}).stdout.decode()
     assert max(map(len, printed.splitlines())) <= 50
     assert "…" not in printed

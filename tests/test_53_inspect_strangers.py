@@ -44,7 +44,7 @@ def test_a_broken_file_of_any_suffix_is_a_report_with_a_reason(tmp_path, suffix,
     json.dumps(report.as_json(), allow_nan=False)
 
 
-def test_what_a_reader_fails_of_is_told_and_no_traceback(shared, monkeypatch):
+def test_what_a_reader_fails_of_is_reported_and_no_traceback(shared, monkeypatch):
     monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), "operator:truediv"))
     report = look(F01 / "uav1.track.csv")
     assert report.problem.found.startswith("its reader failed: TypeError")
@@ -70,13 +70,13 @@ def test_hostile_names_are_shown_escaped(tmp_path, capsys, monkeypatch):
     names = [b"new\nline\x1b[31m.csv", b"[red]x[bold].pos", b"\xff\xfe.npy", b"n" * 250 + b".out", b"a\tb"]
     for name in names:
         (tmp_path / os.fsdecode(name)).write_bytes(b"\x1b]0;title\x07" * 99)
-    told = {}
+    reported = {}
     for name in (*names, b""):
         assert inspect_path(tmp_path / os.fsdecode(name)) == (2 if name else 0)
-        told[name] = capsys.readouterr().out.encode()  # what is no UTF-8 would fail
-        assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", told[name])
-    assert b"[red]x[bold].pos" in told[names[1]]
-    assert b"[red]x[bold].pos" in told[b""]
+        reported[name] = capsys.readouterr().out.encode()  # what is no UTF-8 would fail
+        assert not re.search(rb"[\x00-\x09\x0b-\x1f\x7f]", reported[name])
+    assert b"[red]x[bold].pos" in reported[names[1]]
+    assert b"[red]x[bold].pos" in reported[b""]
     done = run("--json", tmp_path)
     assert (done.returncode, done.stderr) == (0, b"")
     assert sorted(os.fsencode(Path(part["path"]).name) for part in json.loads(done.stdout)["parts"]) == sorted(names)
@@ -115,7 +115,7 @@ def test_an_empty_folder_named_zarr_holds_no_group(tmp_path):
     assert "defect" not in report.problem.remedy
 
 
-def test_a_log_that_leaves_times_open_is_told_what_may_be_typed(tmp_path):
+def test_a_log_that_leaves_times_open_is_reported_what_may_be_typed(tmp_path):
     (tmp_path / "a.track.csv").write_text("time,latitude_deg,longitude_deg,height_m\n2025-05-14T09:30:00,48,9,600\n")
     assert "--set time_system=utc|gpst" in look(tmp_path / "a.track.csv").missing[0]
     (tmp_path / "b.track.csv").write_text("time_s,latitude_deg,longitude_deg,height_m\n1,48,9,600\n2,48,9,600\n")

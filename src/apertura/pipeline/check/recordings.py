@@ -12,6 +12,7 @@ from apertura.formats.recordings.recording import Recording
 from apertura.pipeline.check.hints import likely_cause
 from apertura.pipeline.config import CONFIG, SEGMENTS, OfdmWaveform, SampledWaveform
 from apertura.pipeline.examination.campaign import Examination
+from apertura.pipeline.examination.facts import RecordingFacts
 from apertura.pipeline.examination.times import (
     LAG,
     apart_s,
@@ -119,34 +120,34 @@ def check_channels(examined: Examination) -> Iterator[CampaignError]:
         return
     for flight in examined.campaign.flights:
         for node in flight.nodes:
-            recording = examined.recordings.get((flight.name, node))
-            if recording:
-                yield from _channels(recording, node, secondary=node != flight.transmitter)
-                yield from _long_enough(recording, waveform)
+            key = (flight.name, node)
+            if key in examined.recorded:
+                facts, meta = examined.recorded[key], examined.recordings[key].files[0]
+                yield from _channels(facts, meta, node, secondary=node != flight.transmitter)
+                yield from _long_enough(facts, meta, waveform)
 
 
-def _channels(recording: Recording, node: str, *, secondary: bool) -> Iterator[CampaignError]:
-    names = recording.channels
+def _channels(recording: RecordingFacts, meta: Path, node: str, *, secondary: bool) -> Iterator[CampaignError]:
+    names = list(recording.channels)
     if secondary and "sidelink" not in names:
         yield CampaignError(
             f"apertura:channels {names}",
-            where=recording.files[0],
+            where=meta,
             expected=f"a channel named 'sidelink': {node} receives what another node sends",
             remedy="Name the channel, or take the node out of the flight.",
         )
     if len(set(names)) < len(names):
         yield CampaignError(
             f"apertura:channels {names}, a name twice",
-            where=recording.files[0],
+            where=meta,
             expected="another name for each channel",
             remedy="Correct the metadata.",
         )
 
 
-def _long_enough(recording: Recording, waveform: SampledWaveform) -> Iterator[CampaignError]:
-    if recording.framing is not None:
+def _long_enough(recording: RecordingFacts, meta: Path, waveform: SampledWaveform) -> Iterator[CampaignError]:
+    if recording.runs_through:
         return
-    length = int(np.min(recording.captures.length))
     if isinstance(waveform, OfdmWaveform):
         parts = (
             f"cyclic prefix ({waveform.prefix_samples}) and one period of "
@@ -154,10 +155,10 @@ def _long_enough(recording: Recording, waveform: SampledWaveform) -> Iterator[Ca
         )
     else:
         parts = "lead_s, pulse_s and listen_s of the waveform"
-    if length < waveform.needed_samples:
+    if recording.capture_samples < waveform.needed_samples:
         yield CampaignError(
-            f"captures of {length} samples",
-            where=recording.files[0],
+            f"captures of {recording.capture_samples} samples",
+            where=meta,
             expected=f"at least {waveform.needed_samples}: {parts}",
             remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
         )

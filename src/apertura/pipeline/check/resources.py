@@ -31,15 +31,16 @@ def check_writable(examined: Examination) -> Iterator[CampaignError]:
 
 def check_memory(examined: Examination) -> Iterator[CampaignError]:
     """Yield a problem where the metadata of the longest recording do not fit into memory; samples need none."""
-    if not examined.recordings:
+    if not examined.recorded:
         return
-    key, largest = max(examined.recordings.items(), key=lambda item: len(item[1].captures.start))
-    captures = len(largest.captures.start)
+    key, captures = max(
+        ((key, recording.captures) for key, recording in examined.recorded.items()), key=lambda item: item[1]
+    )
     needed = _BASE_BYTES + _CAPTURE_BYTES * captures
     if needed > (free := free_memory()):
         yield CampaignError(
             f"{captures} captures of {key[1]} in {key[0]} take at least {needed / 1e9:.1f} GB of memory",
-            where=largest.files[-1],
+            where=examined.recordings[key].files[-1],
             expected=f"at most the {free / 1e9:.1f} GB that this process may use now",
             remedy="Run on a machine with more memory, end other work, or cut the recording into several flights.",
         )
@@ -80,17 +81,17 @@ def disk_bytes(examined: Examination) -> dict[str, int]:
     """Return stage → bytes that are at least still to be written; stages with a manifest are there already."""
     campaign, transmitted = examined.campaign, examined.transmitted
     raw = sum(
-        _RAW_BYTES * len(recording.captures.start)
-        for key, recording in examined.recordings.items()
-        if recording.framing is None and not _made(examined, "raw", *key)
+        _RAW_BYTES * recording.captures
+        for key, recording in examined.recorded.items()
+        if not recording.runs_through and not _made(examined, "raw", *key)
     )
     pixels = examined.grid.shape[0] * examined.grid.shape[1] if examined.grid else 0
     if campaign.settings.scene.spacing_m == "auto":
         pixels = 0
     echo = images = 0
     for flight in campaign.flights:
-        recorded = examined.recordings.get((flight.name, flight.transmitter))
-        pulses = len(recorded.captures.time) if recorded and recorded.framing is None else 0
+        recorded = examined.recorded.get((flight.name, flight.transmitter))
+        pulses = recorded.captures if recorded and not recorded.runs_through else 0
         for pair in flight.pairs:
             if transmitted and not _made(examined, "echo", flight.name, pair):
                 echo += round(_ECHO_SHARE * 8 * pulses * transmitted.numerology.numbers.size)

@@ -17,7 +17,7 @@ from apertura.formats.names import PHASE_HISTORIES
 from apertura.formats.reading import open_recording, read_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
-from apertura.pipeline.examination.facts import LogFacts, log_facts
+from apertura.pipeline.examination.facts import LogFacts, RecordingFacts, log_facts, recording_facts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -82,6 +82,11 @@ class Examination:
     def recordings(self) -> dict[Key, "Recording"]:
         """Recordings that open."""
         return self._recordings[0]
+
+    @cached_property
+    def recorded(self) -> dict[Key, RecordingFacts]:
+        """What their headers say."""
+        return {key: recording_facts(recording) for key, recording in self.recordings.items()}
 
     @property
     def recording_problems(self) -> list[CampaignError]:

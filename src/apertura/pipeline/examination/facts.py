@@ -204,6 +204,11 @@ class RecordingFacts:
     times: TimeFacts | None
     frames: FrameNumbers | None
 
+    @property
+    def runs_through(self) -> bool:
+        """Whether the recorder ran through: it was not triggered by pulses."""
+        return self.times is None
+
 
 def recording_facts(recording: Recording) -> RecordingFacts:
     """Return what the header of a recording says; no sample is read."""

@@ -12,7 +12,14 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, load, problems_of
 from apertura.pipeline.examination.campaign import Examination, Key
 from apertura.pipeline.examination.facts import LogFacts
-from apertura.pipeline.examination.times import LOST_CAPTURE, Span, TimeFacts, inside, recorded_span, time_facts
+from apertura.pipeline.examination.times import (
+    LOST_CAPTURE,
+    Span,
+    TimeFacts,
+    Times,
+    inside,
+    time_facts,
+)
 from apertura.views.inspect.report import Report
 
 _LINES = ("recorded", "logged")
@@ -93,16 +100,13 @@ def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Spa
 
 def _recorded(examined: Examination, key: Key) -> tuple[dict[str, Any], Times, Span | None]:
     """Return facts of what a node recorded, and by the log's clock the times of its pulses, the first and the last."""
-    recording = examined.recordings.get(key)
     if examined.waveform is None:
         return _history(examined.campaign, key)
-    if recording is None:
+    if key not in examined.recorded:
         return {}, _NEVER, None
-    times = recording.captures.time  # which `Examination` has corrected by the node's clock
-    rows = {}
-    if recording.framing is None:
-        rows = {"captures": len(times), **_rate_rows(time_facts(times, longer=LOST_CAPTURE))}
-    return rows, times, recorded_span(recording)
+    facts = examined.recorded[key]  # times are corrected by the node's clock
+    rows = {} if facts.times is None else {"captures": facts.captures, **_rate_rows(facts.times)}
+    return rows, examined.recordings[key].captures.time, facts.span
 
 
 def _history(campaign: Campaign, key: Key) -> tuple[dict[str, Any], Times, Span | None]:

@@ -213,7 +213,7 @@ def _recording_lacks(recording: "Recording", facts: RecordingFacts, beside: Surr
         lacks.append(f"its place: raw/<flight>/{NODE}{'|'.join(file.suffix for file in recording.files)} of a campaign")
     if not facts.carrier_hz:
         lacks.append("the carrier: the recording does not say; the one of the config will be taken")
-    if facts.captures == 1 and facts.times is not None:
+    if facts.captures == 1 and not facts.runs_through:
         lacks.append("pulses: it is one capture; write one per trigger, or apertura:framing where the recorder ran on")
     if own_clock(recording.captures.time):
         lacks.append("the time: the recorder has a clock of its own; `apertura align` finds how it stands to the log's")
