@@ -5,8 +5,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.phasors import phasors, turned
+from apertura.core.echo.phasors import turned
 from apertura.simulation.synthesis import Channel, sampling_rate
+from apertura.simulation.transfer import spectrum
 
 
 def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
@@ -43,11 +44,11 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     waveform = channel.waveform
     if channel.sfo_hz or channel.paths.delay_rate[pulses].any():
         raise ValueError("a sampling clock that is off, or Doppler within the pulse, needs exact synthesis")
-    spectrum = _spectrum(channel, pulses) * (
+    echoes = _prefixed_echoes(channel, pulses) * (
         waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
     ).astype(np.complex64)
     bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
-    bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = spectrum
+    bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = echoes
     period = fft.ifft(bins, axis=1, norm="forward")
     period *= turned(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
@@ -60,16 +61,10 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     return np.asarray(captures, np.complex64)
 
 
-def _spectrum(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
-    """Return Σ a·exp(-j2πf_nτ) over the paths that arrive inside the prefix, (pulse, subcarrier) complex64."""
+def _prefixed_echoes(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
+    """Return the spectrum of the paths that arrive inside the prefix, (pulse, subcarrier) complex64."""
     waveform = channel.waveform
-    seen_s = channel.paths.delay_s[pulses] - channel.start_s[pulses, None]
+    delay_s = channel.paths.delay_s[pulses] - channel.start_s[pulses, None]
     early_s = waveform.symbol_s - 1 / waveform.subcarrier_spacing_hz
-    heard = (seen_s >= -early_s) & (seen_s < waveform.cyclic_prefix_s)
-    amplitude = channel.paths.amplitude[pulses] * heard
-    total = np.zeros((len(pulses), len(waveform.codes)), np.complex64)
-    first = waveform.frequency_hz[0]
-    for path in np.flatnonzero(heard.any(axis=0)):
-        level = turned(amplitude[:, path], -first * seen_s[:, path])
-        total += level[:, None] * phasors(-waveform.subcarrier_spacing_hz * seen_s[:, path], total.shape[1])
-    return total
+    inside = (delay_s >= -early_s) & (delay_s < waveform.cyclic_prefix_s)
+    return spectrum(delay_s, channel.paths.amplitude[pulses] * inside, waveform.frequency_hz).astype(np.complex64)

@@ -12,7 +12,8 @@ from apertura.simulation.draw import ImpairmentDraw
 from apertura.simulation.impairments import Adc, ChannelName, Floats, Impairments, Ripple
 from apertura.simulation.radar import Paths, TransmitWaveform, direct_path, echo_paths
 from apertura.simulation.scene import Scatterers
-from apertura.simulation.synthesis import Channel, Complex, path_spectrum
+from apertura.simulation.synthesis import Channel, Complex
+from apertura.simulation.transfer import spectrum
 
 _PULSES_AT_ONCE = 64
 _MOST_PULSES = 8192
@@ -120,9 +121,8 @@ def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex |
     paths = paths.at(slice(None, None, every))
     starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
     parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
-    total = sum(
-        float((np.abs(path_spectrum(waveform, part.delay_s, part.amplitude) * response) ** 2).sum()) for part in parts
-    )
+    spectra = (spectrum(part.delay_s, part.amplitude, waveform.frequency_hz) for part in parts)
+    total = sum(float((np.abs(one * response) ** 2).sum()) for one in spectra)
     return total / (len(paths.delay_s) * len(waveform.codes))
 
 

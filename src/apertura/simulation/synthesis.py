@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from apertura.simulation.impairments import Floats
 from apertura.simulation.radar import Paths, TransmitWaveform
+from apertura.simulation.transfer import spectrum
 
 Complex = NDArray[np.complex128]
 
@@ -51,28 +52,6 @@ class Channel:
     noise_variance: float = 0.0
 
 
-def path_spectrum(waveform: TransmitWaveform, delay_s: Floats, amplitude: Complex) -> Complex:
-    """Return Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
-
-    Notes
-    -----
-    Source: docs/theory/simulate.md, eq. 2. The exponential of subcarrier n = 64i + j is the product of two
-    small ones, so that many points cost one matrix product.
-
-    Examples
-    --------
-    >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
-    >>> np.angle(path_spectrum(wave, np.array([0.25e-6]), np.array([1.0 + 0j]))).round(3) + 0.0
-    array([ 0.   , -1.571, -3.142,  1.571])
-    """
-    width, count = 64, len(waveform.codes)
-    coarse = waveform.frequency_hz[::width]
-    fine = np.arange(width) * waveform.subcarrier_spacing_hz
-    left = amplitude[..., None, :] * np.exp(-2j * np.pi * coarse[:, None] * delay_s[..., None, :])
-    right = np.exp(-2j * np.pi * fine * delay_s[..., :, None])
-    return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
-
-
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
     """Return (pulse, subcarrier) transfer functions as an ideal demodulator would measure them, without samples.
 
@@ -81,7 +60,7 @@ def transfer_functions(channel: Channel, generator: Generator | None) -> Complex
     """
     waveform, paths = channel.waveform, channel.paths
     early = paths.delay_s - channel.start_s[:, None]
-    transfer = path_spectrum(waveform, early, paths.amplitude) * channel.response
+    transfer = spectrum(early, paths.amplitude, waveform.frequency_hz) * channel.response
     transfer *= np.exp(1j * channel.phase_rad[:, None])
     if generator is not None and channel.noise_variance:
         transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
@@ -158,7 +137,7 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
     out = np.zeros((terms, len(splits) + 2, len(factor)), np.complex128)
     for term in range(terms):
         for group, part in enumerate(np.split(np.arange(len(order)), splits)):
-            out[term, group + 1] = path_spectrum(waveform, seen[part], level[part])
+            out[term, group + 1] = spectrum(seen[part], level[part], waveform.frequency_hz)
         out[term] = np.cumsum(out[term], axis=0) * factor
         factor = factor * (-2j * np.pi * waveform.frequency_hz / (term + 1))
         level = level * rate
@@ -173,16 +152,16 @@ def _stretch(channel: Channel, pulse: int, spectra: Complex, start: int, stop: i
     time_s = index / sampling_rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
     numbers = waveform.first_subcarrier + np.arange(spectra.shape[1])
     total = np.zeros(stop - start, np.complex128)
-    for term, spectrum in enumerate(spectra):
+    for term, one in enumerate(spectra):
         if stop - start <= _SHORT:
-            table = _rotations(turns, waveform.first_subcarrier, len(spectrum))[: stop - start]
-            part = table @ (spectrum * np.exp(2j * np.pi * turns * numbers * start))
+            table = _rotations(turns, waveform.first_subcarrier, len(one))[: stop - start]
+            part = table @ (one * np.exp(2j * np.pi * turns * numbers * start))
         elif channel.sfo_hz:
-            part = _zoom(len(spectrum), count, turns)(spectrum)[start:stop]
+            part = _zoom(len(one), count, turns)(one)[start:stop]
             part = part * np.exp(2j * np.pi * turns * waveform.first_subcarrier * index)
         else:
             bins = np.zeros(waveform.dft_samples, np.complex128)
-            bins[numbers] = spectrum
+            bins[numbers] = one
             part = np.fft.ifft(bins, norm="forward")[index % waveform.dft_samples]
         total += time_s**term * part
     return total

@@ -10,7 +10,8 @@ from scipy.signal import CZT
 
 from apertura.core.echo.demodulate import subcarrier_numbers
 from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.synthesis import Channel, noise, path_spectrum, sampling_rate
+from apertura.simulation.synthesis import Channel, noise, sampling_rate
+from apertura.simulation.transfer import spectrum
 
 _PULSES_AT_ONCE = 32
 _DOPPLER_ORDER = 3
@@ -53,10 +54,10 @@ def _symbols(
     seen = paths.delay_s + paths.delay_rate * middle_s - channel.start_s[pulses, None]
     total = np.zeros((len(seen), time_s.size), np.complex128)
     for order in range(_DOPPLER_ORDER + 1 if paths.delay_rate.any() else 1):
-        of_paths = path_spectrum(waveform, seen, paths.amplitude * paths.delay_rate**order)
-        spectrum = of_paths * factor * (-2j * np.pi * waveform.frequency_hz) ** order / factorial(order)
+        of_paths = spectrum(seen, paths.amplitude * paths.delay_rate**order, waveform.frequency_hz)
+        of_order = of_paths * factor * (-2j * np.pi * waveform.frequency_hz) ** order / factorial(order)
         since = time_s + channel.start_s[pulses, None] - middle_s
-        total += since**order * zoom(spectrum)
+        total += since**order * zoom(of_order)
     return total
 
 

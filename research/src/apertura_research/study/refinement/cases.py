@@ -14,9 +14,9 @@ from apertura.core.geometry.track_correction import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import Sighting, TrackErrors
-from apertura_research.study.refinement.echoes import transfer
+from apertura.simulation.transfer import transfer
 from apertura_research.study.refinement.flights import FLIGHTS, NODES, Flight, drawn_errors
-from apertura_research.study.refinement.scenes import GRID, SCENES, Scatterers
+from apertura_research.study.refinement.scenes import GRID, SCENES, TargetScene
 
 BANDWIDTH_HZ, SUBCARRIERS = 409.6e6, 128
 FREQUENCY_HZ: NDArray[np.float64] = 1.2e9 + BANDWIDTH_HZ / SUBCARRIERS * np.arange(SUBCARRIERS, dtype=np.float64)
@@ -85,22 +85,22 @@ def case(
         tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
         dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
         truth,
-        scatterers.places_m[scatterers.targets],
+        scatterers.position_m[scatterers.targets],
         tuple(sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
         flight.reach_m,
     )
 
 
-def _probes(generator: np.random.Generator) -> Scatterers:
+def _probes(generator: np.random.Generator) -> TargetScene:
     phases = np.exp(2j * np.pi * generator.random(len(PROBES_M)))
-    return Scatterers(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
+    return TargetScene(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
 
 
 def sighting(
     pair: str,
     flight: Flight,
     truth: TrackCorrection,
-    scatterers: Scatterers,
+    scatterers: TargetScene,
     snr_db: float | None,
     generator: np.random.Generator,
 ) -> Sighting:
@@ -125,7 +125,8 @@ def sighting(
     logged = Aperture(flight.logged_m[tx], flight.logged_m[rx])
     between_m = None if tx == rx else logged.tx_m - logged.rx_m
     flown = truth.aperture(logged, pair, flight.time_s)
-    echo = transfer(scatterers, flown, FREQUENCY_HZ, further_m=-truth.longer_m(pair, flight.time_s, between_m))
+    longer_m = -truth.longer_m(pair, flight.time_s, between_m)
+    echo = transfer(scatterers, flown, FREQUENCY_HZ, longer_m=longer_m, gridded=True)
     if snr_db is not None:
         std = np.sqrt(_signal_power(echo, scatterers, flown) * SUBCARRIERS / 10 ** (snr_db / 10) / 2)
         parts = generator.standard_normal((*echo.shape, 2), np.float32)
@@ -135,12 +136,12 @@ def sighting(
     return Sighting(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
 
 
-def _signal_power(echo: NDArray[np.complex64], scatterers: Scatterers, flown: Aperture) -> float:
+def _signal_power(echo: NDArray[np.complex64], scatterers: TargetScene, flown: Aperture) -> float:
     """Return the mean power of a target's echo, or of a range cell c/B of total path."""
     if not len(scatterers.targets):
-        paths = flown[::10].path(scatterers.places_m[::10])
+        paths = flown[::10].path(scatterers.position_m[::10])
         cells = np.ptp(paths, axis=1).mean() / (SPEED_OF_LIGHT_M_S / BANDWIDTH_HZ)
         return float(np.mean(np.abs(echo) ** 2) / cells)
-    places, amplitude = (part[scatterers.targets] for part in (scatterers.places_m, scatterers.amplitude))
+    places, amplitude = (part[scatterers.targets] for part in (scatterers.position_m, scatterers.amplitude))
     there, back = (np.linalg.norm(leg[::10, None] - places, axis=2) for leg in flown.legs)
     return float(np.mean(np.abs(amplitude / (there * back)) ** 2))
