@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from apertura_research.study.refinement.cases import PROBES_M, case
-from apertura_research.study.refinement.flights import drawn_errors
-from apertura_research.study.refinement.measures import judge, peaks
+from apertura_research.autofocus.cases import PROBES_M, case, drawn_errors
+from apertura_research.autofocus.outcomes import judge, peaks
 from scenes import compiled
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S

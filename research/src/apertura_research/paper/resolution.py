@@ -7,14 +7,14 @@ import numpy as np
 
 from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
-from apertura_research.study.paper.claims import EXPLAINED, Claim, compare
-from apertura_research.study.paper.formulas import (
+from apertura_research.paper.claims import EXPLAINED, Claim, compare
+from apertura_research.paper.parameters import (
     HALF_POWER_OF_HANN,
     cross_range_resolution_m,
     ground_range_resolution_m,
 )
-from apertura_research.study.paper_scene import Complexes, PaperScene, reduced_scene
-from apertura_research.study.point_response import Floats, find_peaks, half_power_widths, mean_image, undisturbed_tables
+from apertura_research.paper_scene import Complexes, PaperScene, reduced_scene
+from apertura_research.point_response import Floats, find_peaks, half_power_widths, mean_image, undisturbed_tables
 
 WITHIN = 0.05
 """Share by which widths may differ and still agree."""

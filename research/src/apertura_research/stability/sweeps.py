@@ -21,7 +21,7 @@ from apertura.simulation.impairments import (
     UniformPhase,
 )
 from apertura.simulation.presets import paper_waveform
-from apertura_research.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, reduced_scene
+from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, reduced_scene
 
 CHOICES = ("none", *METHODS, "auto")
 """Every correction: the radar alone, each method of the sidelink, and the one `auto` takes."""
@@ -34,7 +34,7 @@ _CELL_M = SPEED_OF_LIGHT_M_S / 409.6e6
 
 
 @dataclass(frozen=True)
-class Sweep:
+class ImpairmentSweep:
     """One impairment and the sizes at which it is tried, from negligible to destructive.
 
     Attributes
@@ -104,93 +104,93 @@ def _reflection(size: float) -> dict[str, object]:
 
 _SNR_DB = tuple(float(snr) for snr in np.arange(30.0, -20.1, -2.5))
 
-SWEEPS: Mapping[str, Sweep] = {
-    "carrier_phase": Sweep(
+SWEEPS: Mapping[str, ImpairmentSweep] = {
+    "carrier_phase": ImpairmentSweep(
         "Carrier phase per pulse, uniform ±", "π rad", (0.05, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0),
         lambda size: {"carrier_phase": UniformPhase(size * np.pi)}, logarithmic=False,
     ),
-    "phase_walk": Sweep(
+    "phase_walk": ImpairmentSweep(
         "Phase noise, random walk", "rad/√s", (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 3.0),
         lambda size: {"carrier_phase": PhaseWalk(size)}, draws=4,
     ),
-    "timing": Sweep(
+    "timing": ImpairmentSweep(
         "Timing offset per pulse, uniform ±", "ns", (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 10.0, 100.0),
         lambda size: {"timing": Timing(half_width_s=1e-9 * size)},
     ),
-    "trigger_jitter": Sweep(
+    "trigger_jitter": ImpairmentSweep(
         "Trigger jitter, σ", "samples of 0.98 ns", (0.1, 0.2, 0.3, 0.5, 1.0, 3.0, 10.0),
         lambda size: {"timing": Timing(jitter_samples=size)}, draws=4,
     ),
-    "cfo": Sweep(
+    "cfo": ImpairmentSweep(
         "Carrier frequency offset", "kHz", (3, 10, 20, 30, 50, 70, 100),
         lambda size: {"clock": Clock(cfo_hz=1e3 * size)}, subcarriers=4096, sampled=True, draws=1,
     ),
-    "sfo": Sweep(
+    "sfo": ImpairmentSweep(
         "Sampling frequency offset", "kHz", (10, 30, 60, 100, 200, 400, 1000),
         lambda size: {"clock": Clock(sfo_hz=1e3 * size)}, subcarriers=4096, sampled=True, draws=1,
     ),
-    "clock": Sweep(
+    "clock": ImpairmentSweep(
         "One clock for carrier and sampling", "ppm", (0.3, 1, 3, 8, 20, 40, 80),
         _one_clock, subcarriers=4096, sampled=True, draws=1,
     ),
-    "radar_noise": Sweep(
+    "radar_noise": ImpairmentSweep(
         "SNR of the echo per subcarrier", "dB", (30, 20, 10, 0, -10, -20, -30, -40),
         lambda size: {"radar_snr_db": float(size)}, logarithmic=False,
     ),
-    "sidelink_noise": Sweep(
+    "sidelink_noise": ImpairmentSweep(
         "SNR of the sidelink per subcarrier", "dB", _SNR_DB,
         lambda size: {"sidelink_snr_db": size, "radar_snr_db": None}, subcarriers=4096, logarithmic=False,
     ),
-    "sidelink_gain": Sweep(
+    "sidelink_gain": ImpairmentSweep(
         "Gain of the sidelink, 30 dB SNR at 0 dB", "dB", (0, -10, -20, -25, -30, -35, -40, -50),
         lambda size: {"sidelink_gain_db": float(size)}, logarithmic=False,
     ),
-    "sidelink_multipath": Sweep(
+    "sidelink_multipath": ImpairmentSweep(
         "Reflection in the sidelink, 12.3 cells late", "dB", (-40, -30, -20, -15, -10, -6, -3, -1),
         _reflection, logarithmic=False, draws=1,
     ),
-    "sidelink_blockage": Sweep(
+    "sidelink_blockage": ImpairmentSweep(
         "Share of pulses with the sidelink blocked by 60 dB", "1", (0.01, 0.03, 0.1, 0.2, 0.4, 0.7),
         lambda size: {"sidelink_blockage": Blockage(size)}, logarithmic=False, draws=4,
     ),
-    "leakage": Sweep(
+    "leakage": ImpairmentSweep(
         "Leakage into the radar against the echo", "dB", (-20, -10, 0, 10, 20, 30, 40),
         lambda size: {"leakage": Leakage(float(size))}, logarithmic=False, draws=1,
     ),
-    "transmit_ripple": Sweep(
+    "transmit_ripple": ImpairmentSweep(
         "Ripple of the transmitter, peak to peak", "dB", (0.1, 0.3, 1, 2, 3, 6, 10),
         lambda _: {}, lambda size: Impairments(transmit_ripple=Ripple(size, 5 / 409.6e6)), draws=1,
     ),
-    "radar_ripple": Sweep(
+    "radar_ripple": ImpairmentSweep(
         "Ripple of the radar's receiver, peak to peak", "dB", (0.1, 0.3, 1, 2, 3, 6, 10), _ripple("radar_ripple"),
         draws=1,
     ),
-    "sidelink_ripple": Sweep(
+    "sidelink_ripple": ImpairmentSweep(
         "Ripple of the sidelink's receiver, peak to peak", "dB", (0.1, 0.3, 1, 2, 3, 6, 10), _ripple("sidelink_ripple"),
         draws=1,
     ),
-    "adc_bits": Sweep(
+    "adc_bits": ImpairmentSweep(
         "Bits of the converter", "bit", (14, 10, 8, 6, 4, 3, 2, 1),
         lambda size: {"adc": Adc(bits=int(size))}, sampled=True, quantised=True, logarithmic=False, draws=1,
     ),
-    "adc_clipping": Sweep(
+    "adc_clipping": ImpairmentSweep(
         "Full scale of the converter over the RMS", "dB", (14, 9, 6, 3, 0, -6, -12, -20),
         lambda size: {"adc": Adc(backoff_db=float(size))}, sampled=True, quantised=True, logarithmic=False, draws=1,
     ),
-    "localization": Sweep(
+    "localization": ImpairmentSweep(
         "Localization error, σ per axis after 1 s", "cm", (0.1, 0.3, 0.5, 1, 1.5, 2, 3, 5),
         lambda size: {"localization": Localization(size / 100)},
         lambda size: Impairments(localization=Localization(size / 100)), draws=6,
     ),
-    "time_tag": Sweep(
+    "time_tag": ImpairmentSweep(
         "Error of the receiver's time tags at 1 m/s, σ", "ms", (1, 3, 10, 20, 30, 50, 100), lambda _: {}, draws=4,
         tagged=True,
     ),
-    "missed_triggers": Sweep(
+    "missed_triggers": ImpairmentSweep(
         "Share of triggers missed", "1", (0.02, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95),
         lambda size: {"missed_fraction": size}, logarithmic=False, draws=4,
     ),
-    "doppler": Sweep(
+    "doppler": ImpairmentSweep(
         "Speed of both nodes within the pulse", "m/s", (1, 3, 10, 30, 100, 300, 1000), lambda _: {"doppler": True},
         subcarriers=4096, sampled=True, draws=1, moving=True,
     ),

@@ -1,6 +1,5 @@
 """What each size of an impairment does to the image under each correction of the sidelink."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,10 +10,10 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.line_of_sight import fit_line_of_sight
 from apertura.core.echo.sidelink import METHODS, choose, measure
 from apertura.core.focus.inputs import PhaseHistory
-from apertura_research.study import point_response
-from apertura_research.study.paper_scene import Complexes, receive_pair
-from apertura_research.study.point_response import Floats, find_peaks, mean_image
-from apertura_research.study.stability.sweeps import SWEEPS, Sweep
+from apertura_research import point_response
+from apertura_research.paper_scene import Complexes, receive_pair
+from apertura_research.point_response import Floats, find_peaks, mean_image
+from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
 
 REFUSED_DB = 40.0
 """Loss entered where nothing is imaged; larger ones are clipped to it."""
@@ -23,7 +22,7 @@ _REACH_M = (0.16, 1.0)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StabilityRow:
     """What one impairment of one size did to the image under one correction: a row of the CSV.
 
     Attributes
@@ -58,30 +57,36 @@ class Outcome:
     seed: int
 
 
-def run_sweep(impairment: str, method: str, *, seed: int = 1) -> Iterator[Outcome]:
-    """Yield the outcome at each size of one impairment of `SWEEPS` under one correction of `CHOICES`.
+def sizes_of(part: str) -> tuple[float, ...]:
+    """Return the sizes that a part, `IMPAIRMENT.METHOD`, is tried at."""
+    return SWEEPS[part.partition(".")[0]].sizes
 
-    Draws depend on the seed and on their number alone: every method and size meets the same random numbers.
+
+def run_size(part: str, size: float, *, seed: int = 1) -> list[StabilityRow]:
+    """Return the outcome of one size of an impairment of `SWEEPS` under a correction of `CHOICES`.
+
+    Draws depend on the seed and on their number alone: every method and size gets the same random numbers.
     """
+    impairment, _, method = part.partition(".")
     sweep = SWEEPS[impairment]
-    for size in sweep.sizes:
-        ideal = _undisturbed(sweep)
-        draws = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
-        measured = [one for one, _ in draws]
-        mean, spread = (_rounded(statistic(measured, axis=0)) for statistic in (np.mean, np.std))
-        width = _rounded(np.median(measured, axis=0))
-        chosen = [one for _, one in draws]
-        yield Outcome(
-            impairment=impairment,
-            unit=sweep.unit,
-            size=float(size),
-            method=method,
-            loss_spread_db=spread.loss_db,
-            **mean._replace(ground_width_m=width.ground_width_m, cross_width_m=width.cross_width_m)._asdict(),
-            chosen=max(sorted(set(chosen)), key=chosen.count),
-            draws=sweep.draws,
-            seed=seed,
-        )
+    ideal = _undisturbed(sweep)
+    draws = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
+    measured = [one for one, _ in draws]
+    mean, spread = (_rounded(statistic(measured, axis=0)) for statistic in (np.mean, np.std))
+    width = _rounded(np.median(measured, axis=0))
+    chosen = [one for _, one in draws]
+    row = StabilityRow(
+        impairment=impairment,
+        unit=sweep.unit,
+        size=float(size),
+        method=method,
+        loss_spread_db=spread.loss_db,
+        **mean._replace(ground_width_m=width.ground_width_m, cross_width_m=width.cross_width_m)._asdict(),
+        chosen=max(sorted(set(chosen)), key=chosen.count),
+        draws=sweep.draws,
+        seed=seed,
+    )
+    return [row]
 
 
 class _Measured(NamedTuple):
@@ -103,7 +108,7 @@ class _Ideal(NamedTuple):
     values: Complexes
 
 
-def _undisturbed(sweep: Sweep) -> _Ideal:
+def _undisturbed(sweep: ImpairmentSweep) -> _Ideal:
     """Return the peaks, and the image at random pixels, of the scene with nothing wrong."""
     scene = sweep.flown(0.0)
     tables = point_response.undisturbed_tables(scene)
@@ -113,7 +118,7 @@ def _undisturbed(sweep: Sweep) -> _Ideal:
 
 
 def _draw(
-    sweep: Sweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
+    sweep: ImpairmentSweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
 ) -> tuple[_Measured, str]:
     """Return what is measured of one draw, and the method applied."""
     flown = sweep.flown(size)

@@ -14,7 +14,7 @@ from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import half_power_width, locate_maximum
-from apertura_research.study.paper_scene import Complexes, PaperScene, receive_undisturbed
+from apertura_research.paper_scene import Complexes, PaperScene, receive_undisturbed
 
 Floats = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from apertura.core.quality.fused import Amplitude
 from apertura.core.quality.point_targets import Cut, cut_through, find_peak
 from apertura.simulation.experiments import GAP_M, SEGMENT_M
-from apertura_research.study.paper.claims import Claim, compare, require
-from apertura_research.study.paper.coherence import LARGEST_PHASE_RAD
-from apertura_research.study.paper.experiments import (
+from apertura_research.paper.claims import Claim, compare, require
+from apertura_research.paper.experiments import (
     BISTATIC,
+    LARGEST_PHASE_RAD,
     MONOSTATIC,
     Experiment,
     by_pair,
