@@ -21,7 +21,7 @@ from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import preset, simulate
-from apertura.simulation.experiments import CABLE_M, GAP_M, SEGMENT_M
+from apertura.simulation.presets import CABLE_M, GAP_M, SEGMENT_M
 
 PULSES = 16
 

@@ -7,10 +7,19 @@ mended, refused, or what is left.
 import dataclasses
 
 import numpy as np
-from apertura_research.autofocus.cases import PAIRS, PROBES_M, Case, sighting
-from apertura_research.autofocus.cases import FLIGHTS, NODES, drawn_errors
+from apertura_research.autofocus.cases import (
+    FLIGHTS,
+    GRID,
+    NODES,
+    PAIRS,
+    PROBES_M,
+    SCENES,
+    Case,
+    TargetScene,
+    drawn_errors,
+    sighting,
+)
 from apertura_research.autofocus.outcomes import judge
-from apertura_research.autofocus.cases import GRID, SCENES, TargetScene
 
 from apertura.core.geometry.track_correction import TrackCorrection
 from apertura.core.scene.terrain import FlatGround

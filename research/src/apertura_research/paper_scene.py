@@ -13,11 +13,18 @@ from apertura.core.echo.demodulate import subcarrier_numbers
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.observation import Observation, observe
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.radar import TransmitWaveform, newman_codes, qpsk_codes
-from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
-from apertura.simulation.synthesis import Channel, noise, sampling_rate, transfer_functions
+from apertura.simulation.synthesis import (
+    Channel,
+    Geometry,
+    digitize,
+    full_scale,
+    noise,
+    sampling_rate,
+    transfer_functions,
+)
 from apertura.simulation.transfer import spectrum
+from apertura.simulation.waveform import TransmitWaveform, newman_codes, qpsk_codes
 
 Complexes = NDArray[np.complex64]
 
@@ -176,10 +183,10 @@ def _symbols(
     """Return the window before the mixer: a Taylor series in t of the Doppler of each path."""
     waveform, paths = channel.waveform, channel.paths.at(pulses)
     middle_s = waveform.duration_s / 2
-    seen = paths.delay_s + paths.delay_rate * middle_s - channel.start_s[pulses, None]
-    total = np.zeros((len(seen), time_s.size), np.complex128)
+    late_s = paths.delay_s + paths.delay_rate * middle_s - channel.start_s[pulses, None]
+    total = np.zeros((len(late_s), time_s.size), np.complex128)
     for order in range(_DOPPLER_ORDER + 1 if paths.delay_rate.any() else 1):
-        of_paths = spectrum(seen, paths.amplitude * paths.delay_rate**order, waveform.frequency_hz)
+        of_paths = spectrum(late_s, paths.amplitude * paths.delay_rate**order, waveform.frequency_hz)
         of_order = of_paths * factor * (-2j * np.pi * waveform.frequency_hz) ** order / factorial(order)
         since = time_s + channel.start_s[pulses, None] - middle_s
         total += since**order * zoom(of_order)

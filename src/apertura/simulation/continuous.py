@@ -13,11 +13,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from apertura.common.errors import CampaignError
-from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, Adc, Floats
-from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.recording import digitize, full_scale
-from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate
+from apertura.simulation.impairments import STRICT_KEYS, Adc, Floats, independent_streams
+from apertura.simulation.synthesis import Channel, Complex, digitize, full_scale, noise, samples, sampling_rate
+from apertura.simulation.waveform import TransmitWaveform
 
 Chips = NDArray[np.int8]
 

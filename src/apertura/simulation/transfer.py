@@ -1,7 +1,9 @@
-"""Transfer functions of point scatterers along an aperture, for simulations, studies, benchmarks and tests.
+"""Paths of echoes and transfer functions of point scatterers, for simulations, studies, benchmarks and tests.
 
 The exact sum costs one matrix product per pulse; for thousands of scatterers there is a gridded one.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,8 @@ from apertura.simulation.impairments import Floats
 from apertura.simulation.scene import Scatterers
 
 _BLOCK = 64  # subcarriers that share one exponential
-_TERMS = 2**22  # exponentials held at once by the exact sum
-_SAMPLES = 2**20  # of range, held at once by the gridded one
+_TERMS = 2**22  # exponentials at once in the exact sum
+_SAMPLES = 2**20  # of range at once in the gridded one
 
 
 def transfer(
@@ -121,3 +123,102 @@ def _gridded(
 
     points = scatterers.position_m, scatterers.amplitude
     return gridded_sum(points, aperture.legs, frequency_hz, longer_m, spreading=spreading)
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths from the transmitter to one receiving channel, each array (pulse, path).
+
+    Attributes
+    ----------
+    delay_s, delay_rate
+        float64, seconds at the pulse's start, and their growth in seconds per second; zero: stop and go.
+    amplitude
+        complex128.
+    """
+
+    delay_s: Floats
+    amplitude: NDArray[np.complex128]
+    delay_rate: Floats
+
+    def and_also(self, other: "Paths") -> "Paths":
+        """Return both sets together."""
+        both = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Paths(*(np.concatenate(pair, axis=1) for pair in both))
+
+    def at(self, pulses: slice | NDArray[np.intp]) -> "Paths":
+        """Return those of some pulses."""
+        return Paths(self.delay_s[pulses], self.amplitude[pulses], self.delay_rate[pulses])
+
+
+def echo_paths(
+    tx_position_m: Floats,
+    rx_position_m: Floats,
+    scatterers: Scatterers,
+    *,
+    path_offset_m: float = 0.0,
+    tx_velocity_m_s: Floats | float = 0.0,
+    rx_velocity_m_s: Floats | float = 0.0,
+) -> Paths:
+    """Return the echoes of scatterers: delay (R_tx + R_rx + offset)/c, amplitude a/(R_tx·R_rx).
+
+    Parameters
+    ----------
+    tx_position_m, rx_position_m
+        (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
+    path_offset_m
+        Electrical path of the receiving channel beyond geometry, metres.
+    tx_velocity_m_s, rx_velocity_m_s
+        (pulse, 3) float64, for Doppler within the pulse; zero without.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, eq. 1.
+
+    Examples
+    --------
+    >>> point = Scatterers(np.array([[0.0, 3.0, 0.0]]), np.array([1.0 + 0j]))
+    >>> paths = echo_paths(np.zeros((1, 3)), np.array([[4.0, 0.0, 0.0]]), point)
+    >>> paths.delay_s * 299792458, paths.amplitude.real.round(4)
+    (array([[8.]]), array([[0.0667]]))
+    """
+    tx_range, tx_rate = _range_and_rate(tx_position_m, tx_velocity_m_s, scatterers.position_m)
+    rx_range, rx_rate = _range_and_rate(rx_position_m, rx_velocity_m_s, scatterers.position_m)
+    return Paths(
+        (tx_range + rx_range + path_offset_m) / SPEED_OF_LIGHT_M_S,
+        scatterers.amplitude / (tx_range * rx_range),
+        (tx_rate + rx_rate) / SPEED_OF_LIGHT_M_S,
+    )
+
+
+def direct_path(
+    tx_position_m: Floats,
+    rx_position_m: Floats,
+    *,
+    path_offset_m: float = 0.0,
+    relative_velocity_m_s: Floats | float = 0.0,
+) -> Paths:
+    """Return the one path from antenna to antenna: delay (R + offset)/c, amplitude 1/R, level inside 1 m.
+
+    Parameters
+    ----------
+    tx_position_m, rx_position_m, path_offset_m
+        As for `echo_paths`.
+    relative_velocity_m_s
+        (pulse, 3) float64, transmitter's less receiver's velocity.
+
+    Examples
+    --------
+    >>> direct_path(np.zeros((1, 3)), np.array([[4.0, 0.0, 0.0]])).amplitude
+    array([[0.25+0.j]])
+    """
+    distance, rate = _range_and_rate(tx_position_m - rx_position_m, relative_velocity_m_s, np.zeros((1, 3)))
+    delay = (distance + path_offset_m) / SPEED_OF_LIGHT_M_S
+    return Paths(delay, 1 / np.maximum(distance, 1.0).astype(np.complex128), rate / SPEED_OF_LIGHT_M_S)
+
+
+def _range_and_rate(antenna_m: Floats, velocity_m_s: Floats | float, points_m: Floats) -> tuple[Floats, Floats]:
+    sight = antenna_m[:, None, :] - points_m[None, :, :]
+    distance = np.sqrt(np.einsum("pki,pki->pk", sight, sight))
+    velocity = np.broadcast_to(np.asarray(velocity_m_s, np.float64), antenna_m.shape)
+    return distance, np.einsum("pki,pi->pk", sight, velocity) / np.maximum(distance, 1e-9)

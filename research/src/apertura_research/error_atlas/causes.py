@@ -36,7 +36,7 @@ class Cause:
     assume
         Flight, size and generator → what the pipeline assumes.
     expect
-        Flight, pair and size → what the budget says when the size is stated.
+        Flight, pair and size → what the budget expects when the size is stated.
     stated
         How it is stated to the budget, in a few words.
     draws

@@ -24,8 +24,8 @@ from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.simulation.impairments import Impairments
-from apertura.simulation.recording import Geometry
-from apertura.simulation.trajectory import GaussianBeam, Sampled, Straight, Wobble
+from apertura.simulation.scene import GaussianBeam, Sampled, Straight, Wobble
+from apertura.simulation.synthesis import Geometry
 from apertura_research.paper_scene import RX_AHEAD_M, Complexes, Disturbance, PaperScene, receive_pair, reduced_scene
 
 Floats = NDArray[np.float64]
@@ -272,7 +272,7 @@ def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors
         places[node], checked = log.checked(flown, node, generator)
         barred = checked.barred(flown.time_s)
         flags |= {cause: node for cause, out in barred.items() if out.any()}
-        flags |= {cause: node for cause, found in checked.faults.items() if found}
+        flags |= {cause: node for cause, text in checked.faults.items() if text}
         for out in barred.values():
             used &= ~out
     return replace(flown.truth, apertures=flown.apertures(**places), used=used, flags=flags)

@@ -104,7 +104,7 @@ def _formation(assumed: AssumedFlight, pair: str, history: Any) -> Formation:
 
 
 def _interpolator(formation: Formation) -> Callable[[Floats, Floats], NDArray[np.complex64]]:
-    """Return the planned image at any place, formed there: a raster tells a peak to a centimetre only."""
+    """Return the planned image at any place, formed there: a raster locates a peak to a centimetre only."""
     setting, inputs = formation.plan.setting, formation.plan.inputs(formation.profiles)
     engine = load_engine(setting.engine)
     tables = engine.prepare(inputs, **setting.options)

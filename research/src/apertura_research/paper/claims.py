@@ -85,7 +85,7 @@ def compare(
 
 
 def require(claim: str, computed: float, unit: str, *, limit: str, met: bool, style: str = ".4g", note: str) -> Claim:
-    """Return a row of something said without a number, held against a limit of this project's own.
+    """Return a row of something stated without a number, compared with a limit of this project's own.
 
     Parameters
     ----------

@@ -21,8 +21,7 @@ from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.observation import observe
 from apertura.simulation.presets import paper_waveform
-from apertura.simulation.recording import straight_pair
-from apertura.simulation.synthesis import samples, transfer_functions
+from apertura.simulation.synthesis import samples, straight_pair, transfer_functions
 from apertura_research.paper.claims import Claim, compare, require
 from apertura_research.paper.losses import ERRORS, peak_losses_db
 from apertura_research.paper_scene import (
@@ -113,10 +112,10 @@ def clock_claims(*, pulses: int = 150) -> list[Claim]:
 
 
 def _captures(scene: PaperScene, receiver: Impairments) -> list[Complexes]:
-    _, _, seen = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
+    _, _, observed = receive_pair(scene, Disturbance(receiver), np.random.default_rng(0))
     names = ("radar", "sidelink")
     noise = dict(zip(names, (np.random.default_rng(number) for number in (1, 2)), strict=True))
-    return [samples(seen.channels[name], noise[name]).astype(np.complex64) for name in names]
+    return [samples(observed.channels[name], noise[name]).astype(np.complex64) for name in names]
 
 
 def _image(scene: PaperScene, captures: list[Complexes]) -> tuple[Complexes, Floats]:
@@ -170,9 +169,9 @@ def _monostatic_db(size_cm: float, generator: np.random.Generator) -> float:
     levels = []
     for sigma_m in (0.0, size_cm / 100):
         wrong = Impairments(localization=Localization(sigma_m))
-        # one antenna position for both ways: no transmitter of its own
-        seen = observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=wrong, sidelink=False)
-        transfer = transfer_functions(seen.channels["radar"], None).astype(np.complex64)
+        # one antenna position for both legs: no transmitter of its own
+        observed = observe(scene.waveform, scene.scatterers, scene.geometry, generator, receiver=wrong, sidelink=False)
+        transfer = transfer_functions(observed.channels["radar"], None).astype(np.complex64)
         levels.append(find_peaks(range_tables(phase_history(scene, transfer), targets), targets)[1])
     return float(amplitude_db(levels[1] / levels[0]).mean())
 
@@ -217,7 +216,7 @@ SNR_DB = -10.0
 
 
 def swarm_claims(*, pulses: int = 150, seed: int = 1) -> list[Claim]:
-    """Return how a swarm's receivers add up, each corrected by its own sidelink alone, and how pulses are found."""
+    """Return how a swarm's receivers add up, each corrected by its own sidelink alone, and how pulses are detected."""
     images = [_receiver(number, pulses, np.random.default_rng([seed, number])) for number in range(1, RECEIVERS + 1)]
     peaks, noises = (np.array([image[part] for image in images]) for part in (0, 1))
     efficiency = float((np.abs(peaks.sum(axis=0)) / np.abs(peaks).sum(axis=0)).min())
@@ -263,17 +262,17 @@ def trigger_claims(*, pulses: int = 12) -> list[Claim]:
     with TemporaryDirectory() as folder:
         campaign = Campaign.load(simulate(Path(folder) / "made", preset("continuous", pulses=pulses)))
         nodes = json.loads((campaign.root / "truth.json").read_text(encoding="utf-8"))["flights"]["f01"]["nodes"]
-        errors, found = [], 0
+        errors, detected = [], 0
         for node, truth in nodes.items():
             ingest(campaign, "f01", node)
             raw = open_stage(campaign.stage("raw", "f01", node), "raw")
             since_s = (raw.time.values - raw.time.values[0]) / np.timedelta64(1, "s")
             starts = np.array(truth["pulse_start_sample"])
-            found += len(since_s)
+            detected += len(since_s)
             if len(since_s) == len(starts):
                 errors.append(np.abs(since_s * raw.attrs["sample_rate_hz"] - (starts - starts[0])).max())
     return [
-        compare("trigger: pulses found by the preamble", found / (pulses * len(nodes)), "1", independent_model=1.0,
+        compare("trigger: pulses found by the preamble", detected / (pulses * len(nodes)), "1", independent_model=1.0,
                 within=1e-9, note=f"of {pulses} pulses in each of {len(nodes)} recordings that ran through"),
         require("trigger: largest error of a capture's start", float(np.max(errors)), "samples",
                 limit="at most 2 samples, which the sidelink removes", met=bool(np.max(errors) <= 2), style=".2f",

@@ -45,7 +45,7 @@ _COLUMNS = 500
 def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
     """Draw data and image with one error, a key of `SHOWN`, as PNG; return its path.
 
-    Both panels are in dB against the peak of the same scene without error, so that what is lost is seen.
+    Both panels are in dB against the peak of the same scene without error, so that losses are visible.
     """
     key, size = SHOWN[name]
     error = ERRORS[key]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.core.quality.fused import Amplitude
 from apertura.core.quality.point_targets import Cut, cut_through, find_peak
-from apertura.simulation.experiments import GAP_M, SEGMENT_M
+from apertura.simulation.presets import GAP_M, SEGMENT_M
 from apertura_research.paper.claims import Claim, compare, require
 from apertura_research.paper.experiments import (
     BISTATIC,

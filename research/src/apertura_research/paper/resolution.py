@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from apertura.simulation.recording import straight_pair
 from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import straight_pair
 from apertura_research.paper.claims import EXPLAINED, Claim, compare
 from apertura_research.paper.parameters import (
     HALF_POWER_OF_HANN,

@@ -21,7 +21,7 @@ EXPECTED = {
     "two_parameter": "works down to −20 dB",
     "auto": "within 0.2 dB of the best",
 }
-"""What an independent model says of each method."""
+"""What an independent model predicts of each method."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def _of_method(outcomes: Sequence[StabilityRow], method: str) -> list[StabilityR
 def write_sidelink_tables(outcomes: Sequence[StabilityRow], folder: Path) -> None:
     """Write sidelink.csv: each method at each SNR of the sidelink, the best, and how far `auto` is from it.
 
-    Beside it sidelink_methods.csv says at which SNR each method fails.
+    Beside it sidelink_methods.csv lists at which SNR each method fails.
     """
     methods = [method for method in CHOICES if method not in ("none", "auto")]
     write_table(folder / "sidelink.csv", _snr_rows(outcomes, methods))
