@@ -41,7 +41,7 @@ demo: $(SETUP)
 run: $(SETUP)
 	$(BIN)/apertura run $(or $(CAMPAIGN),$(error which campaign? make run CAMPAIGN=folder))
 
-# The paper's claims and the stability atlas, into results/study/; killed runs go on where they were.
+# The paper's claims; stability, error atlas and autofocus; into results/study/; killed runs go on where they were.
 paper stability: $(SETUP)
 	$(BIN)/snakemake --snakefile research/study.smk --workflow-profile profiles/default $@
 

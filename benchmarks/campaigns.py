@@ -15,6 +15,8 @@ from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, ra
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround, GroundModels
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 FLAT = FlatGround(0.0)
 
@@ -101,15 +103,12 @@ def _record(
     rows, columns = (generator.uniform(0, size - 1, targets) for size in grid.shape)
     places = grid.positions_at(rows, columns, 0.0)
     gains = generator.standard_normal(targets) + 1j * generator.standard_normal(targets)
-    path = sum(np.linalg.norm(places - antenna[:, None], axis=-1) for antenna in (tx, rx))
-    reference = near / C
-    transfer = np.zeros((len(tx), count), np.complex128)
-    for delay, gain in zip((path / C - reference[:, None]).T, gains, strict=True):
-        transfer += gain * np.exp(-2j * np.pi * frequency * delay[:, None])
+    flown = Aperture(tx, rx)
+    echoes = transfer(Scatterers(places, gains), flown, frequency, longer_m=-near, spreading=False)
     noise = 10 ** (generator.uniform(-60, 10) / 20)
-    transfer += noise * (generator.standard_normal(transfer.shape) + 1j * generator.standard_normal(transfer.shape))
+    white = generator.standard_normal(echoes.shape) + 1j * generator.standard_normal(echoes.shape)
     weights = window_weights(window, count)
-    return PhaseHistory(transfer.astype(np.complex64), frequency, weights, reference, Aperture(tx, rx))
+    return PhaseHistory((echoes + noise * white).astype(np.complex64), frequency, weights, near / C, flown)
 
 
 def compressed(history: PhaseHistory, grid: SceneGrid, window: str) -> Profiles:

@@ -15,6 +15,8 @@ from scipy.ndimage import gaussian_filter
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16
@@ -118,15 +120,9 @@ def turned(job: Job, degrees: float) -> Job:
 
 def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
     """Return (pulse, subcarrier) Σ a·exp(-j2πf(path - reference)/c), as other codes read it."""
-    fine, block = np.arange(64), 64 * np.arange(SUBCARRIERS // 64)
-    history = np.zeros((len(reference_path_m), SUBCARRIERS), np.complex128)
-    first_hz = CENTRE_HZ - SPACING_HZ * (SUBCARRIERS - 1) / 2
-    for place, gain in zip(job.scatterers, job.amplitude, strict=True):
-        path = total_path(*job.profiles.aperture.legs, place[None])
-        turn = -2j * np.pi / C * (path - reference_path_m[:, None])
-        coarse = gain * np.exp(turn * (first_hz + SPACING_HZ * block))
-        history += (coarse[:, :, None] * np.exp(turn * SPACING_HZ * fine)[:, None, :]).reshape(history.shape)
-    return history.astype(np.complex64)
+    frequency_hz = CENTRE_HZ + SPACING_HZ * (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2)
+    points = Scatterers(job.scatterers, job.amplitude)
+    return transfer(points, job.profiles.aperture, frequency_hz, longer_m=-reference_path_m, spreading=False)
 
 
 def exact(job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ) -> NDArray[np.complex128]:

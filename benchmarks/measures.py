@@ -21,7 +21,6 @@ import zarr
 from rich.console import Console
 from rich.table import Table
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.echo.compression import window_weights
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.focus.tiles import compute_tiles
@@ -36,6 +35,8 @@ from apertura.core.quality.agreement import agreement
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
 
@@ -50,14 +51,12 @@ def formation(size: int, pulses: int, subcarriers: int) -> Formation:
     places = np.array(
         [[x, y, 0.0] for x, y in half * np.array([(0, 0), (-0.5, 0.2), (0.4, 0.5), (0.3, -0.6), (-0.6, -0.4)])]
     )
-    transfer = np.zeros((pulses, subcarriers), np.complex64)
-    for path in flown.path(places).T:
-        transfer += np.exp(-2j * np.pi * np.outer(path / C, frequency)).astype(np.complex64)
-    for part in np.array_split(transfer, 32):
+    echoes = transfer(Scatterers(places, np.ones(len(places))), flown, frequency, spreading=False)
+    for part in np.array_split(echoes, 32):
         part.real += 0.05 * generator.standard_normal(part.shape, np.float32)
         part.imag += 0.05 * generator.standard_normal(part.shape, np.float32)
     weight = window_weights("hann", subcarriers)
-    history = PhaseHistory(transfer, frequency, weight, np.zeros(pulses), flown)
+    history = PhaseHistory(echoes, frequency, weight, np.zeros(pulses), flown)
     grid, ground = SceneGrid("local", -half, half, SPACING_M, (size, size)), FlatGround(0.0)
     job = imaging_job(flown, frequency, weight, grid, GroundModels.of(ground, None, grid), history=history)
     plan = make_plan(job, accuracy_db=-60.0)

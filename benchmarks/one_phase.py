@@ -11,9 +11,8 @@ from statistics import median
 from time import process_time
 
 import numpy as np
-from apertura_research.study.refinement.cases import PROBES_M, Case, case
-from apertura_research.study.refinement.measures import UNCORRECTED, Peaks, image_seconds, peaks
-from apertura_research.study.refinement.scenes import AREA_M, GRID
+from apertura_research.autofocus.cases import AREA_M, GRID, PROBES_M, Case, case
+from apertura_research.autofocus.outcomes import UNCORRECTED, Peaks, image_seconds, peaks
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table

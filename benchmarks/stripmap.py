@@ -25,7 +25,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.echo.compression import centre_frequency
@@ -40,6 +39,8 @@ from apertura.core.imaging.range_profiles import RangeWindow, Rows, range_compre
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 FLAT = FlatGround(0.0)
 SPEED_M, HEIGHT_M = 0.02, 40.0
@@ -65,27 +66,15 @@ class Flight:
 
     def __getitem__(self, pulses: slice) -> NDArray[np.complex64]:
         some = self.aperture[pulses]
-        echo = np.zeros((len(some), self.shape[1]), np.complex128)
         east, reach = some.tx_m[:, 0], 200.0
-        for target in self.targets_m[np.abs(self.targets_m[:, 0] - east.mean()) < reach]:
-            delay = some.path(target) / C
-            turn = np.exp(-2j * np.pi * (delay * (self.frequency_hz[1] - self.frequency_hz[0])))
-            echo += np.exp(-2j * np.pi * delay * self.frequency_hz[0])[:, None] * _powers(turn, self.shape[1])
-        return echo.astype(np.complex64)
+        near_m = self.targets_m[np.abs(self.targets_m[:, 0] - east.mean()) < reach]
+        return transfer(Scatterers(near_m, np.ones(len(near_m))), some, self.frequency_hz, spreading=False)
 
     @property
     def history(self) -> PhaseHistory:
         """All of it, read as it is asked for."""
         weight = np.hanning(self.shape[1]) / np.hanning(self.shape[1]).sum()
         return PhaseHistory(self, self.frequency_hz, weight, np.zeros(len(self)), self.aperture)  # type: ignore[arg-type]
-
-
-def _powers(turn: NDArray[np.complex128], count: int) -> NDArray[np.complex128]:
-    """Return turn**n, n = 0…count-1, (pulse, n), by doubling."""
-    powers = np.ones((len(turn), 1), np.complex128)
-    while powers.shape[1] < count:
-        powers = np.hstack([powers, powers * (powers[:, -1] * turn)[:, None]])
-    return powers[:, :count]
 
 
 def compress_into(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, into: Any) -> None:

@@ -1,20 +1,30 @@
 # The studies need no campaign: `snakemake --snakefile research/study.smk --cores 2 paper stability`.
 from apertura.common.provenance import code_sha256
-from apertura_research.error_atlas.causes import CAUSES
-from apertura_research.study.commands import PAPER_FIGURES, PAPER_PARTS, PAPER_READS
-from apertura_research.study.refinement.outcomes import KINDS
-from apertura_research.study.stability.sweeps import CHOICES, SWEEPS
+from apertura_research.autofocus.outcomes import KINDS
+from apertura_research.commands import (
+    PAPER_FIGURES,
+    PAPER_PARTS,
+    PAPER_READS,
+    STUDIES,
+    study_of,
+)
 
 CAMPAIGN = "results/study/paper/campaigns/{experiment}"
+STUDY = {name: study_of(name) for name in STUDIES}
+
+
+def parts(study, names):
+    return expand("results/study/{study}/parts/{part}.csv", study=study, part=names)
 
 
 wildcard_constraints:
-    part="|".join(PAPER_PARTS),
+    part="|".join(
+        [*PAPER_PARTS, *(part for study in STUDY.values() for part in study.parts)]
+    ),
     figure="|".join(PAPER_FIGURES),
     experiment="lab|static|uav",
-    impairment="|".join(SWEEPS),
-    method="|".join(CHOICES),
-    cause="|".join(CAUSES),
+    study="|".join(STUDY),
+    chart="|".join(chart for study in STUDY.values() for chart in study.charts),
     scene="|".join(KINDS),
 
 
@@ -31,12 +41,17 @@ rule paper:
 
 rule stability:
     input:
-        "results/study/stability/summary.csv",
-        expand("results/study/stability/{impairment}.png", impairment=SWEEPS),
-        "results/study/atlas/summary.csv",
-        expand("results/study/atlas/{cause}.png", cause=CAUSES),
-        "results/study/refinement/losses.png",
-        expand("results/study/refinement/{scene}.png", scene=KINDS),
+        [
+            f"results/study/{name}/{chart}.png"
+            for name, study in STUDY.items()
+            for chart in study.charts
+        ],
+        [
+            f"results/study/{name}/{table}"
+            for name, study in STUDY.items()
+            for table in study.summaries
+        ],
+        expand("results/study/autofocus/{scene}.png", scene=KINDS),
 
 
 rule paper_campaign:
@@ -53,7 +68,11 @@ rule paper_campaign:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         folder=CAMPAIGN,
-        code=code_sha256("apertura.simulation.presets", "apertura.pipeline.steps.echo", "apertura.pipeline.steps.cube"),
+        code=code_sha256(
+            "apertura.simulation.presets",
+            "apertura.pipeline.steps.echo",
+            "apertura.pipeline.steps.cube",
+        ),
     message:
         "the paper's experiment {wildcards.experiment}, through the ordinary pipeline"
     shell:
@@ -63,7 +82,9 @@ rule paper_campaign:
 
 rule paper_part:
     input:
-        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_READS.get(wildcards.part, ())),
+        lambda wildcards: expand(
+            f"{CAMPAIGN}.done", experiment=PAPER_READS.get(wildcards.part, ())
+        ),
     output:
         "results/study/paper/parts/{part}.csv",
     log:
@@ -76,7 +97,9 @@ rule paper_part:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=lambda wildcards: code_sha256("apertura_research.study.paper." + PAPER_PARTS[wildcards.part].split(":")[0]),
+        code=lambda wildcards: code_sha256(
+            "apertura_research.paper." + PAPER_PARTS[wildcards.part].split(":")[0]
+        ),
     message:
         "claims of the paper: {wildcards.part}"
     shell:
@@ -98,7 +121,7 @@ rule paper_claims:
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura_research.study.paper.claims"),
+        code=code_sha256("apertura_research.paper.claims"),
     message:
         "putting the claims together"
     shell:
@@ -107,7 +130,9 @@ rule paper_claims:
 
 rule paper_figure:
     input:
-        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_FIGURES[wildcards.figure]),
+        lambda wildcards: expand(
+            f"{CAMPAIGN}.done", experiment=PAPER_FIGURES[wildcards.figure]
+        ),
     output:
         "results/study/paper/{figure}.png",
     log:
@@ -120,205 +145,107 @@ rule paper_figure:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura_research.study.paper.figures", "apertura_research.study.paper.experiment_figures"),
+        code=code_sha256(
+            "apertura_research.paper.figures", "apertura_research.paper.figures"
+        ),
     message:
         "drawing the paper's figure {wildcards.figure}"
     shell:
         "apertura study paper-figure {wildcards.figure} > {log} 2>&1"
 
 
-rule stability_sweep:
+rule sweep:
     output:
-        "results/study/stability/parts/{impairment}.{method}.csv",
+        "results/study/{study}/parts/{part}.csv",
     log:
-        "results/logs/study/{impairment}.{method}.log",
+        "results/logs/study/{study}.{part}.log",
     benchmark:
-        "results/benchmarks/study/{impairment}.{method}.tsv"
+        "results/benchmarks/study/{study}.{part}.tsv"
     conda:
         "../environment.yml"
     threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura_research.study.stability.outcomes"),
+        code=lambda wildcards: code_sha256(STUDY[wildcards.study].run.__module__),
     message:
-        "sweeping {wildcards.impairment} under {wildcards.method}"
+        "{wildcards.study}: sweeping {wildcards.part}"
     shell:
-        "apertura study stability-sweep {wildcards.impairment} {wildcards.method} > {log} 2>&1"
+        "apertura study sweep {wildcards.study} {wildcards.part} > {log} 2>&1"
 
 
-rule stability_chart:
+rule chart:
     input:
-        expand("results/study/stability/parts/{{impairment}}.{method}.csv", method=CHOICES),
+        lambda wildcards: parts(
+            wildcards.study, STUDY[wildcards.study].charts[wildcards.chart]
+        ),
     output:
-        "results/study/stability/{impairment}.csv",
-        "results/study/stability/{impairment}.png",
+        "results/study/{study}/{chart}.csv",
+        "results/study/{study}/{chart}.png",
     log:
-        "results/logs/study/{impairment}.chart.log",
+        "results/logs/study/{study}.{chart}.chart.log",
     benchmark:
-        "results/benchmarks/study/{impairment}.chart.tsv"
+        "results/benchmarks/study/{study}.{chart}.chart.tsv"
     conda:
         "../environment.yml"
     threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
     params:
-        code=code_sha256("apertura_research.study.stability.charts"),
+        code=lambda wildcards: code_sha256(STUDY[wildcards.study].draw.__module__),
     message:
-        "charting {wildcards.impairment}"
+        "{wildcards.study}: charting {wildcards.chart}"
     shell:
-        "apertura study stability-chart {wildcards.impairment} > {log} 2>&1"
+        "apertura study chart {wildcards.study} {wildcards.chart} > {log} 2>&1"
 
 
-rule stability_summary:
-    input:
-        expand("results/study/stability/{impairment}.csv", impairment=SWEEPS),
+for study_name, study in STUDY.items():
+    if study.summaries:
+
+        rule:
+            name:
+                f"{study_name}_summary"
+            input:
+                parts(study_name, study.parts),
+            output:
+                expand(
+                    "results/study/{study}/{table}",
+                    study=study_name,
+                    table=study.summaries,
+                ),
+            log:
+                f"results/logs/study/{study_name}.summary.log",
+            benchmark:
+                f"results/benchmarks/study/{study_name}.summary.tsv"
+            conda:
+                "../environment.yml"
+            threads: 1
+            resources:
+                mem_mb=lambda wildcards, attempt: 500 * attempt,
+            params:
+                study=study_name,
+                code=code_sha256(study.draw.__module__),
+            message:
+                "{params.study}: tables and picture of all parts"
+            shell:
+                "apertura study summary {params.study} > {log} 2>&1"
+
+
+rule autofocus_picture:
     output:
-        "results/study/stability/summary.csv",
-        "results/study/stability/summary.png",
-        "results/study/stability/sidelink.csv",
-        "results/study/stability/sidelink_methods.csv",
+        "results/study/autofocus/{scene}.png",
     log:
-        "results/logs/study/summary.log",
+        "results/logs/study/autofocus.{scene}.png.log",
     benchmark:
-        "results/benchmarks/study/summary.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura_research.study.stability.charts"),
-    message:
-        "where each correction fails"
-    shell:
-        "apertura study stability-summary > {log} 2>&1"
-
-
-rule atlas_sweep:
-    output:
-        "results/study/atlas/parts/{cause}.csv",
-    log:
-        "results/logs/study/atlas.{cause}.log",
-    benchmark:
-        "results/benchmarks/study/atlas.{cause}.tsv"
+        "results/benchmarks/study/autofocus.{scene}.png.tsv"
     conda:
         "../environment.yml"
     threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256("apertura_research.error_atlas.outcomes"),
-    message:
-        "spoiling images by {wildcards.cause}"
-    shell:
-        "apertura study atlas-sweep {wildcards.cause} > {log} 2>&1"
-
-
-rule atlas_chart:
-    input:
-        "results/study/atlas/parts/{cause}.csv",
-    output:
-        "results/study/atlas/{cause}.png",
-    log:
-        "results/logs/study/atlas.{cause}.chart.log",
-    benchmark:
-        "results/benchmarks/study/atlas.{cause}.chart.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura_research.error_atlas.charts"),
-    message:
-        "charting what {wildcards.cause} does"
-    shell:
-        "apertura study atlas-chart {wildcards.cause} > {log} 2>&1"
-
-
-rule atlas_summary:
-    input:
-        expand("results/study/atlas/parts/{cause}.csv", cause=CAUSES),
-    output:
-        "results/study/atlas/summary.csv",
-        "results/study/atlas/summary.png",
-        "results/study/atlas/flags.csv",
-    log:
-        "results/logs/study/atlas.summary.log",
-    benchmark:
-        "results/benchmarks/study/atlas.summary.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura_research.error_atlas.charts"),
-    message:
-        "which mistakes are seen"
-    shell:
-        "apertura study atlas-summary > {log} 2>&1"
-
-
-rule refinement_sweep:
-    output:
-        "results/study/refinement/parts/{scene}.csv",
-    log:
-        "results/logs/study/refinement.{scene}.log",
-    benchmark:
-        "results/benchmarks/study/refinement.{scene}.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
-    params:
-        code=code_sha256("apertura_research.study.refinement.outcomes"),
-    message:
-        "refining tracks over {wildcards.scene}"
-    shell:
-        "apertura study refinement-sweep {wildcards.scene} > {log} 2>&1"
-
-
-rule refinement_chart:
-    input:
-        expand("results/study/refinement/parts/{scene}.csv", scene=KINDS),
-    output:
-        "results/study/refinement/losses.csv",
-        "results/study/refinement/losses.png",
-    log:
-        "results/logs/study/refinement.chart.log",
-    benchmark:
-        "results/benchmarks/study/refinement.chart.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-    params:
-        code=code_sha256("apertura_research.study.refinement.charts"),
-    message:
-        "charting what refinement leaves"
-    shell:
-        "apertura study refinement-chart > {log} 2>&1"
-
-
-rule refinement_picture:
-    output:
-        "results/study/refinement/{scene}.png",
-    log:
-        "results/logs/study/refinement.{scene}.png.log",
-    benchmark:
-        "results/benchmarks/study/refinement.{scene}.png.tsv"
-    conda:
-        "../environment.yml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 1500 * attempt,
-    params:
-        code=code_sha256("apertura_research.study.refinement.pictures"),
+        code=code_sha256("apertura_research.autofocus.charts"),
     message:
         "images of {wildcards.scene} before and after"
     shell:
-        "apertura study refinement-picture {wildcards.scene} > {log} 2>&1"
+        "apertura study autofocus-picture {wildcards.scene} > {log} 2>&1"

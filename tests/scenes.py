@@ -19,6 +19,8 @@ from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, GroundModels
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 WAVELENGTH = C / 1.2e9
@@ -80,16 +82,16 @@ def point_history(pulses: int = 96) -> PhaseHistory:
     along = np.linspace(-4, 4, pulses)
     track = np.stack([along, np.full(pulses, -20.0), np.full(pulses, 10.0)], -1)
     flown = Aperture(track, track + [0.5, 0.0, 0.0])
-    echo = np.exp(-2j * np.pi * frequency * flown.path(TARGET) / C).astype(np.complex64)
+    echo = transfer(Scatterers(TARGET, np.ones(1)), flown, frequency, spreading=False)
     return PhaseHistory(echo, frequency, np.full(200, 1 / 200), np.zeros(pulses), flown)
 
 
 def strip_history(aperture: Aperture, targets_m: NDArray[np.float64], subcarriers: int = 64) -> PhaseHistory:
     """Echoes of targets (target, 3) of any flight, 96 MHz about 1.25 GHz."""
     frequency = 1.2e9 + 1.5e6 * np.arange(subcarriers)
-    echo = sum(np.exp(-2j * np.pi * frequency * aperture.path(target)[:, None] / C) for target in targets_m)
+    echo = transfer(Scatterers(targets_m, np.ones(len(targets_m))), aperture, frequency, spreading=False)
     weight = np.full(subcarriers, 1 / subcarriers)
-    return PhaseHistory(np.asarray(echo, np.complex64), frequency, weight, np.zeros(len(aperture)), aperture)
+    return PhaseHistory(echo, frequency, weight, np.zeros(len(aperture)), aperture)
 
 
 UTM_GRID = SceneGrid("EPSG:32632", 500020.0, 5400060.0, 0.5, (70, 90))
@@ -98,6 +100,7 @@ UTM_GRID = SceneGrid("EPSG:32632", 500020.0, 5400060.0, 0.5, (70, 90))
 
 AXES, PLACE = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0], np.array([4.1e6, 0.9e6, 4.8e6])
 SUBCARRIERS, BANDWIDTH_HZ = 128, 409.6e6
+OFFSET_HZ = (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2) * BANDWIDTH_HZ / SUBCARRIERS
 GUARD = 12
 
 
@@ -110,21 +113,18 @@ def ecef(local: NDArray[np.float64]) -> NDArray[np.float64]:
 class Scene:
     """What was flown, and the calibrated spectra it gave; positions in ECEF."""
 
-    transfer: NDArray[np.complex128]
+    transfer: NDArray[np.complex64]
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     carrier_hz: float
-
-    @property
-    def offset_hz(self) -> NDArray[np.float64]:
-        return (np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2) * BANDWIDTH_HZ / SUBCARRIERS
 
     def path_m(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         return sum(np.linalg.norm(place - antenna[:, None], axis=-1) for antenna in (self.tx, self.rx))
 
     def history(self) -> PhaseHistory:
-        frequency, silent = self.carrier_hz + self.offset_hz, np.zeros(len(self.tx))
-        return PhaseHistory(self.transfer, frequency, np.ones(frequency.size), silent, Aperture(self.tx, self.rx))
+        silent = np.zeros(len(self.tx))
+        frequency = self.carrier_hz + OFFSET_HZ
+        return PhaseHistory(self.transfer, frequency, np.ones(SUBCARRIERS), silent, Aperture(self.tx, self.rx))
 
     def profiles(self, around: NDArray[np.float64]) -> Profiles:
         paths = self.path_m(around.reshape(-1, 3))
@@ -132,13 +132,13 @@ class Scene:
         start = paths.min(1) - GUARD * step_m
         length = int(np.ceil((paths.max(1) - start).max() / step_m)) + GUARD
         at = start[:, None] + step_m * np.arange(length)
-        turns = np.exp(2j * np.pi * at[..., None] / C * self.offset_hz)
+        turns = np.exp(2j * np.pi * at[..., None] / C * OFFSET_HZ)
         samples = np.einsum("pln,pn->pl", turns, self.transfer).astype(np.complex64)
         return Profiles(samples, start, step_m, self.carrier_hz, 2.0, Aperture(self.tx, self.rx))
 
     def exact(self, places: NDArray[np.float64]) -> NDArray[np.complex128]:
         delay = self.path_m(places) / C
-        inner = np.einsum("pxn,pn->px", np.exp(2j * np.pi * delay[..., None] * self.offset_hz), self.transfer)
+        inner = np.einsum("pxn,pn->px", np.exp(2j * np.pi * delay[..., None] * OFFSET_HZ), self.transfer)
         return (inner * np.exp(2j * np.pi * self.carrier_hz * delay)).sum(0)
 
 
@@ -155,11 +155,15 @@ def fly(
     bend = np.sin(np.linspace(0, 7, pulses))[:, None]
     tx = ecef(np.hstack([0.03 * bend, along, range_m + 0.05 * bend]))
     rx = ecef(np.hstack([-1.5 + along / 7, 3 + 0.8 * along, 1.2 * range_m - 0.04 * bend])) if bistatic else tx.copy()
-    empty = Scene(np.zeros((pulses, SUBCARRIERS), complex), tx, rx, carrier_hz)
-    amplitude = np.exp(2j * np.pi * np.arange(len(targets)) * 0.618)
-    delay = empty.path_m(ecef(targets)) / C
-    waves = np.exp(-2j * np.pi * delay[..., None] * (carrier_hz + empty.offset_hz))
-    return replace(empty, transfer=np.einsum("ptn,t->pn", waves, amplitude))
+    return observed(targets, tx, rx, carrier_hz)
+
+
+def observed(
+    targets: NDArray[np.float64], tx: NDArray[np.float64], rx: NDArray[np.float64], carrier_hz: float
+) -> Scene:
+    """Echoes of targets (local metres) of unit modulus from antennas in ECEF."""
+    points = Scatterers(ecef(targets), np.exp(2j * np.pi * np.arange(len(targets)) * 0.618))
+    return Scene(transfer(points, Aperture(tx, rx), carrier_hz + OFFSET_HZ, spreading=False), tx, rx, carrier_hz)
 
 
 def pixel_grid(

@@ -13,7 +13,7 @@ from website.pages import PAGES
 
 ROOT = Path(__file__).parents[1]
 SOURCES = {path.relative_to(ROOT / "src/apertura").as_posix(): path for path in ROOT.glob("src/apertura/*/**/*.py")}
-ELSEWHERE = ("flags/", "atlas/", "study/")
+ELSEWHERE = ("flags/",)
 """Who tells of flags, or names outcomes that raise them, and raises none."""
 
 HOLDERS = {"flags", "raised", "crossed", "lines", "said"}

@@ -12,9 +12,9 @@ from apertura.core.echo.transfer import transfer_by_sidelink
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import PulseWaveform, validated
 from apertura.pipeline.opening.transmitted import read_pulse, transmitted
-from apertura.simulation.pulse import TransmitPulse, pulse_samples
-from apertura.simulation.radar import Paths
 from apertura.simulation.synthesis import Channel, samples
+from apertura.simulation.transfer import Paths
+from apertura.simulation.waveform import TransmitPulse, pulse_samples
 
 RATE = 256e6
 SIZES = {"bandwidth_hz": 128e6, "pulse_s": 2e-6, "sample_rate_hz": RATE}

@@ -9,7 +9,6 @@ from scenes import Scene, decibels, ecef, fly, pixel_grid, scatter, swaying_beam
 
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.focus.engines import native, numba, reference
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
@@ -22,10 +21,7 @@ def hard(soft: Beam, half_deg: float) -> Beam:
 
 
 def exact(scene: Scene, pixels: NDArray[np.float64], beams: Beams) -> NDArray[np.complex128]:
-    frequency = scene.carrier_hz + scene.offset_hz
-    silent = np.zeros(len(scene.tx))
-    spectra = PhaseHistory(scene.transfer, frequency, np.ones(frequency.size), silent, Aperture(scene.tx, scene.rx))
-    return reference.form(spectra, ecef(pixels), beams=beams)
+    return reference.form(scene.history(), ecef(pixels), beams=beams)
 
 
 @pytest.fixture(scope="module")

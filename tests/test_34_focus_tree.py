@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scenes import compiled, decibels, ecef, error_db, pixel_grid, scatter, swaying_beam
+from scenes import compiled, decibels, ecef, error_db, observed, pixel_grid, scatter, swaying_beam
 from tree_flights import WAVENUMBERS, counted, flown, formed, heard, seen, setting, shaken
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
@@ -101,10 +101,8 @@ def test_tiles_beyond_all_profiles_cost_nothing(plain):
 def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
     """A smooth track's 64 pulses become few; white noise of a millimetre on it is not smooth at 12 m, and is kept."""
     white = jitter_m * np.random.default_rng(8).standard_normal((2, 300, 3))
-    scene = replace(plain.scene, tx=plain.scene.tx + white[0], rx=plain.scene.rx + white[1])
-    delay = (scene.path_m(ecef(scatter(plain.pixels)))) / C
-    waves = np.exp(-2j * np.pi * delay[..., None] * (scene.carrier_hz + scene.offset_hz))
-    scene = replace(scene, transfer=np.einsum("ptn,t->pn", waves, np.exp(2j * np.pi * np.arange(25) * 0.618)))
+    true = plain.scene
+    scene = observed(scatter(plain.pixels), true.tx + white[0], true.rx + white[1], true.carrier_hz)
     shaken = seen(scene, plain.pixels)
     fewer = counted(shaken.aperture[:256], ecef(plain.pixels[:35, :45])).fewer
     assert 5 <= fewer <= 28 if not jitter_m else fewer == 0

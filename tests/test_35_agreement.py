@@ -5,8 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from apertura_research.study.refinement.echoes import transfer
-from apertura_research.study.refinement.scenes import Scatterers
 
 from apertura.core.echo.compression import window_weights
 from apertura.core.focus.inputs import PhaseHistory
@@ -19,6 +17,8 @@ from apertura.methods.autofocus.inputs import NodePrior, Prior, Sighting, TrackE
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.solve import Gauge, minimal
 from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)
@@ -36,7 +36,7 @@ def speckle(generator):
     """A scatterer to a resolution cell, beyond the grid on all sides."""
     places = np.concatenate([generator.uniform((-14, 2), (14, 32), (30_000, 2)), np.zeros((30_000, 1))], axis=1)
     amplitude = generator.standard_normal((2, 30_000)).T @ [1, 1j]
-    return Scatterers(places, amplitude, np.zeros(0, int))
+    return Scatterers(places, amplitude)
 
 
 @cache
@@ -50,7 +50,7 @@ def seen(seed, ahead_m=4.7):
         logged = Aperture(flown(0.0), flown(ahead_m if pair == "a-b" else 0.0))
         between_m = logged.tx_m - logged.rx_m if pair == "a-b" else None
         longer_m = -truth.longer_m(pair, TIME_S, between_m)
-        echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, further_m=longer_m)
+        echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, longer_m=longer_m, gridded=True)
         history = PhaseHistory(echo, FREQUENCY_HZ, window_weights("hann", 128), np.zeros(600), logged)
         sightings.append(Sighting(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
     return sightings, unknowns

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from apertura_research.study.refinement.cases import case
-from apertura_research.study.refinement.measures import judge
-from apertura_research.study.refinement.scenes import GRID
+from apertura_research.autofocus.cases import GRID, case
+from apertura_research.autofocus.outcomes import judge
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions

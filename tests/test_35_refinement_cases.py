@@ -2,21 +2,24 @@
 
 import numpy as np
 import pytest
-from apertura_research.study.refinement.cases import PROBES_M, case
-from apertura_research.study.refinement.echoes import transfer
-from apertura_research.study.refinement.flights import drawn_errors
-from apertura_research.study.refinement.measures import judge, peaks
-from apertura_research.study.refinement.scenes import Scatterers
+from apertura_research.autofocus.cases import PROBES_M, case, drawn_errors
+from apertura_research.autofocus.outcomes import judge, peaks
 from scenes import compiled
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 from apertura.methods.autofocus.inputs import TrackErrors
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 
 
-def test_echoes_are_those_of_the_plain_sum():
+@pytest.mark.parametrize(
+    ("gridded", "spreading", "error"),
+    [(True, True, 3e-6), (True, False, 3e-6), (False, True, 1e-7), (False, False, 1e-7)],
+)
+def test_echoes_are_those_of_the_plain_sum(gridded, spreading, error):
     generator = np.random.default_rng(1)
     places = generator.uniform((-9, 5, 0), (9, 25, 1), (30, 3))
     amplitude = generator.standard_normal(30) + 1j * generator.standard_normal(30)
@@ -26,9 +29,11 @@ def test_echoes_are_those_of_the_plain_sum():
     for place, one in zip(places, amplitude, strict=True):
         there, back = (np.linalg.norm(place - leg, axis=1) for leg in flown.legs)
         path = (there + back + further)[:, None]
-        exact += (one / (there * back))[:, None] * np.exp(-2j * np.pi * FREQUENCY_HZ * path / SPEED_OF_LIGHT_M_S)
-    echo = transfer(Scatterers(places, amplitude, np.zeros(0, int)), flown, FREQUENCY_HZ, further_m=further)
-    assert np.linalg.norm(echo - exact) < 3e-6 * np.linalg.norm(exact)
+        level = one / (there * back) if spreading else one * np.ones(40)
+        exact += level[:, None] * np.exp(-2j * np.pi * FREQUENCY_HZ * path / SPEED_OF_LIGHT_M_S)
+    points = Scatterers(places, amplitude)
+    echo = transfer(points, flown, FREQUENCY_HZ, longer_m=further, spreading=spreading, gridded=gridded)
+    assert np.linalg.norm(echo - exact) < error * np.linalg.norm(exact)
 
 
 def test_errors_have_the_deviation_and_the_correlation_of_the_prior():

@@ -15,11 +15,22 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected
 from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Impairments, Localization
-from apertura.simulation.scene import Clutter, Line, Origin, Plate, PointTarget, scatterers
+from apertura.simulation.scene import (
+    Clutter,
+    GaussianBeam,
+    Line,
+    Origin,
+    Plate,
+    PointTarget,
+    Straight,
+    Waypoints,
+    Wobble,
+    phase_centre,
+    scatterers,
+)
 from apertura.simulation.specification import (
     SimulatedNode,
 )
-from apertura.simulation.trajectory import GaussianBeam, Straight, Waypoints, Wobble, phase_centre
 
 C = 299_792_458.0
 ORIGIN = Origin(48.0, 9.0, 500.0)

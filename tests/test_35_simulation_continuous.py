@@ -13,8 +13,7 @@ from apertura.common.errors import CampaignError
 from apertura.simulation import simulate
 from apertura.simulation.continuous import Framing, continuous_blocks, pulse_samples
 from apertura.simulation.impairments import Adc, Clock, Impairments, TimeTag, Timing
-from apertura.simulation.recording import full_scale
-from apertura.simulation.synthesis import samples
+from apertura.simulation.synthesis import full_scale, samples
 
 
 def stream_of(simulation, name, **settings):

@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from apertura.simulation.continuous import Framing
-from apertura.simulation.draw import draw_impairments
 from apertura.simulation.impairments import (
     Adc,
     Blockage,
@@ -20,14 +19,22 @@ from apertura.simulation.impairments import (
     Ripple,
     Timing,
     UniformPhase,
+    draw_impairments,
 )
 from apertura.simulation.observation import observe
-from apertura.simulation.periodic import periodic_samples
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.radar import Paths, TransmitWaveform, qpsk_codes
-from apertura.simulation.recording import Geometry, digitize, full_scale
 from apertura.simulation.scene import Scatterers
-from apertura.simulation.synthesis import Channel, samples, transfer_functions
+from apertura.simulation.synthesis import (
+    Channel,
+    Geometry,
+    digitize,
+    full_scale,
+    periodic_samples,
+    samples,
+    transfer_functions,
+)
+from apertura.simulation.transfer import Paths
+from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
 
 C = 299_792_458.0
 

@@ -14,15 +14,14 @@ from apertura.pipeline.campaign import Campaign
 from apertura.simulation import preset, read_specification, simulate, specification_text
 from apertura.simulation.impairments import Impairments, TimeTag, UniformPhase
 from apertura.simulation.presets import PRESETS
-from apertura.simulation.scene import Clutter, Origin, PointTarget, scatterers
+from apertura.simulation.scene import Clutter, Origin, PointTarget, Straight, Waypoints, Wobble, scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
 )
-from apertura.simulation.trajectory import Straight, Waypoints, Wobble
-from apertura.simulation.waveforms import WaveformSpecification
+from apertura.simulation.waveform import WaveformSpecification
 from apertura.views.cli import app
 
 

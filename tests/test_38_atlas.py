@@ -1,15 +1,17 @@
-"""The atlas: what spoils an image costs what the budget says, and its flag comes; rates of alarms are counted right."""
+"""The error atlas: what spoils an image costs what the budget says and is flagged; alarms are counted right."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from apertura_research.error_atlas import commands, outcomes
+from apertura_research import commands
+from apertura_research.error_atlas import outcomes
 from apertura_research.error_atlas.causes import CAUSES
-from apertura_research.error_atlas.charts import draw_cause, draw_summary
 from apertura_research.error_atlas.flight import PAIRS, flight
-from apertura_research.error_atlas.outcomes import Outcome, run_cause
-from apertura_research.error_atlas.summary import alarms, part_path, summary_of, write_summary
+from apertura_research.error_atlas.outcomes import ErrorAtlasRow
+from apertura_research.error_atlas.summary import STUDY, alarms, draw_cause, summary_of
+from apertura_research.sweep import part_path
 from typer.testing import CliRunner
 
 from apertura.common.errors import CampaignError
@@ -19,14 +21,14 @@ CELL_M = 0.1
 
 
 def outcome(size, draw=0, *, loss_db=0.0, shift_m=0.0, phase_rad=0.0, expected_loss_db=0.0, flags="", cause="height"):
-    return Outcome(
+    return ErrorAtlasRow(
         cause, "cm", size, draw, "a-a", loss_db, shift_m, phase_rad, 0.0, CELL_M, expected_loss_db, 0.0, 0.0, flags
     )  # fmt: skip
 
 
 def swept(monkeypatch, name, *sizes, draws=1):
     monkeypatch.setattr(outcomes, "CAUSES", {name: replace(CAUSES[name], sizes=sizes, draws=draws)})
-    return list(run_cause(name))
+    return list(STUDY.rows(name))
 
 
 @pytest.mark.slow
@@ -67,16 +69,16 @@ def test_what_is_refused_is_neither_wrong_nor_right(monkeypatch):
 @pytest.mark.parametrize(
     "name", sorted(CAUSES.keys() - {"track_noise_time"})
 )  # of which every size is as bad as 1.5 cm
-def test_what_is_told_of_a_negligible_size_is_the_truth(name):
+def test_what_is_assumed_at_a_negligible_size_is_the_truth(name):
     """To a centimetre: logs have noise of their own, and a tag a millisecond late is a millimetre."""
     cause = CAUSES[name]
     steps = np.diff(cause.sizes)
     assert (steps > 0).all() or (steps < 0).all()
     flown = cause.flight()
-    told = cause.tell(flown, cause.sizes[0], np.random.default_rng(0))
+    assumed = cause.assume(flown, cause.sizes[0], np.random.default_rng(0))
     off_m = 0.04 if name == "association" else 0.01  # a pulse is 3.3 cm
     for pair in PAIRS:
-        for leg, true in zip(told.apertures[pair].legs, flown.truth.apertures[pair].legs, strict=True):
+        for leg, true in zip(assumed.apertures[pair].legs, flown.truth.apertures[pair].legs, strict=True):
             assert np.abs(leg - true).max() < off_m
     effects = [cause.expect(flown, pair, cause.sizes[0]) for pair in PAIRS]
     assert min(effect.loss_db for effect in effects) > -0.1
@@ -117,7 +119,7 @@ def test_a_flag_is_counted_over_the_causes_that_raise_it():
     rows = {row.flag: row for row in alarms([*SWEEP, *other])}
     assert rows["defocused"].wrong == 4
     assert rows["defocused"].missed == 0.75
-    assert rows["defocused"].unsaid == 0.25
+    assert rows["defocused"].unflagged == 0.25
     assert (rows["defocused"].right, rows["defocused"].false) == (3, pytest.approx(1 / 3, rel=1e-3))
     assert (rows["pairs_apart"].missed, rows["pairs_apart"].false) == (0.25, 0.0)
 
@@ -127,18 +129,20 @@ def test_pictures_are_the_same_bytes_for_the_same_rows(tmp_path):
     for name in CAUSES:
         rows = [replace(row, cause=name) for row in SWEEP] + [outcome(2000.0, loss_db=np.nan, flags="refused")]
         write_table(part_path(tmp_path, name), rows, digits=6)
-    summaries = write_summary(tmp_path)
-    assert [row.cause for row in summaries] == list(CAUSES)
-    rows = read_table(part_path(tmp_path, "arm"), Outcome)
-    for name in ("a.png", "b.png"):
-        draw_cause(rows, tmp_path / name)
-        draw_summary(summaries, tmp_path / f"all_{name}")
-    for name in ("", "all_"):
-        assert (tmp_path / f"{name}a.png").read_bytes() == (tmp_path / f"{name}b.png").read_bytes()
+    for again in ("a", "b"):
+        for path in STUDY.summary(tmp_path):
+            path.rename(tmp_path / f"{again}_{path.name}")
+    with (tmp_path / "a_summary.csv").open(encoding="utf-8") as table:
+        assert [row["cause"] for row in csv.DictReader(table)] == list(CAUSES)
+    rows = read_table(part_path(tmp_path, "arm"), ErrorAtlasRow)
+    for again in ("a", "b"):
+        draw_cause("arm", rows, tmp_path / f"{again}_arm.png")
+    for name in ("summary.png", "flags.csv", "arm.png"):
+        assert (tmp_path / f"a_{name}").read_bytes() == (tmp_path / f"b_{name}").read_bytes()
 
 
-@pytest.mark.parametrize("command", ["atlas-sweep", "atlas-chart"])
-def test_a_cause_that_does_not_exist_is_told_those_that_do(command):
-    error = CliRunner().invoke(commands.app, [command, "x"]).exception
+@pytest.mark.parametrize("command", ["sweep", "chart"])
+def test_a_cause_that_does_not_exist_is_answered_with_those_that_do(command):
+    error = CliRunner().invoke(commands.app, [command, "error_atlas", "x"]).exception
     assert isinstance(error, CampaignError)
     assert "track_noise" in str(error)

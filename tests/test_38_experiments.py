@@ -2,20 +2,26 @@
 
 import numpy as np
 import pytest
-from apertura_research.study import commands
-from apertura_research.study.paper import experiment_figures, figures
-from apertura_research.study.paper.claims import AGREES, UNTESTABLE, VERDICTS
-from apertura_research.study.paper.coherence import coherence_claims
-from apertura_research.study.paper.experiments import BISTATIC, MONOSTATIC, open_experiment, profiles_at, terms_at
-from apertura_research.study.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
-from apertura_research.study.paper.losses import ERRORS
+from apertura_research import commands
+from apertura_research.paper import figures
+from apertura_research.paper.claims import AGREES, UNTESTABLE, VERDICTS
+from apertura_research.paper.experiments import (
+    BISTATIC,
+    MONOSTATIC,
+    coherence_claims,
+    open_experiment,
+    profiles_at,
+    terms_at,
+)
+from apertura_research.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
+from apertura_research.paper.losses import ERRORS
 from folders import run_steps
 
 from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import preset, simulate
-from apertura.simulation.experiments import CABLE_M, GAP_M, SEGMENT_M
+from apertura.simulation.presets import CABLE_M, GAP_M, SEGMENT_M
 
 PULSES = 16
 
@@ -94,12 +100,12 @@ def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab_profile", "lab_phase", "static_profile", "static_phase"])
 def test_figures_of_the_experiments_are_drawn_from_their_campaigns(campaigns, tmp_path, name):
-    path = experiment_figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")
+    path = figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")
     assert path.stat().st_size > 20_000
 
 
 def test_every_figure_of_the_paper_has_what_draws_it():
-    drawn = {*figures.SHOWN, "scene", *experiment_figures.DRAWN}
+    drawn = {*figures.SHOWN, "scene", *figures.DRAWN}
     assert drawn == set(commands.PAPER_FIGURES)
     assert len(drawn) == 14
     assert {error for error, _ in figures.SHOWN.values()} == set(ERRORS)

@@ -4,25 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from apertura_research.study import commands
-from apertura_research.study.refinement import charts, outcomes, pictures
-from apertura_research.study.refinement.measures import UNCORRECTED
-from apertura_research.study.refinement.outcomes import (
+from apertura_research import commands, sweep
+from apertura_research.autofocus import charts, outcomes
+from apertura_research.autofocus.cases import SCENES
+from apertura_research.autofocus.outcomes import (
     ACCEPTED,
     FLAGGED,
     KINDS,
     REFUSED,
-    SAID,
     SEEDS,
     SIGMAS_CM,
     TOO_FEW,
-    Outcome,
-    drawn,
+    UNCORRECTED,
+    VERDICTS,
+    AutofocusRow,
+    case_of,
     outcome_of,
-    run_kind,
-    said_of,
+    run_case,
+    verdict_of,
 )
-from apertura_research.study.refinement.scenes import SCENES
 from scenes import compiled
 from typer.testing import CliRunner
 
@@ -33,7 +33,7 @@ from apertura.methods.autofocus.inputs import Refinement
 
 
 def row(sigma_cm, said, *, scene="five", seed=1, product_db=0.2):
-    return Outcome(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, said, "", "why")
+    return AutofocusRow(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, said, "", "why")
 
 
 def answer(accepted, *flags, correction=UNCORRECTED):
@@ -42,12 +42,12 @@ def answer(accepted, *flags, correction=UNCORRECTED):
 
 def test_what_the_product_said_is_one_of_four_things():
     said = [
-        said_of(answer(True)),
-        said_of(answer(True, "prior_inconsistent")),
-        said_of(answer(False, "refinement_rejected", "cycle_slip_suspected")),
-        said_of(answer(False, "refinement_too_few_patches")),
+        verdict_of(answer(True)),
+        verdict_of(answer(True, "prior_inconsistent")),
+        verdict_of(answer(False, "refinement_rejected", "cycle_slip_suspected")),
+        verdict_of(answer(False, "refinement_too_few_patches")),
     ]
-    assert said == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(SAID)
+    assert said == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(VERDICTS)
 
 
 def test_every_kind_of_scene_is_one_of_the_cases_and_sizes_begin_at_none():
@@ -59,11 +59,11 @@ def test_every_kind_of_scene_is_one_of_the_cases_and_sizes_begin_at_none():
 @pytest.mark.slow
 @compiled
 def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_its_own():
-    one = drawn("five", 1.0, 1)
+    one = case_of("five", 1.0, 1)
     refused, accepted = (outcome_of(one, answer(yes, "f", correction=one.truth)) for yes in (False, True))
     assert refused.loss_db == accepted.loss_db > 0.8
-    assert (refused.product_loss_db, refused.found_loss_db) == (refused.loss_db, 0.0)
-    assert (accepted.product_loss_db, accepted.found_loss_db) == (0.0, 0.0)
+    assert (refused.product_loss_db, refused.estimate_loss_db) == (refused.loss_db, 0.0)
+    assert (accepted.product_loss_db, accepted.estimate_loss_db) == (0.0, 0.0)
     assert (accepted.scene, accepted.sigma_cm, accepted.seed, accepted.flags) == ("five", 1.0, 1, "f")
 
 
@@ -77,16 +77,16 @@ def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(mon
         return answer(False, "refinement_rejected")
 
     monkeypatch.setattr(outcomes, "refine", looked_at)
-    right, wrong = run_kind("five", sigmas_cm=(0.0, 2.0), seeds=(1,))
+    right, wrong = (run_case("five", (sigma_cm, 1))[0] for sigma_cm in (0.0, 2.0))
     assert stated == [(0.005,) * 3] * 2 + [(0.02,) * 3] * 2
-    assert (right.loss_db, right.product_loss_db, right.said) == (0.0, 0.0, REFUSED)
+    assert (right.loss_db, right.product_loss_db, right.verdict) == (0.0, 0.0, REFUSED)
     assert wrong.loss_db > 3
 
 
 @compiled
 @pytest.mark.slow
 def test_speckle_is_not_made_worse():
-    (one,) = run_kind("dense", sigmas_cm=(2.0,), seeds=(1,))
+    (one,) = run_case("dense", (2.0, 1))
     assert one.loss_db > 3
     assert one.product_loss_db <= one.loss_db
 
@@ -95,7 +95,7 @@ def test_speckle_is_not_made_worse():
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["five", "forty"])
 def test_where_there_are_points_little_is_left_of_two_centimetres(scene):
-    rows = list(run_kind(scene, sigmas_cm=(2.0,), seeds=(1, 2)))
+    rows = [run_case(scene, (2.0, seed))[0] for seed in (1, 2)]
     assert all(one.loss_db > 3 for one in rows)
     assert np.mean([one.product_loss_db for one in rows]) < 0.5
 
@@ -108,12 +108,12 @@ def marks(axes, said):
 @pytest.mark.slow
 def test_a_chart_tells_apart_what_was_said(monkeypatch, tmp_path):
     rows = [row(1.0, ACCEPTED), row(2.0, FLAGGED), row(3.0, REFUSED, product_db=6.0), row(5.0, TOO_FEW, product_db=10)]
-    rows += [replace(one, scene="dense", said=TOO_FEW) for one in rows]
+    rows += [replace(one, scene="dense", verdict=TOO_FEW) for one in rows]
     figures = []
-    monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
-    charts.draw_losses(rows, tmp_path / "losses.png")
+    monkeypatch.setattr(sweep, "save_png", lambda figure, _: figures.append(figure))
+    charts.draw_losses("losses", rows, tmp_path / "losses.png")
     five, dense = figures[0].axes
-    places = [marks(five, said).tolist() for said in (*SAID, "what was refused")]
+    places = [marks(five, said).tolist() for said in (*VERDICTS, "what was refused")]
     assert places == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
     assert "2 of 4 accepted, 0 of them worse" in five.get_title()
@@ -127,21 +127,23 @@ def test_the_tally_counts_what_was_accepted_and_did_harm():
 
 @pytest.mark.slow
 def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):
-    monkeypatch.setattr(outcomes, "run_kind", lambda scene: [row(1.0, ACCEPTED, scene=scene)])
-    for arguments in (*(["refinement-sweep", scene] for scene in KINDS), ["refinement-chart"]):
+    one_case = replace(charts.STUDY, cases=lambda _: [None], run=lambda scene, _: [row(1.0, ACCEPTED, scene=scene)])
+    monkeypatch.setattr(charts, "STUDY", one_case)
+    monkeypatch.setattr(sweep, "code_sha256", lambda _: "0" * 64)
+    for arguments in (*(["sweep", "autofocus", scene] for scene in KINDS), ["chart", "autofocus", "losses"]):
         run = CliRunner().invoke(commands.app, [*arguments, "--folder", str(tmp_path)])
         assert run.exit_code == 0, run.output
-    rows = read_table(tmp_path / "losses.csv", Outcome)
+    rows = read_table(tmp_path / "losses.csv", AutofocusRow)
     assert [one.scene for one in rows] == list(KINDS)
     drawn_once = (tmp_path / "losses.png").read_bytes()
     write_table(tmp_path / "again.csv", rows)
-    charts.draw_losses(read_table(tmp_path / "again.csv", Outcome), tmp_path / "again.png")
+    charts.draw_losses("losses", read_table(tmp_path / "again.csv", AutofocusRow), tmp_path / "again.png")
     assert (tmp_path / "again.png").read_bytes() == drawn_once
 
 
-@pytest.mark.parametrize("command", ["refinement-sweep", "refinement-picture"])
-def test_a_scene_that_is_not_tried_is_told_those_that_are(command):
-    error = CliRunner().invoke(commands.app, [command, "x"]).exception
+@pytest.mark.parametrize("command", ["sweep autofocus", "autofocus-picture"])
+def test_a_scene_that_is_not_tried_is_answered_with_those_that_are(command):
+    error = CliRunner().invoke(commands.app, [*command.split(), "x"]).exception
     assert isinstance(error, CampaignError)
     assert "texture" in str(error)
 
@@ -160,15 +162,15 @@ def linear_path_error(one, place_m):
 @pytest.mark.slow
 @compiled
 def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_takes_away(monkeypatch, tmp_path):
-    one = drawn("five", 2.0, 1)
+    one = case_of("five", 2.0, 1)
     half = TrackCorrection(one.truth.time_s, {node: 0.5 * moved for node, moved in one.truth.moved_m.items()})
     figures = []
-    monkeypatch.setattr(pictures, "refined", lambda _: answer(True, correction=half))
-    monkeypatch.setattr(pictures, "save_png", lambda figure, _: figures.append(figure))
-    pictures.draw_case("five", tmp_path / "five.png")
+    monkeypatch.setattr(charts, "refine_case", lambda _: answer(True, correction=half))
+    monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
+    charts.draw_case("five", tmp_path / "five.png")
     images = [axes for axes in figures[0].axes if axes.images]
     assert [axes.get_title().split(",")[0] for axes in images] == ["logs", "refined tracks", "true tracks"] * 2
-    assert {axes.images[0].get_clim() for axes in images} == {(-pictures.DEPTH_DB, 0.0)}
+    assert {axes.images[0].get_clim() for axes in images} == {(-charts.DEPTH_DB, 0.0)}
     highest = [axes.images[0].get_array().max() for axes in images[:3]]
     assert highest[0] < highest[1] < highest[2] == pytest.approx(0, abs=1e-9)
     errors = [axes for axes in figures[0].axes if axes.get_title() in ("east", "north", "up")]
@@ -186,11 +188,11 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
 @pytest.mark.slow
 @compiled
 def test_a_picture_of_what_was_refused_says_so_and_shows_the_logs(monkeypatch, tmp_path):
-    one = drawn("five", 2.0, 1)
+    one = case_of("five", 2.0, 1)
     figures = []
-    monkeypatch.setattr(pictures, "refined", lambda _: answer(False, "refinement_rejected", correction=one.truth))
-    monkeypatch.setattr(pictures, "save_png", lambda figure, _: figures.append(figure))
-    pictures.draw_case("five", tmp_path / "five.png")
+    monkeypatch.setattr(charts, "refine_case", lambda _: answer(False, "refinement_rejected", correction=one.truth))
+    monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
+    charts.draw_case("five", tmp_path / "five.png")
     logs, after, _ = [axes for axes in figures[0].axes if axes.images][:3]
     assert after.get_title().startswith("refused: the logs stay")
     assert (logs.images[0].get_array() == after.images[0].get_array()).all()

@@ -1,28 +1,32 @@
 """The studies: claims beside what is computed, losses, fewer pulses that change nothing, jobs that resume."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from apertura_research.study import commands
-from apertura_research.study.dft_window import demodulated, window_samples
-from apertura_research.study.paper import formulas
-from apertura_research.study.paper.claims import AGREES, DISAGREES, EXPLAINED, UNTESTABLE, Claim, compare, require
-from apertura_research.study.paper.corrected import clock_claims, corrected_claims
-from apertura_research.study.paper.effects import effect_claims
-from apertura_research.study.paper.losses import DESTROYED_DB, ERRORS, loss_claims
-from apertura_research.study.paper.parameters import parameter_claims
-from apertura_research.study.paper.positions import position_claims
-from apertura_research.study.paper.resolution import simulated_table, uav_table
-from apertura_research.study.paper.swarm import swarm_claims, trigger_claims
-from apertura_research.study.paper_scene import (
+from apertura_research import commands, sweep
+from apertura_research.paper import parameters
+from apertura_research.paper.claims import AGREES, DISAGREES, EXPLAINED, UNTESTABLE, Claim, compare, require
+from apertura_research.paper.corrections import (
+    clock_claims,
+    corrected_claims,
+    position_claims,
+    swarm_claims,
+    trigger_claims,
+)
+from apertura_research.paper.losses import DESTROYED_DB, ERRORS, effect_claims, loss_claims
+from apertura_research.paper.parameters import parameter_claims
+from apertura_research.paper.resolution import simulated_table, uav_table
+from apertura_research.paper_scene import (
     UNDISTURBED,
     Disturbance,
+    demodulated,
     receive_pair,
     receive_undisturbed,
     reduced_scene,
+    window_samples,
 )
-from apertura_research.study.point_response import (
+from apertura_research.point_response import (
     amplitude_db,
     coherence_factors,
     find_peaks,
@@ -31,10 +35,10 @@ from apertura_research.study.point_response import (
     phase_history,
     range_tables,
 )
-from apertura_research.study.stability.charts import draw_impairment
-from apertura_research.study.stability.outcomes import Outcome, correct, run_sweep
-from apertura_research.study.stability.summary import crossing, join_parts, part_path, tolerance_of
-from apertura_research.study.stability.sweeps import CHOICES, SWEEPS
+from apertura_research.stability.outcomes import StabilityRow, correct
+from apertura_research.stability.summary import STUDY, tolerance_of
+from apertura_research.stability.sweeps import CHOICES, SWEEPS
+from apertura_research.sweep import Study, crossing, part_path
 from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
@@ -50,7 +54,7 @@ def by_claim(claims):
 
 
 def outcome(size, loss_db, *, impairment="timing", method="none"):
-    return Outcome(impairment, "ns", size, method, loss_db, 0.0, 0.9, 0.3, 0.07, -40.0, 1.0, method, 1, 1)
+    return StabilityRow(impairment, "ns", size, method, loss_db, 0.0, 0.9, 0.3, 0.07, -40.0, 1.0, method, 1, 1)
 
 
 def test_what_follows_from_parameters_is_what_the_paper_says():
@@ -92,17 +96,17 @@ def test_contradictions_of_the_paper_are_noted_where_they_stand():
 
 def test_limits_are_where_orthogonality_ends():
     # at the limit the sampling clock slips by one turn of the last subcarrier over the symbol
-    limit_hz = formulas.sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6)
+    limit_hz = parameters.sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6)
     slip_s = 12.5e-6 * limit_hz / (1.024e9 - limit_hz)
     assert slip_s * 409.6e6 == pytest.approx(1, rel=1e-9)
-    assert 20 * np.log10(np.sinc(formulas.cfo_limit_hz(100e3) / 100e3)) == pytest.approx(-0.143, abs=1e-3)
+    assert 20 * np.log10(np.sinc(parameters.cfo_limit_hz(100e3) / 100e3)) == pytest.approx(-0.143, abs=1e-3)
 
 
 def test_coherence_follows_from_snr_and_back():
     for coherence in (0.3, 0.986, 0.9999):
-        snr = formulas.snr_of_coherence_factor(coherence, 200)
-        assert formulas.coherence_of_snr(snr, 200) == pytest.approx(coherence, rel=1e-12)
-    assert formulas.coherence_of_snr(0.0, 200) == 1 / 200  # without an echo
+        snr = parameters.snr_of_coherence_factor(coherence, 200)
+        assert parameters.coherence_of_snr(snr, 200) == pytest.approx(coherence, rel=1e-12)
+    assert parameters.coherence_of_snr(0.0, 200) == 1 / 200  # without an echo
 
 
 def test_five_targets_are_as_wide_as_the_independent_model_says():
@@ -330,12 +334,12 @@ def test_a_loss_is_crossed_between_the_sizes_that_enclose_it():
 
 def test_every_impairment_of_the_simulator_is_swept():
     swept = set()
-    for sweep in SWEEPS.values():
-        receiver, perfect = sweep.receiver(sweep.sizes[-1]), Impairments()
+    for one in SWEEPS.values():
+        receiver, perfect = one.receiver(one.sizes[-1]), Impairments()
         swept |= set(receiver)
-        sender = sweep.transmitter(sweep.sizes[-1])
+        sender = one.transmitter(one.sizes[-1])
         swept |= {name for name in vars(perfect) if getattr(sender, name) != getattr(perfect, name)}
-        swept |= {"time_tag"} if sweep.tagged else set()
+        swept |= {"time_tag"} if one.tagged else set()
     assert swept == set(vars(Impairments()))
 
 
@@ -353,7 +357,7 @@ def short(monkeypatch, name, *sizes):
 @pytest.mark.slow
 def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkeypatch):
     short(monkeypatch, "carrier_phase", 1.0)
-    losses = {method: next(run_sweep("carrier_phase", method)).loss_db for method in CHOICES}
+    losses = {method: next(STUDY.rows(f"carrier_phase.{method}")).loss_db for method in CHOICES}
     assert losses.pop("none") > 12
     assert max(map(abs, losses.values())) < 0.05
 
@@ -361,14 +365,14 @@ def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkey
 @pytest.mark.slow
 def test_moving_while_the_pulse_lasts_costs_nothing_below_10_m_s_and_something_at_3000(monkeypatch):
     monkeypatch.setitem(SWEEPS, "doppler", replace(SWEEPS["doppler"], sizes=(10.0, 3000.0), subcarriers=512))
-    slow, fast = run_sweep("doppler", "none")
+    slow, fast = STUDY.rows("doppler.none")
     assert abs(slow.loss_db) < 0.01
     assert fast.floor_db > slow.floor_db + 8
 
 
 def test_wrong_time_tags_misplace_the_receiver_by_speed_times_error(monkeypatch):
     short(monkeypatch, "time_tag", 1.0, 100.0)
-    small, large = run_sweep("time_tag", "divide")
+    small, large = STUDY.rows("time_tag.divide")
     assert abs(small.loss_db) < 0.1
     assert large.loss_db > 3
 
@@ -376,7 +380,7 @@ def test_wrong_time_tags_misplace_the_receiver_by_speed_times_error(monkeypatch)
 def test_a_sidelink_that_never_locks_is_refused_not_imaged(monkeypatch):
     short(monkeypatch, "sidelink_gain", -70.0)
     for method in ("divide", "auto"):
-        (row,) = run_sweep("sidelink_gain", method)
+        (row,) = STUDY.rows(f"sidelink_gain.{method}")
         assert (row.chosen, row.pulses_used, row.loss_db) == ("refused", 0.0, 40.0)
 
 
@@ -397,7 +401,7 @@ def test_auto_is_within_a_fifth_of_a_decibel_of_the_best_at_every_snr(monkeypatc
     monkeypatch.setitem(
         SWEEPS, "sidelink_noise", replace(SWEEPS["sidelink_noise"], sizes=(30, 10, 5, 0, -10, -20), draws=1)
     )
-    loss = {method: [abs(one.loss_db) for one in run_sweep("sidelink_noise", method)] for method in CHOICES[1:]}
+    loss = {method: [abs(one.loss_db) for one in STUDY.rows(f"sidelink_noise.{method}")] for method in CHOICES[1:]}
     best = np.min([loss[method] for method in CHOICES[1:-1]], axis=0)
     assert (np.array(loss["auto"]) - best).max() < 0.2
 
@@ -405,7 +409,7 @@ def test_auto_is_within_a_fifth_of_a_decibel_of_the_best_at_every_snr(monkeypatc
 def test_outcomes_survive_their_file_and_give_a_tolerance(tmp_path):
     rows = [outcome(0.1, 0.0), outcome(1.0, float("nan")), outcome(10.0, 4.0)]
     write_table(tmp_path / "a.csv", rows)
-    again = read_table(tmp_path / "a.csv", Outcome)
+    again = read_table(tmp_path / "a.csv", StabilityRow)
     assert again[0] == rows[0]
     assert np.isnan(again[1].loss_db)
     tolerance = tolerance_of([outcome(0.1, 0.0), outcome(1.0, 0.5), outcome(10.0, 1.5)])
@@ -418,11 +422,10 @@ def test_outcomes_survive_their_file_and_give_a_tolerance(tmp_path):
 @pytest.mark.slow
 def test_a_chart_is_the_same_bytes_for_the_same_rows(tmp_path):
     for method in CHOICES:
-        write_table(part_path(tmp_path, "timing", method), [outcome(s, s, method=method) for s in (0.1, 1.0, 10.0)])
-    rows = join_parts(tmp_path, "timing")
-    assert len(read_table(tmp_path / "timing.csv", Outcome)) == 3 * len(CHOICES)
+        write_table(part_path(tmp_path, f"timing.{method}"), [outcome(s, s, method=method) for s in (0.1, 1.0, 10.0)])
     for name in ("a.png", "b.png"):
-        draw_impairment("timing", rows, tmp_path / name)
+        STUDY.chart("timing", tmp_path).rename(tmp_path / name)
+    assert len(read_table(tmp_path / "timing.csv", StabilityRow)) == 3 * len(CHOICES)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
@@ -433,9 +436,9 @@ def test_parts_of_the_claims_are_the_errors_of_the_table():
 
 def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
     short(monkeypatch, "missed_triggers", 0.1, 0.5)
-    run = CliRunner().invoke(commands.app, ["stability-sweep", "missed_triggers", "divide", "--folder", str(tmp_path)])
+    run = CliRunner().invoke(commands.app, ["sweep", "stability", "missed_triggers.divide", "--folder", str(tmp_path)])
     assert run.exit_code == 0, run.output
-    rows = read_table(part_path(tmp_path, "missed_triggers", "divide"), Outcome)
+    rows = read_table(part_path(tmp_path, "missed_triggers.divide"), StabilityRow)
     assert [row.size for row in rows] == [0.1, 0.5]
     assert rows[1].pulses_used < 0.7 < rows[0].pulses_used
     CliRunner().invoke(commands.app, ["paper-part", "parameters", "--folder", str(tmp_path)])
@@ -447,9 +450,11 @@ def test_a_job_of_the_study_is_one_command(tmp_path, monkeypatch):
     [
         (("paper-part", "loss_x"), "loss_timing"),
         (("paper-figure", "x"), "uav_cuts"),
-        (("stability-sweep", "x", "divide"), "missed_triggers"),
-        (("stability-sweep", "timing", "x"), "two_parameter"),
-        (("stability-chart", "x"), "missed_triggers"),
+        (("sweep", "x", "timing.divide"), "error_atlas"),
+        (("sweep", "stability", "x.divide"), "missed_triggers"),
+        (("sweep", "stability", "timing.x"), "two_parameter"),
+        (("chart", "stability", "x"), "missed_triggers"),
+        (("summary", "autofocus"), "stability"),
     ],
 )
 def test_a_job_of_the_study_that_does_not_exist_is_told_those_that_do(arguments, named):
@@ -463,3 +468,50 @@ def test_a_localization_error_moves_antennas_and_not_the_logs():
     scene = reduced_scene(pulses=150, subcarriers=128, rx_ahead_m=4.7)
     _, _, observation = receive_pair(scene, Disturbance(wrong, wrong), np.random.default_rng(0))
     assert np.std(observation.truth.radar_rx - scene.geometry.radar_rx) == pytest.approx(0.02, rel=0.3)
+
+
+@dataclass(frozen=True)
+class Square:
+    size: float
+    square: float
+
+
+def squares(run):
+    """A study of one part and one chart."""
+    return Study(Square, {"all": ("numbers",)}, lambda _: (1.5, np.nan, 1 / 3), run, draw=lambda *_: None)
+
+
+def test_a_killed_job_goes_on_after_the_last_case_that_it_has_finished(tmp_path):
+    tried = []
+
+    def run(part, size):
+        tried.append(size)
+        if size == 1 / 3 and len(tried) == 3:
+            raise KeyboardInterrupt
+        return [Square(size, size**2)]
+
+    study = squares(run)
+    with pytest.raises(KeyboardInterrupt):
+        study.compute("numbers", tmp_path)
+    assert not part_path(tmp_path, "numbers").exists()
+    path = study.compute("numbers", tmp_path)
+    assert (len(tried), tried[2:]) == (4, [1 / 3, 1 / 3])
+    assert repr(read_table(path, Square)) == repr(list(squares(run).rows("numbers")))
+    assert [one.name for one in path.parent.iterdir()] == ["numbers.csv"]
+
+
+def test_cases_that_other_code_has_finished_are_run_again(tmp_path, monkeypatch):
+    calls = []
+
+    def run(part, size):
+        calls.append(size)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return [Square(size, size)]
+
+    study = squares(run)
+    with pytest.raises(KeyboardInterrupt):
+        study.compute("numbers", tmp_path)
+    monkeypatch.setattr(sweep, "code_sha256", lambda _: "0" * 64)
+    study.compute("numbers", tmp_path)
+    assert calls.count(1.5) == 2

@@ -14,7 +14,7 @@ from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
-from apertura.simulation.trajectory import Wobble
+from apertura.simulation.scene import Wobble
 
 
 def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):

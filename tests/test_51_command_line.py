@@ -84,3 +84,32 @@ def test_memory_that_runs_out_is_one_message():
     assert done.returncode == 2
     assert done.stderr.startswith("error: out of memory")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [(), ("paper-part", "effects"), ("sweep", "stability", "--folder", "x"), ("--help",)])
+def test_a_study_without_its_distribution_says_what_to_install(words):
+    """As where apertura alone is installed: no other distribution has commands."""
+    code = (
+        "import importlib.metadata as metadata, sys\n"
+        "metadata.entry_points = lambda **_: ()\n"
+        "from apertura.views.cli import main\n"
+        "main()\n"
+    )
+    command = [sys.executable, "-c", code, "study", *words]
+    done = subprocess.run(command, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert "the studies are not installed" in done.stderr
+    assert "pip install ./research" in done.stderr
+
+
+def test_a_study_is_a_group_of_commands_where_its_distribution_is_installed():
+    done = run("study", "--help")
+    assert done.returncode == 0
+    assert "paper-part" in done.stdout
+
+
+def test_a_study_looks_for_its_results_in_the_folder_that_it_is_started_in(tmp_path):
+    done = run("study", "chart", "stability", "timing", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: results/study/stability/parts/timing.none.csv: ")

@@ -68,14 +68,12 @@ TYPED = {
     "step refine": "step refine f01",
     "step tiles": "step tiles f01 uav1-uav2 1-of-2",
     "step whole-chart": "step whole-chart --repeats 1",
-    "study atlas-chart": "study atlas-chart none",
-    "study atlas-sweep": "study atlas-sweep none",
+    "study autofocus-picture": "study autofocus-picture none",
+    "study chart": "study chart stability none",
     "study paper-figure": "study paper-figure scene",
     "study paper-part": "study paper-part parameters",
-    "study refinement-picture": "study refinement-picture none",
-    "study refinement-sweep": "study refinement-sweep none",
-    "study stability-chart": "study stability-chart none",
-    "study stability-sweep": "study stability-sweep none none",
+    "study summary": "study summary none",
+    "study sweep": "study sweep stability none",
 }
 """Command → what is typed in the campaign folder, where that is more than the command."""
 

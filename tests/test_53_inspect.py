@@ -273,7 +273,9 @@ def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
 
 
 def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
-    flight = FmcwFlight(Sweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),))
+    flight = FmcwFlight(
+        FrequencySweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),)
+    )
     raw = write_fmcw_campaign(tmp_path / "campaign", flight, waveform={}) / "raw/f01"
     times = np.load(raw / "uav1.time.npy")
     for name in ("uav1.npy", "uav1.time.npy"):

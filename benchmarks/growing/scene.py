@@ -11,11 +11,9 @@ fields, so that a few bright ones do not decide the error.
 from dataclasses import dataclass
 from typing import Literal
 
-import numba
 import numpy as np
 from job import _wobble
 from numpy.typing import NDArray
-from scipy.fft import fft
 from scipy.ndimage import gaussian_filter
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
@@ -24,6 +22,8 @@ from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
 
 Geometry = Literal["monostatic", "bistatic", "low", "spotlight"]
 Surface = Literal["flat", "smooth", "rough"]
@@ -31,7 +31,6 @@ Window = tuple[slice, slice]
 
 TILE_PX, FIELD_PX, INNER_PX = 512, 64, 32
 _FIELDS, _CHECKS, _SCATTERER_PX = 16, 40, 4
-_FINE = 4  # bins per cell of total path that echoes are laid on
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +101,10 @@ def build(size: int, pulses: int, geometry: Geometry, surface: Surface, *, noise
     middle = grid.positions_at([size // 2], [size // 2], 0.0)
     delay = flight.path(middle)[:, 0] / C
     fields = _fields(size, generator)
-    transfer = _clutter(flight, frequency, delay, _scatterers(fields, grid, ground, generator), generator)
+    clutter = _clutter(_places(fields, grid, ground, generator), generator)
+    echoes = transfer(clutter, flight, frequency, longer_m=-C * delay, spreading=False, gridded=True)
     weight = np.full(subcarriers, 1 / subcarriers)
-    history = PhaseHistory(transfer, frequency, weight, delay, flight)
+    history = PhaseHistory(echoes, frequency, weight, delay, flight)
     inside = generator.integers(0, INNER_PX, (_FIELDS, _CHECKS, 2))
     corner = np.array([(rows.start, columns.start) for rows, columns in map(_inner, fields)])
     checks = (corner[:, None] + inside).reshape(-1, 2).T
@@ -112,7 +112,7 @@ def build(size: int, pulses: int, geometry: Geometry, surface: Surface, *, noise
     power = np.mean(np.abs(reference.form(history, places[::10])) ** 2) / pulses**2
     amplitude = np.float32(np.sqrt(power * pulses * subcarriers * 10 ** (noise_db / 10) / 2))
     for first in range(0, pulses, 64):
-        part = transfer[first : first + 64]
+        part = echoes[first : first + 64]
         part += amplitude * generator.standard_normal((len(part), 2 * subcarriers), np.float32).view(np.complex64)
     return Scene(geometry, surface, history, grid, ground, fields, checks, reference.form(history, places))
 
@@ -176,7 +176,7 @@ def _inner(field: Window) -> Window:
     return rows, columns
 
 
-def _scatterers(
+def _places(
     fields: list[Window], grid: SceneGrid, ground: Terrain, generator: np.random.Generator
 ) -> NDArray[np.float64]:
     count = (FIELD_PX // _SCATTERER_PX) ** 2
@@ -185,44 +185,8 @@ def _scatterers(
     return ground.positions_at(grid, np.clip(rows, 0, grid.shape[0] - 1), np.clip(columns, 0, grid.shape[1] - 1))
 
 
-def _clutter(
-    flight: Aperture,
-    frequency: NDArray[np.float64],
-    delay: NDArray[np.float64],
-    places: NDArray[np.float64],
-    generator: np.random.Generator,
-) -> NDArray[np.complex64]:
-    """Return (pulse, subcarrier) echoes, laid on a fine grid of delays; what they are exactly does not matter."""
-    amplitude = generator.standard_normal((2, len(places))).T.copy().view(np.complex128)[:, 0]
-    count = len(frequency)
-    transfer = np.empty((len(flight), count), np.complex64)
-    step_hz = (frequency[-1] - frequency[0]) / (count - 1)
-    # the band's middle is at the carrier: over the band an echo on bin b turns by (n - (N-1)/2)·b
-    shift = np.exp(1j * np.pi * np.fft.fftfreq(_FINE * count) * (count - 1))
-    for first in range(0, len(flight), 128):
-        part = slice(first, first + 128)
-        late = flight[part].path(places) / C - delay[part, None]
-        bins = np.zeros((len(late), _FINE * count), np.complex128)
-        _lay(late * step_hz, amplitude * np.exp(-2j * np.pi * np.remainder(frequency.mean() * late, 1)), bins)
-        transfer[part] = fft(bins * shift, axis=1)[:, :count]
-    return transfer
-
-
-@numba.njit(cache=True)
-def _lay(turns, value, bins):  # type: ignore[no-untyped-def]
-    """Add values at fractional bins by four-point Lagrange weights."""
-    size = bins.shape[1]
-    for p in range(turns.shape[0]):
-        for t in range(turns.shape[1]):
-            at = (turns[p, t] % 1.0) * size
-            whole = int(np.floor(at))
-            u = at - whole
-            for n in range(-1, 3):
-                weight = 1.0
-                for m in range(-1, 3):
-                    if m != n:
-                        weight *= (u - m) / (n - m)
-                bins[p, (whole + n) % size] += weight * value[p, t]
+def _clutter(places: NDArray[np.float64], generator: np.random.Generator) -> Scatterers:
+    return Scatterers(places, generator.standard_normal((2, len(places))).T.copy().view(np.complex128)[:, 0])
 
 
 def _round_up(wanted: float) -> int:

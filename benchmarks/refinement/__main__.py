@@ -16,9 +16,8 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from apertura_research.study.refinement.cases import Case, case
-from apertura_research.study.refinement.measures import UNCORRECTED, image_seconds, judge
-from apertura_research.study.refinement.scenes import GRID
+from apertura_research.autofocus.cases import GRID, Case, case
+from apertura_research.autofocus.outcomes import UNCORRECTED, image_seconds, judge
 
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import NodePrior, Prior, Refinement

@@ -7,10 +7,19 @@ mended, refused, or what is left.
 import dataclasses
 
 import numpy as np
-from apertura_research.study.refinement.cases import PAIRS, PROBES_M, Case, sighting
-from apertura_research.study.refinement.flights import FLIGHTS, NODES, drawn_errors
-from apertura_research.study.refinement.measures import judge
-from apertura_research.study.refinement.scenes import GRID, SCENES, Scatterers
+from apertura_research.autofocus.cases import (
+    FLIGHTS,
+    GRID,
+    NODES,
+    PAIRS,
+    PROBES_M,
+    SCENES,
+    Case,
+    TargetScene,
+    drawn_errors,
+    sighting,
+)
+from apertura_research.autofocus.outcomes import judge
 
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
@@ -40,8 +49,8 @@ def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed
     course /= np.linalg.norm(course, axis=1, keepdims=True)
     arm = np.concatenate([course[:, 1:], -course[:, :1], np.zeros((len(course), 1))], axis=1) * arm_m
     truth = TrackCorrection(flight.time_s, {**moved, NODES[0]: moved[NODES[0]] + arm})
-    lifted = dataclasses.replace(scatterers, places_m=scatterers.places_m + [0, 0, height_m])
-    probes = Scatterers(PROBES_M + [0, 0, height_m], np.ones(len(PROBES_M), complex), np.arange(len(PROBES_M)))
+    lifted = dataclasses.replace(scatterers, position_m=scatterers.position_m + [0, 0, height_m])
+    probes = TargetScene(PROBES_M + [0, 0, height_m], np.ones(len(PROBES_M), complex), np.arange(len(PROBES_M)))
     noises = of_noise.spawn(2)
     return Case(
         ("forty", flight_name, "joint", SIGMA_M, 10.0, seed),
@@ -50,7 +59,7 @@ def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed
         ),
         dict.fromkeys(NODES, TrackErrors((SIGMA_M,) * 3, drift_std_m=drift_m)),
         truth,
-        lifted.places_m[lifted.targets] * [1, 1, 0],
+        lifted.position_m[lifted.targets] * [1, 1, 0],
         tuple(
             sighting(pair, flight, truth, probes, None, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)
         ),

@@ -19,8 +19,8 @@ from apertura.simulation.specification import (
     SimulatedFlight,
     SimulatedNode,
 )
-from apertura.simulation.trajectory import Waypoints
-from apertura.simulation.waveforms import WaveformSpecification
+from apertura.simulation.scene import Waypoints
+from apertura.simulation.waveform import WaveformSpecification
 
 FIRST_S, LAST_S = 5.6, 11.6
 """The leg of the flight that is imaged, from the log's first epoch."""

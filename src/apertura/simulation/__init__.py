@@ -12,7 +12,19 @@ from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.presets import PRESETS
-from apertura.simulation.scene import Clutter, Line, Origin, Plate, PointTarget, Target
+from apertura.simulation.scene import (
+    Clutter,
+    GaussianBeam,
+    Line,
+    Origin,
+    Plate,
+    PointTarget,
+    Straight,
+    Target,
+    Track,
+    Waypoints,
+    Wobble,
+)
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
@@ -21,8 +33,7 @@ from apertura.simulation.specification import (
     read_specification,
     specification_text,
 )
-from apertura.simulation.trajectory import GaussianBeam, Straight, Track, Waypoints, Wobble
-from apertura.simulation.waveforms import PulseSpecification, WaveformSpecification
+from apertura.simulation.waveform import PulseSpecification, WaveformSpecification
 
 __all__ = [
     "CampaignSpecification",

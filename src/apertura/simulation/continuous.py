@@ -14,11 +14,9 @@ from pydantic.dataclasses import dataclass
 
 from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
-from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, Adc
-from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.recording import digitize, full_scale
-from apertura.simulation.synthesis import Channel, Complex, noise, samples, sampling_rate
+from apertura.simulation.impairments import STRICT_KEYS, Adc, independent_streams
+from apertura.simulation.synthesis import Channel, Complex, digitize, full_scale, noise, samples, sampling_rate
+from apertura.simulation.waveform import TransmitWaveform
 
 Chips = NDArray[np.int8]
 

@@ -7,14 +7,18 @@ import numpy as np
 from numpy.random import Generator
 
 from apertura.common.arrays import Floats
-from apertura.simulation.draw import ImpairmentDraw, draw_impairments, independent_streams
-from apertura.simulation.impairments import AntennaPoint, Impairments, RadarPoint
-from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.recording import Geometry, receive
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.impairments import (
+    AntennaPoint,
+    ImpairmentDraw,
+    Impairments,
+    RadarPoint,
+    draw_impairments,
+    independent_streams,
+)
+from apertura.simulation.scene import Scatterers, body_turn, logged_velocity, phase_centre
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
-from apertura.simulation.synthesis import Channel
-from apertura.simulation.trajectory import body_turn, logged_velocity, phase_centre
+from apertura.simulation.synthesis import Channel, Geometry, receive
+from apertura.simulation.waveform import TransmitWaveform
 
 _Node = tuple[Impairments, ImpairmentDraw]
 
@@ -138,9 +142,9 @@ def observe(
     --------
     >>> from apertura.simulation.presets import paper_scene, paper_waveform
     >>> from apertura.simulation.synthesis import transfer_functions
-    >>> seen = observe(paper_waveform(), *paper_scene(pulses=3), np.random.default_rng(0),
-    ...                receiver=Impairments(radar_snr_db=20.0))
-    >>> transfer_functions(seen.channels["radar"], seen.noise["radar"]).shape
+    >>> observed = observe(paper_waveform(), *paper_scene(pulses=3), np.random.default_rng(0),
+    ...                    receiver=Impairments(radar_snr_db=20.0))
+    >>> transfer_functions(observed.channels["radar"], observed.noise["radar"]).shape
     (3, 4096)
     """
     time_s = np.arange(len(logged.radar_tx)) / waveform.prf_hz

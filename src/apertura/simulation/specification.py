@@ -17,12 +17,16 @@ from apertura.common.arrays import Floats
 from apertura.common.documents import read_yaml, validated
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation.continuous import Framing
-from apertura.simulation.draw import independent_streams
-from apertura.simulation.impairments import STRICT_KEYS, AntennaPoint, ChannelName, Impairments, RadarPoint
-from apertura.simulation.radar import TransmitWaveform
-from apertura.simulation.scene import Origin, Target, Vector
-from apertura.simulation.trajectory import GaussianBeam, Track, Trajectory
-from apertura.simulation.waveforms import TransmittedSpecification
+from apertura.simulation.impairments import (
+    STRICT_KEYS,
+    AntennaPoint,
+    ChannelName,
+    Impairments,
+    RadarPoint,
+    independent_streams,
+)
+from apertura.simulation.scene import GaussianBeam, Origin, Target, Track, Trajectory, Vector
+from apertura.simulation.waveform import TransmittedSpecification, TransmitWaveform
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
 
@@ -176,7 +180,7 @@ def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         fields: dict[str, FieldInfo] = type(value).__pydantic_fields__  # type: ignore[union-attr]
         own = {name: getattr(value, name) for name in fields}
-        # keyword-only: `kind`, which tells a reader of YAML what the rest is
+        # keyword-only: `kind`, which says to a reader of YAML what the rest is
         return {
             name: _plain(own[name])
             for name, field in sorted(fields.items(), key=lambda item: not item[1].kw_only)

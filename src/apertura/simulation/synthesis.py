@@ -1,21 +1,29 @@
-"""From paths to samples: exact synthesis of what a receiver with its own clock digitises.
+"""From geometry to counts: paths through what is wrong with a node, to samples on its own clock, digitised.
 
 A delay acts on each subcarrier, so all echoes are summed as one spectrum and brought to the receiver's own
 time grid by an inverse DFT, or by a chirp-z transform where its sampling rate is off. Edges are true: an
-echo is absent before it arrives and after it has ended.
+echo is absent before it arrives and after it has ended. Captures of long flights are synthesised faster, as if echoes
+neither began nor ended.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from types import MappingProxyType
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy import fft
 
 from apertura.common.arrays import Floats
-from apertura.simulation.radar import Paths, TransmitWaveform
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import turned
+from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Ripple
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import Paths, direct_path, echo_paths, spectrum
+from apertura.simulation.waveform import TransmitWaveform
 
 Complex = NDArray[np.complex128]
 
@@ -51,28 +59,6 @@ class Channel:
     noise_variance: float = 0.0
 
 
-def path_spectrum(waveform: TransmitWaveform, delay_s: Floats, amplitude: Complex) -> Complex:
-    """Return Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
-
-    Notes
-    -----
-    Source: docs/theory/simulate.md, eq. 2. The exponential of subcarrier n = 64i + j is the product of two
-    small ones, so that many points cost one matrix product.
-
-    Examples
-    --------
-    >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.0, 8e6, 1.0)
-    >>> np.angle(path_spectrum(wave, np.array([0.25e-6]), np.array([1.0 + 0j]))).round(3) + 0.0
-    array([ 0.   , -1.571, -3.142,  1.571])
-    """
-    width, count = 64, len(waveform.codes)
-    coarse = waveform.frequency_hz[::width]
-    fine = np.arange(width) * waveform.subcarrier_spacing_hz
-    left = amplitude[..., None, :] * np.exp(-2j * np.pi * coarse[:, None] * delay_s[..., None, :])
-    right = np.exp(-2j * np.pi * fine * delay_s[..., :, None])
-    return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
-
-
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
     """Return (pulse, subcarrier) transfer functions as an ideal demodulator would measure them, without samples.
 
@@ -81,7 +67,7 @@ def transfer_functions(channel: Channel, generator: Generator | None) -> Complex
     """
     waveform, paths = channel.waveform, channel.paths
     early = paths.delay_s - channel.start_s[:, None]
-    transfer = path_spectrum(waveform, early, paths.amplitude) * channel.response
+    transfer = spectrum(early, paths.amplitude, waveform.frequency_hz) * channel.response
     transfer *= np.exp(1j * channel.phase_rad[:, None])
     if generator is not None and channel.noise_variance:
         transfer += noise(generator, transfer.shape, channel.noise_variance / waveform.dft_samples)
@@ -151,14 +137,14 @@ def _cumulative_spectra(channel: Channel, pulse: int, order: NDArray[np.intp], s
     delay, rate = paths.delay_s[pulse, order], paths.delay_rate[pulse, order]
     middle_s = waveform.duration_s / 2
     terms = _DOPPLER_ORDER + 1 if rate.any() else 1
-    # delays at the middle of the pulse, seen from the receiver's start; the carrier turns with the whole delay
-    seen = delay + rate * middle_s - channel.start_s[pulse]
+    # delays at the middle of the pulse from the receiver's start; the carrier turns with the whole delay
+    late = delay + rate * middle_s - channel.start_s[pulse]
     level = paths.amplitude[pulse, order]
     factor = waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
     out = np.zeros((terms, len(splits) + 2, len(factor)), np.complex128)
     for term in range(terms):
         for group, part in enumerate(np.split(np.arange(len(order)), splits)):
-            out[term, group + 1] = path_spectrum(waveform, seen[part], level[part])
+            out[term, group + 1] = spectrum(late[part], level[part], waveform.frequency_hz)
         out[term] = np.cumsum(out[term], axis=0) * factor
         factor = factor * (-2j * np.pi * waveform.frequency_hz / (term + 1))
         level = level * rate
@@ -173,16 +159,16 @@ def _stretch(channel: Channel, pulse: int, spectra: Complex, start: int, stop: i
     time_s = index / sampling_rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
     numbers = waveform.first_subcarrier + np.arange(spectra.shape[1])
     total = np.zeros(stop - start, np.complex128)
-    for term, spectrum in enumerate(spectra):
+    for term, one in enumerate(spectra):
         if stop - start <= _SHORT:
-            table = _rotations(turns, waveform.first_subcarrier, len(spectrum))[: stop - start]
-            part = table @ (spectrum * np.exp(2j * np.pi * turns * numbers * start))
+            table = _rotations(turns, waveform.first_subcarrier, len(one))[: stop - start]
+            part = table @ (one * np.exp(2j * np.pi * turns * numbers * start))
         elif channel.sfo_hz:
-            part = _zoom(len(spectrum), count, turns)(spectrum)[start:stop]
+            part = _zoom(len(one), count, turns)(one)[start:stop]
             part = part * np.exp(2j * np.pi * turns * waveform.first_subcarrier * index)
         else:
             bins = np.zeros(waveform.dft_samples, np.complex128)
-            bins[numbers] = spectrum
+            bins[numbers] = one
             part = np.fft.ifft(bins, norm="forward")[index % waveform.dft_samples]
         total += time_s**term * part
     return total
@@ -210,3 +196,219 @@ def noise(generator: Generator, shape: tuple[int, ...], variance: float) -> Comp
     """Return circular Gaussian samples of E|n|² = variance, complex128."""
     parts = generator.standard_normal((*shape, 2)) * np.sqrt(variance / 2)
     return np.asarray(parts.view(np.complex128)[..., 0])
+
+
+def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
+    """Return (pulse, sample) complex64 of some captures, before the ADC: the symbol is periodic, so one spectrum does.
+
+    Parameters
+    ----------
+    channel
+        Of a receiver whose clock samples true; nothing moves within a pulse.
+    generator
+        Draws the noise, pulse after pulse; None: without noise.
+    pulses
+        Which captures.
+
+    Raises
+    ------
+    ValueError
+        If the channel has a sampling clock that is off, or Doppler within the pulse.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, "Long flights". From the end of the prefix on equal to
+    `apertura.simulation.synthesis.samples`, to the rounding of complex64, as long as echoes arrive inside the prefix;
+    those that the window of the DFT would not hold whole are left out.
+
+    Examples
+    --------
+    >>> from apertura.simulation.transfer import Paths
+    >>> from apertura.simulation.waveform import TransmitWaveform
+    >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.5e-6, 8e6, 1.0)
+    >>> path = Paths(np.array([[0.25e-6]]), np.array([[1.0 + 0j]]), np.zeros((1, 1)))
+    >>> abs(periodic_samples(Channel(wave, path, np.ones(4), np.zeros(1), np.zeros(1)), None, np.arange(1))).round(2)
+    array([[0.  , 1.08, 0.  , 1.08, 0.  , 2.61, 4.  , 2.61, 0.  , 1.08, 0.  , 1.08]], dtype=float32)
+    """
+    waveform = channel.waveform
+    if channel.sfo_hz or channel.paths.delay_rate[pulses].any():
+        raise ValueError("a sampling clock that is off, or Doppler within the pulse, needs exact synthesis")
+    echoes = _prefixed_echoes(channel, pulses) * (
+        waveform.codes * channel.response * np.exp(-2j * np.pi * waveform.baseband_hz * waveform.cyclic_prefix_s)
+    ).astype(np.complex64)
+    bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
+    bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = echoes
+    period = fft.ifft(bins, axis=1, norm="forward")
+    period *= turned(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
+    captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
+    if channel.cfo_hz:
+        turns = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
+        captures = captures * turned(np.ones(1), np.asarray(turns, np.float64))
+    if generator is not None and channel.noise_variance:
+        parts = captures.view(np.float32)
+        parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))
+    return np.asarray(captures, np.complex64)
+
+
+def _prefixed_echoes(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex64]:
+    """Return the spectrum of the paths that arrive inside the prefix, (pulse, subcarrier) complex64."""
+    waveform = channel.waveform
+    delay_s = channel.paths.delay_s[pulses] - channel.start_s[pulses, None]
+    early_s = waveform.symbol_s - 1 / waveform.subcarrier_spacing_hz
+    inside = (delay_s >= -early_s) & (delay_s < waveform.cyclic_prefix_s)
+    return spectrum(delay_s, channel.paths.amplitude[pulses] * inside, waveform.frequency_hz).astype(np.complex64)
+
+
+_PULSES_AT_ONCE = 64
+_MOST_PULSES = 8192
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """True phase centres at the start of each pulse.
+
+    Attributes
+    ----------
+    radar_tx, radar_rx, sidelink_tx, sidelink_rx
+        (pulse, 3) float64, metres, Cartesian, in the frame of the scatterers; `sidelink`: ends of the direct path.
+    tx_velocity, rx_velocity
+        (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
+    gain
+        (pulse, point) float64, field of both radar antennas towards each scatterer, relative to their boresights.
+    """
+
+    radar_tx: Floats
+    radar_rx: Floats
+    sidelink_tx: Floats
+    sidelink_rx: Floats
+    tx_velocity: Floats | float = 0.0
+    rx_velocity: Floats | float = 0.0
+    gain: Floats | float = 1.0
+
+
+def straight_pair(along_m: Floats, height_m: float, *, rx_ahead_m: float = 0.0) -> Geometry:
+    """Return two nodes with their antennas at one place each, above the first axis at (pulse,) places along it."""
+    sender = np.column_stack([along_m, np.zeros(len(along_m)), np.full(len(along_m), height_m)])
+    receiver = sender + np.array([rx_ahead_m, 0.0, 0.0])
+    return Geometry(sender, receiver, sender, receiver)
+
+
+def receive(
+    waveform: TransmitWaveform,
+    scatterers: Scatterers,
+    geometry: Geometry,
+    *,
+    impairments: Impairments,
+    draw: ImpairmentDraw,
+    transmitter: Impairments,
+    path_offset_m: Mapping[ChannelName, float] = MappingProxyType({}),
+    sidelink: bool = True,
+) -> dict[str, Channel]:
+    """Return the channels `radar` and, of a node without the transmitter's clock, `sidelink`.
+
+    Parameters
+    ----------
+    scatterers, geometry
+        The scene, and where the antennas truly are.
+    impairments, draw, transmitter
+        What is wrong with the receiving node, what was drawn of it, and what is wrong with the transmitting one.
+    path_offset_m
+        Electrical path beyond geometry per channel, metres; zero where missing.
+    sidelink
+        Whether the second channel is recorded.
+    """
+    velocity = (geometry.tx_velocity, geometry.rx_velocity) if impairments.doppler else (0.0, 0.0)
+    echoes = echo_paths(
+        geometry.radar_tx,
+        geometry.radar_rx,
+        scatterers,
+        path_offset_m=path_offset_m.get("radar", 0.0),
+        tx_velocity_m_s=velocity[0],
+        rx_velocity_m_s=velocity[1],
+    )
+    echoes = replace(echoes, amplitude=echoes.amplitude * geometry.gain)
+    direct = direct_path(
+        geometry.sidelink_tx,
+        geometry.sidelink_rx,
+        path_offset_m=path_offset_m.get("sidelink", 0.0),
+        relative_velocity_m_s=np.subtract(*velocity),
+    )
+    power = spectral_power(waveform, echoes)
+    leaked = _with_leakage(echoes, geometry, impairments, path_offset_m.get("radar", 0.0), power)
+    received = {"radar": (leaked, power, impairments.radar_ripple, impairments.radar_snr_db)}
+    if sidelink:
+        power = spectral_power(waveform, direct)
+        paths = _sidelink(direct, impairments, draw)
+        received["sidelink"] = (paths, power, impairments.sidelink_ripple, impairments.sidelink_snr_db)
+    return {
+        name: Channel(
+            waveform,
+            paths,
+            _response(waveform, transmitter.transmit_ripple) * _response(waveform, ripple),
+            draw.phase_rad,
+            draw.start_s,
+            cfo_hz=impairments.clock.cfo_hz,
+            sfo_hz=impairments.clock.sfo_hz,
+            noise_variance=0.0 if snr_db is None else waveform.noise_at_unit_snr * power / 10 ** (snr_db / 10),
+        )
+        for name, (paths, power, ripple, snr_db) in received.items()
+    }
+
+
+def _response(waveform: TransmitWaveform, ripple: Ripple | None) -> Complex:
+    return ripple.response(waveform.frequency_hz) if ripple else np.ones(len(waveform.codes), np.complex128)
+
+
+def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex | float = 1.0) -> float:
+    """Return the mean of |Σ a·exp(-j2πfτ)|² over subcarriers and pulses; of a long flight over some, evenly spread."""
+    every = -(-len(paths.delay_s) // _MOST_PULSES)
+    paths = paths.at(slice(None, None, every))
+    starts = range(0, len(paths.delay_s), _PULSES_AT_ONCE)
+    parts = (paths.at(slice(start, start + _PULSES_AT_ONCE)) for start in starts)
+    spectra = (spectrum(part.delay_s, part.amplitude, waveform.frequency_hz) for part in parts)
+    total = sum(float((np.abs(one * response) ** 2).sum()) for one in spectra)
+    return total / (len(paths.delay_s) * len(waveform.codes))
+
+
+def full_scale(channel: Channel, adc: Adc) -> float:
+    """Return the amplitude of I or Q that the converter takes as full scale, set once per flight.
+
+    The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it.
+    """
+    power = spectral_power(channel.waveform, channel.paths, channel.response) * channel.waveform.mean_power
+    rms = np.sqrt((power + channel.noise_variance) / 2)
+    return float(rms * 10 ** (adc.backoff_db / 20))
+
+
+def digitize(samples: NDArray[np.complexfloating], adc: Adc, full_scale_amplitude: float) -> NDArray[np.int16]:
+    """Return (..., 2) int16 counts of I and Q, rounded and clipped to ±2^(bits-1).
+
+    Examples
+    --------
+    >>> digitize(np.array([0.5 - 2.0j]), Adc(bits=4), 1.0)
+    array([[ 4, -8]], dtype=int16)
+    """
+    limit = 2 ** (adc.bits - 1)
+    parts = np.ascontiguousarray(samples)[..., None].view(samples.real.dtype)
+    counts = parts * parts.dtype.type(limit / full_scale_amplitude)
+    np.clip(np.rint(counts, out=counts), -limit, limit - 1, out=counts)
+    return np.asarray(counts, np.int16)
+
+
+def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, offset_m: float, power: float) -> Paths:
+    leakage = impairments.leakage
+    if leakage is None:
+        return echoes
+    direct = direct_path(geometry.radar_tx, geometry.radar_rx, path_offset_m=offset_m + leakage.path_m)
+    level = np.full(direct.amplitude.shape, np.sqrt(power) * 10 ** (leakage.level_db / 20), np.complex128)
+    return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
+
+
+def _sidelink(direct: Paths, impairments: Impairments, draw: ImpairmentDraw) -> Paths:
+    paths = direct
+    for reflection in impairments.sidelink_multipath:
+        later_s = direct.delay_s + reflection.excess_m / SPEED_OF_LIGHT_M_S
+        paths = paths.and_also(Paths(later_s, direct.amplitude * reflection.amplitude, direct.delay_rate))
+    shadow_db = impairments.sidelink_blockage.attenuation_db if impairments.sidelink_blockage else 0.0
+    gain = 10 ** ((impairments.sidelink_gain_db - shadow_db * draw.blocked) / 20)
+    return replace(paths, amplitude=paths.amplitude * gain[:, None])

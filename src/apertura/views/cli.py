@@ -5,8 +5,9 @@ Commands import what they run when they run: help and mistakes in the command li
 
 import os
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,16 +25,39 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step")
-for _further in entry_points(group="apertura.commands"):  # of other distributions: research/ has `study`
-    app.add_typer(_further.load(), name=_further.name)
+
+
+PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Options that are not known go to snakemake."""
+
+
+def add_installed_commands(to: typer.Typer, installed: Iterable[EntryPoint]) -> None:
+    """Add the commands of other distributions; without apertura-research, `study` is an error that says what to do."""
+    names = set()
+    for point in installed:
+        to.add_typer(point.load(), name=point.name)
+        names.add(point.name)
+    if "study" not in names:
+        to.command("study", hidden=True, context_settings=PASS_ON, add_help_option=False)(_no_study)
+
+
+def _no_study() -> None:
+    raise CampaignError(
+        "the studies are not installed",
+        where="apertura study",
+        expected="the distribution apertura-research beside apertura",
+        remedy="Install it from the source of apertura: `pip install ./research`.",
+    )
+
+
+add_installed_commands(app, entry_points(group="apertura.commands"))
+
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
-PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
-"""Options that are not known go to snakemake."""
 
 
 class _PassesOn(TyperCommand):

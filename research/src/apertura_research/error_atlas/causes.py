@@ -9,11 +9,18 @@ from numpy.random import Generator
 from apertura.core.quality.budget import NodePositions, offset_line, position_lines
 from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.terrain import FlatGround, GridHeights
-from apertura_research.error_atlas.flight import GRID, Flight, Told, flight
-from apertura_research.error_atlas.logs import Log, between_epochs, told_by
+from apertura_research.error_atlas.flight import (
+    GRID,
+    AssumedFlight,
+    LogErrors,
+    TrueFlight,
+    assumed_from_logs,
+    between_epochs,
+    flight,
+)
 
-Tell = Callable[[Flight, float, Generator], Told]
-Expect = Callable[[Flight, str, float], Effect]
+Assume = Callable[[TrueFlight, float, Generator], AssumedFlight]
+Expect = Callable[[TrueFlight, str, float], Effect]
 
 _CM, _MS = 1e-2, 1e-3
 _WHOLE_FLIGHT_S = 1e3
@@ -26,10 +33,10 @@ class Cause:
 
     Attributes
     ----------
-    tell
-        Flight, size and generator → what the pipeline is told.
+    assume
+        Flight, size and generator → what the pipeline assumes.
     expect
-        Flight, pair and size → what the budget says when the size is stated.
+        Flight, pair and size → what the budget expects when the size is stated.
     stated
         How it is stated to the budget, in a few words.
     draws
@@ -43,7 +50,7 @@ class Cause:
     title: str
     unit: str
     sizes: tuple[float, ...]
-    tell: Tell
+    assume: Assume
     expect: Expect
     stated: str
     draws: int = 4
@@ -51,24 +58,26 @@ class Cause:
     added: bool = False
     pulses: int = 300
 
-    def flight(self) -> Flight:
+    def flight(self) -> TrueFlight:
         """Return what was flown."""
         return flight(pulses=self.pulses, beamed=self.beamed)
 
 
-def nothing(flown: Flight, pair: str, size: float) -> Effect:  # noqa: ARG001
+def nothing(flown: TrueFlight, pair: str, size: float) -> Effect:  # noqa: ARG001
     """Return that the budget has no line for it."""
     return Effect(0.0, 0.0, 0.0)
 
 
-def positions(flown: Flight, pair: str, *known: NodePositions) -> Effect:
+def positions(flown: TrueFlight, pair: str, *known: NodePositions) -> Effect:
     """Return the line of positions: of one or both nodes of a pair, in the order a, b; a node not given is exact."""
     exact = NodePositions((1e-9,) * 3, 1.0, "truth")
     nodes = [*known, exact, exact]
     return position_lines(flown.paths(pair), nodes[: len(set(pair.split("-")))], sidelink=pair == "a-b")[0].effect
 
 
-def offset(flown: Flight, pair: str, slope: Callable[..., np.ndarray], size: float, *, common: bool = False) -> Effect:
+def offset(
+    flown: TrueFlight, pair: str, slope: Callable[..., np.ndarray], size: float, *, common: bool = False
+) -> Effect:
     """Return the line of a constant error, whose path per unit follows from the paths of a point."""
     paths = flown.paths(pair)
     return offset_line(paths, "", slope(paths), size, unit="", common=common).effect
@@ -78,45 +87,45 @@ def _noise(size: float, correlation_s: float) -> NodePositions:
     return NodePositions((_CM * size,) * 3, correlation_s, "truth")
 
 
-def _wander(flown: Flight, log: Log, generator: Generator) -> Told:
-    return told_by(flown, generator, a=log, b=log)
+def _wander(flown: TrueFlight, log: LogErrors, generator: Generator) -> AssumedFlight:
+    return assumed_from_logs(flown, generator, a=log, b=log)
 
 
-def _late(flown: Flight, pair: str, late_ms: float) -> Effect:
+def _late(flown: TrueFlight, pair: str, late_ms: float) -> Effect:
     return offset(flown, pair, lambda paths: -_MS * paths.rate_m_s, late_ms, common=True)
 
 
-def _higher(flown: Flight, pair: str, higher_cm: float) -> Effect:
+def _higher(flown: TrueFlight, pair: str, higher_cm: float) -> Effect:
     return offset(flown, pair, lambda paths: -_CM * paths.gradient[:, 2], higher_cm, common=True)
 
 
 def _only(pair: str, effect: Callable[..., Effect]) -> Expect:
     """Return an expectation that touches one pair."""
-    return lambda flown, asked, size: effect(flown, asked, size) if asked == pair else Effect(0.0, 0.0, 0.0)
+    return lambda flown, one, size: effect(flown, one, size) if one == pair else Effect(0.0, 0.0, 0.0)
 
 
-def _late_receiver(flown: Flight, size: float, _: Generator) -> Told:
+def _late_receiver(flown: TrueFlight, size: float, _: Generator) -> AssumedFlight:
     moved = flown.antenna("b", flown.time_s + _MS * size)
     return replace(flown.truth, apertures=flown.apertures(b=moved))
 
 
-def _late_nodes(flown: Flight, size: float, _: Generator) -> Told:
+def _late_nodes(flown: TrueFlight, size: float, _: Generator) -> AssumedFlight:
     moved = {node: flown.antenna(node, flown.time_s + _MS * size) for node in flown.nodes}
     return replace(flown.truth, apertures=flown.apertures(**moved))
 
 
-def _rough(flown: Flight, size: float, generator: Generator) -> Told:
+def _rough(flown: TrueFlight, size: float, generator: Generator) -> AssumedFlight:
     from scipy.ndimage import gaussian_filter
 
     field = gaussian_filter(generator.standard_normal(GRID.shape), _DEM_CORRELATION_M / GRID.spacing_m, mode="wrap")
     return replace(flown.truth, terrain=GridHeights(GRID, _CM * size * field / field.std()))
 
 
-def _every(flown: Flight, size: float, _: Generator) -> Told:
+def _every(flown: TrueFlight, size: float, _: Generator) -> AssumedFlight:
     return replace(flown.truth, used=np.arange(len(flown.time_s)) % round(size) == 0)
 
 
-def _mispaired(flown: Flight, size: float, _: Generator) -> Told:
+def _mispaired(flown: TrueFlight, size: float, _: Generator) -> AssumedFlight:
     late_s = flown.time_s + size * flown.time_s[1]
     moved = flown.apertures(**{node: flown.antenna(node, late_s) for node in flown.nodes})
     return replace(flown.truth, apertures={**flown.apertures(), "a-b": moved["a-b"]})
@@ -125,30 +134,30 @@ def _mispaired(flown: Flight, size: float, _: Generator) -> Told:
 CAUSES: Mapping[str, Cause] = {
     "track_noise": Cause(
         "Noise of the tracks, correlated over 1 s, σ per axis", "cm", (0.1, 0.3, 0.6, 1, 1.5, 2, 3, 5),
-        lambda flown, size, generator: _wander(flown, Log(wander_m=_CM * size), generator),
+        lambda flown, size, generator: _wander(flown, LogErrors(wander_m=_CM * size), generator),
         lambda flown, pair, size: positions(flown, pair, *[_noise(size, 1.0)] * 2), "positions", draws=6,
     ),
     "track_noise_time": Cause(
         "Correlation time of track noise of 1.5 cm", "s", (0.1, 0.3, 1, 3, 10, 30),
-        lambda flown, size, generator: _wander(flown, Log(wander_m=0.015, correlation_s=size), generator),
+        lambda flown, size, generator: _wander(flown, LogErrors(wander_m=0.015, correlation_s=size), generator),
         lambda flown, pair, size: positions(flown, pair, *[_noise(1.5, size)] * 2), "positions", draws=6,
     ),
     "track_gap": Cause(
         "Gap in the transmitter's log", "s", (0.1, 0.3, 0.6, 1, 2, 3, 5, 8),
-        lambda flown, size, generator: told_by(flown, generator, a=Log(gap_s=size), b=Log()),
+        lambda flown, size, generator: assumed_from_logs(flown, generator, a=LogErrors(gap_s=size), b=LogErrors()),
         nothing, "missing pulses (no loss)",
     ),
     "log_rate": Cause(
         "Epochs per second of both logs", "Hz", (50, 20, 10, 5, 2, 1, 0.5, 0.3),
-        lambda flown, size, generator: _wander(flown, Log(rate_hz=size), generator),
-        lambda flown, pair, size: positions(flown, pair, *[between_epochs(flown, Log(rate_hz=size))] * 2),
+        lambda flown, size, generator: _wander(flown, LogErrors(rate_hz=size), generator),
+        lambda flown, pair, size: positions(flown, pair, *[between_epochs(flown, LogErrors(rate_hz=size))] * 2),
         "interpolation_m as positions",
     ),
     "tags_common": Cause(
         "Tags of both nodes late", "ms", (1, 3, 10, 30, 60, 100, 300, 1000), _late_nodes, _late, "time tags", draws=2,
     ),
     "tags_of_one": Cause(
-        "Log of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
+        "LogErrors of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
         "time tags", draws=2,
     ),
     "height": Cause(

@@ -1,10 +1,11 @@
-"""The flight of the atlas: two nodes over five targets, what they truly heard, and what the pipeline is told."""
+"""The flight of the error atlas: two nodes over five targets, what they receive, and what the pipeline assumes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
@@ -16,13 +17,16 @@ from apertura.core.echo.sidelink import METHODS, measure
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import body_axes
+from apertura.core.geometry.phase_centres import position_spline
+from apertura.core.geometry.track_checks import CheckedTrack, check_track
+from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.simulation.impairments import Impairments
-from apertura.simulation.recording import Geometry
-from apertura.simulation.trajectory import GaussianBeam, Sampled, Straight, Wobble
-from apertura_research.study.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
+from apertura.simulation.scene import GaussianBeam, Sampled, Straight, Wobble
+from apertura.simulation.synthesis import Geometry
+from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")
 """A node that sends and receives, and one ahead of it that receives."""
@@ -38,8 +42,8 @@ _CUTOFF_DB = -20.0
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What a pair truly heard.
+class Received:
+    """What a pair truly received.
 
     Attributes
     ----------
@@ -54,8 +58,8 @@ class Heard:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What the pipeline is told of a flight, right or wrong.
+class AssumedFlight:
+    """What the pipeline assumes of a flight, right or wrong.
 
     Attributes
     ----------
@@ -64,7 +68,7 @@ class Told:
     terrain
         The ground.
     longer_m, turned_rad
-        Pair → path and phase that nobody takes off its echo.
+        Pair → path and phase that stay uncorrected in its echo.
     used
         Pulses that are imaged; None: all.
     beams
@@ -72,7 +76,7 @@ class Told:
     presum
         Pulses that are made one; None: as the planner likes.
     flags
-        What checks of logs said already.
+        Flags that the checks of logs have raised.
     """
 
     apertures: Mapping[str, Aperture]
@@ -84,29 +88,29 @@ class Told:
     presum: int | None = None
     flags: Mapping[str, str] = field(default_factory=dict)
 
-    def history(self, pair: str, heard: Heard, frequency_hz: Floats) -> PhaseHistory:
+    def history(self, pair: str, received: Received, frequency_hz: Floats) -> PhaseHistory:
         """Return the phase history of a pair as the pipeline would make it."""
         aperture, used = self.apertures[pair], slice(None) if self.used is None else self.used
         longer_m = np.full(len(aperture), self.longer_m.get(pair, 0.0))
-        if heard.sidelink_m is not None:
+        if received.sidelink_m is not None:
             longer_m += np.linalg.norm(aperture.tx_m - aperture.rx_m, axis=1)
         turn = np.complex64(np.exp(1j * self.turned_rad.get(pair, 0.0)))
         weight = window_weights("hann", len(frequency_hz))
         delay_s = longer_m[used] / SPEED_OF_LIGHT_M_S
-        return PhaseHistory(heard.transfer[used] * turn, frequency_hz, weight, delay_s, aperture[used])
+        return PhaseHistory(received.transfer[used] * turn, frequency_hz, weight, delay_s, aperture[used])
 
-    def sidelink_flags(self, pair: str, heard: Heard) -> dict[str, str]:
+    def sidelink_flags(self, pair: str, received: Received) -> dict[str, str]:
         """Return the flag of a sidelink that does not move as the logs say."""
-        if heard.sidelink_m is None:
+        if received.sidelink_m is None:
             return {}
         used = slice(None) if self.used is None else self.used
         length_m = np.linalg.norm(self.apertures[pair].tx_m - self.apertures[pair].rx_m, axis=1)
-        line = detect_wrong_association(baseline_residual(heard.sidelink_m[used], length_m[used]))
+        line = detect_wrong_association(baseline_residual(received.sidelink_m[used], length_m[used]))
         return {"association_suspect": line} if line else {}
 
 
 @dataclass(frozen=True, eq=False)
-class Flight:
+class TrueFlight:
     """What was flown: 10 m at 1 m/s and 10 m above the ground, shaken by the wind as far as `Wobble` says.
 
     Attributes
@@ -142,9 +146,9 @@ class Flight:
         return {pair: Aperture(*(places[node] for node in pair.split("-"))) for pair in PAIRS}
 
     @property
-    def truth(self) -> Told:
-        """What a pipeline is told that knows everything."""
-        return Told(self.apertures(), beams=self.beams())
+    def truth(self) -> AssumedFlight:
+        """What a pipeline assumes that knows everything."""
+        return AssumedFlight(self.apertures(), beams=self.beams())
 
     def beams(self, off_deg: float = 0.0) -> dict[str, Beams]:
         """Return pair → beams of node a's antennas, turned off their boresight in azimuth."""
@@ -155,16 +159,16 @@ class Flight:
         beam = Beam(axes, *cuts[0], *cuts[1])
         return {"a-a": Beams(beam, beam), "a-b": Beams(transmit=beam)}
 
-    def hear(self, pair: str, generator: np.random.Generator) -> Heard:
-        """Return what a pair heard, with 20 dB SNR per subcarrier and 30 dB of the sidelink."""
+    def receive(self, pair: str, generator: np.random.Generator) -> Received:
+        """Return what a pair received, with 20 dB SNR per subcarrier and 30 dB of the sidelink."""
         tx_m, rx_m = self.apertures()[pair].legs
         geometry = Geometry(tx_m, rx_m, tx_m, rx_m, gain=self._gain(pair))
         scene = PaperScene(self.scene.waveform, self.scene.scatterers, geometry)
         radar, sidelink, _ = receive_pair(scene, _NOISE, generator)
         if pair == "a-a":
-            return Heard(radar, None)
+            return Received(radar, None)
         cell_m = SPEED_OF_LIGHT_M_S / np.ptp(self.frequency_hz) * (SUBCARRIERS - 1) / SUBCARRIERS
-        return Heard(METHODS["divide"](radar, sidelink), measure(sidelink).delay_cells * cell_m)
+        return Received(METHODS["divide"](radar, sidelink), measure(sidelink).delay_cells * cell_m)
 
     def paths(self, pair: str) -> PointPaths:
         """Return the paths of a point in the middle of the scene, which the budget is of."""
@@ -195,7 +199,7 @@ class Flight:
 
 
 @cache
-def flight(*, pulses: int = 300, beamed: bool = False) -> Flight:
+def flight(*, pulses: int = 300, beamed: bool = False) -> TrueFlight:
     """Return the flight of every sweep, with so many pulses."""
     generator = np.random.default_rng(7)
     nodes = {
@@ -203,4 +207,77 @@ def flight(*, pulses: int = 300, beamed: bool = False) -> Flight:
         for node, middle_m in (("a", 0.0), ("b", RX_AHEAD_M))
     }
     scene = reduced_scene(pulses=pulses, subcarriers=SUBCARRIERS)
-    return Flight(nodes, scene, np.arange(pulses) * LASTING_S / pulses, beamed=beamed)
+    return TrueFlight(nodes, scene, np.arange(pulses) * LASTING_S / pulses, beamed=beamed)
+
+
+NOISE_M = 0.002
+"""Of every epoch by itself."""
+
+USUAL_HZ = 20.0
+_MARGIN_S = 9.0
+_TOLERATED_WAVELENGTHS = 1 / 16
+
+
+@dataclass(frozen=True)
+class LogErrors:
+    """How a node's log is made.
+
+    Attributes
+    ----------
+    rate_hz
+        Epochs per second.
+    wander_m, correlation_s
+        Error of every epoch, per axis: white noise after a moving average of so long.
+    gap_s
+        Length of what is missing in the middle.
+    """
+
+    rate_hz: float = USUAL_HZ
+    wander_m: float = 0.0
+    correlation_s: float = 1.0
+    gap_s: float = 0.0
+
+    def checked(self, flown: TrueFlight, node: str, generator: Generator) -> tuple[Floats, CheckedTrack]:
+        """Return (pulse, 3) float64 positions as the log gives them, and what its checks say."""
+        end_s = float(flown.time_s[-1])
+        time_s = np.arange(-_MARGIN_S, end_s + _MARGIN_S, 1 / self.rate_hz)
+        place_m = flown.nodes[node].position(time_s)
+        place_m += NOISE_M * generator.standard_normal(place_m.shape)
+        place_m += self.wander_m * self._wander(len(time_s), generator)
+        there = np.abs(time_s - end_s / 2) >= self.gap_s / 2
+        time_s, place_m = time_s[there], place_m[there]
+        wavelength_m = flown.paths("a-a").wavelength_m
+        checked = check_track(
+            time_s,
+            place_m,
+            poor_fix=np.zeros(len(time_s), bool),
+            tolerated_m=wavelength_m * _TOLERATED_WAVELENGTHS,
+        )
+        spline = position_spline(time_s[checked.kept], place_m[checked.kept])
+        return np.asarray(spline(flown.time_s)), checked
+
+    def _wander(self, count: int, generator: Generator) -> Floats:
+        """Return (epoch, 3) float64 of unit variance."""
+        width = max(1, round(self.correlation_s * self.rate_hz))
+        white = generator.standard_normal((count + width - 1, 3)) / np.sqrt(width)
+        return np.stack([np.convolve(axis, np.ones(width), "valid") for axis in white.T], -1)
+
+
+def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors) -> AssumedFlight:
+    """Return what a pipeline assumes whose nodes have these logs; nodes without one are where they truly are."""
+    places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
+    for node, log in logs.items():
+        places[node], checked = log.checked(flown, node, generator)
+        barred = checked.barred(flown.time_s)
+        flags |= {cause: node for cause, out in barred.items() if out.any()}
+        flags |= {cause: node for cause, text in checked.faults.items() if text}
+        for out in barred.values():
+            used &= ~out
+    return replace(flown.truth, apertures=flown.apertures(**places), used=used, flags=flags)
+
+
+def between_epochs(flown: TrueFlight, log: LogErrors) -> NodePositions:
+    """Return what the checks of a log say of the spline between its epochs, as the budget takes positions."""
+    _, checked = log.checked(flown, "a", np.random.default_rng(0))
+    std_m = checked.interpolation_m or 0.0
+    return NodePositions((std_m,) * 3, 1 / log.rate_hz, "the log's own epochs")

@@ -1,4 +1,4 @@
-"""The tables of the atlas: what each cause costs, when its flag comes, and how often flags are missing or false."""
+"""The error atlas as a study: its parts, its tables of harm and flags, and its charts."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -6,11 +6,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from apertura.common.tables import read_table, write_table
+from apertura.common.tables import write_table
 from apertura_research.error_atlas.causes import CAUSES
-from apertura_research.error_atlas.outcomes import Outcome
-from apertura_research.study.stability.summary import crossing
+from apertura_research.error_atlas.outcomes import ErrorAtlasRow, draws_of, run_draw
+from apertura_research.sweep import Study, crossing, draw_table, order_sizes, panels, with_unit
 
 HARMFUL_DB, HARMFUL_CELLS = 1.0, 0.5
 """An image that lost more, or lies further off, is wrong: without a flag, an alarm is missed."""
@@ -18,12 +19,12 @@ HARMFUL_DB, HARMFUL_CELLS = 1.0, 0.5
 HARMLESS_DB, HARMLESS_CELLS, HARMLESS_RAD, HARMLESS_GHOST_DB = 0.3, 0.1, 0.3, 3.0
 """An image with less of all of these is right: with a flag, an alarm is false."""
 
-_TELLING_DB = 0.5
+_MEASURABLE_DB = 0.5
 """Losses above which the ratio of expected to measured loss is formed."""
 
 
 @dataclass(frozen=True)
-class Summary:
+class CauseSummary:
     """What the sweep of one cause came to: a row of summary.csv.
 
     Attributes
@@ -65,7 +66,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Alarm:
-    """How well one flag tells: a row of flags.csv.
+    """How well one flag warns: a row of flags.csv.
 
     Attributes
     ----------
@@ -73,7 +74,7 @@ class Alarm:
         Draws of all causes with it.
     wrong, missed
         Draws that are wrong by causes that raise it at some size, and the share of them without it.
-    unsaid
+    unflagged
         The share of the same without any flag.
     right, false
         Draws of all causes that are right, and the share of them with it.
@@ -83,17 +84,17 @@ class Alarm:
     raised: int
     wrong: int
     missed: float
-    unsaid: float
+    unflagged: float
     right: int
     false: float
 
 
-def is_wrong(one: Outcome) -> bool:
+def is_wrong(one: ErrorAtlasRow) -> bool:
     """Return whether the image of a draw should have a flag."""
     return one.loss_db > HARMFUL_DB or one.shift_m > HARMFUL_CELLS * one.cell_m
 
 
-def is_right(one: Outcome) -> bool:
+def is_right(one: ErrorAtlasRow) -> bool:
     """Return whether the image of a draw should have none."""
     return (
         one.loss_db < HARMLESS_DB
@@ -103,19 +104,19 @@ def is_right(one: Outcome) -> bool:
     )
 
 
-def by_size(outcomes: Sequence[Outcome]) -> dict[float, list[Outcome]]:
+def by_size(outcomes: Sequence[ErrorAtlasRow]) -> dict[float, list[ErrorAtlasRow]]:
     """Return size → its draws, in the order of the sweep."""
     sizes = dict.fromkeys(one.size for one in outcomes)
     return {size: [one for one in outcomes if one.size == size] for size in sizes}
 
 
-def mean_of(some: Sequence[Outcome], name: str) -> float:
+def mean_of(some: Sequence[ErrorAtlasRow], name: str) -> float:
     """Return the mean of one column over draws that were not refused; NaN without any."""
     values = [value for one in some if np.isfinite(value := getattr(one, name))]
     return float(np.mean(values)) if values else float("nan")
 
 
-def summary_of(outcomes: Sequence[Outcome]) -> Summary:
+def summary_of(outcomes: Sequence[ErrorAtlasRow]) -> CauseSummary:
     """Return what the draws of one cause come to.
 
     Parameters
@@ -130,7 +131,7 @@ def summary_of(outcomes: Sequence[Outcome]) -> Summary:
     )
     ratio, ratio_of = _ratio(groups)
     wrong, right = [one for one in outcomes if is_wrong(one)], [one for one in outcomes if is_right(one)]
-    return Summary(
+    return CauseSummary(
         first.cause,
         first.unit,
         _rounded(crossing(sizes, measured, 1.0, logarithmic=True)),
@@ -148,8 +149,8 @@ def summary_of(outcomes: Sequence[Outcome]) -> Summary:
     )
 
 
-def alarms(outcomes: Sequence[Outcome]) -> list[Alarm]:
-    """Return how well each flag tells, over every draw of every cause."""
+def alarms(outcomes: Sequence[ErrorAtlasRow]) -> list[Alarm]:
+    """Return how well each flag warns, over every draw of every cause."""
     right = [one for one in outcomes if is_right(one)]
     rows = []
     for flag in sorted({flag for one in outcomes for flag in one.flags.split()}):
@@ -171,29 +172,23 @@ def alarms(outcomes: Sequence[Outcome]) -> list[Alarm]:
     return rows
 
 
-def share(some: Sequence[Outcome], holds: Callable[[Outcome], bool]) -> float:
+def share(some: Sequence[ErrorAtlasRow], holds: Callable[[ErrorAtlasRow], bool]) -> float:
     """Return the share of draws of which something holds; NaN without any."""
     return _rounded(np.mean([holds(one) for one in some])) if some else float("nan")
 
 
-def part_path(folder: Path, cause: str) -> Path:
-    """Return where one job of the atlas writes."""
-    return folder / "parts" / f"{cause}.csv"
-
-
-def write_summary(folder: Path) -> list[Summary]:
-    """Write summary.csv and flags.csv from the tables of every cause, and return the rows of the first."""
-    parts = {cause: read_table(part_path(folder, cause), Outcome) for cause in CAUSES}
-    rows = [summary_of(outcomes) for outcomes in parts.values()]
-    write_table(folder / "flags.csv", alarms([one for outcomes in parts.values() for one in outcomes]))
+def summarise(outcomes: Sequence[ErrorAtlasRow], folder: Path) -> None:
+    """Write summary.csv and .png, what each cause comes to, and flags.csv, how well each flag warns."""
+    rows = [summary_of([one for one in outcomes if one.cause == cause]) for cause in CAUSES]
+    write_table(folder / "flags.csv", alarms(outcomes))
     write_table(folder / "summary.csv", rows)
-    return rows
+    draw_summary(rows, folder / "summary.png")
 
 
-def _ratio(groups: dict[float, list[Outcome]]) -> tuple[float, str]:
+def _ratio(groups: dict[float, list[ErrorAtlasRow]]) -> tuple[float, str]:
     """Return expected over measured, and of what."""
     cell_m = next(iter(groups.values()))[0].cell_m
-    for what, name, least in (("loss", "loss_db", _TELLING_DB), ("shift", "shift_m", HARMLESS_CELLS * cell_m)):
+    for what, name, least in (("loss", "loss_db", _MEASURABLE_DB), ("shift", "shift_m", HARMLESS_CELLS * cell_m)):
         ratios = []
         for some in groups.values():
             measured = mean_of(some, name)
@@ -204,14 +199,128 @@ def _ratio(groups: dict[float, list[Outcome]]) -> tuple[float, str]:
     return float("nan"), "nothing"
 
 
-def _raises(flag: str, one: Outcome) -> bool:
+def _raises(flag: str, one: ErrorAtlasRow) -> bool:
     return flag in one.flags.split()
 
 
-def _first(groups: dict[float, list[Outcome]], holds: Callable[[Outcome], bool]) -> float:
+def _first(groups: dict[float, list[ErrorAtlasRow]], holds: Callable[[ErrorAtlasRow], bool]) -> float:
     """Return the first size at which most draws hold; NaN where none does."""
     return next((size for size, some in groups.items() if np.mean([holds(one) for one in some]) > 0.5), float("nan"))
 
 
 def _rounded(value: float | np.floating) -> float:
     return float(f"{value:.4g}")
+
+
+_MEASURED, _EXPECTED, _FLAGGED = "#0072b2", "#d55e00", "#cc0000"
+_LEAST = {"loss_db": 0.01, "shift_m": 0.05, "phase_rad": 0.01}
+"""Smaller values are drawn at the lower edge, in the unit of the axis."""
+
+
+def draw_cause(name: str, outcomes: Sequence[ErrorAtlasRow], path: Path) -> None:
+    """Draw loss, shift and phase against the size of one cause: measured, expected, and where a flag was raised."""
+    cause, cell_m = CAUSES[name], outcomes[0].cell_m
+    quantities = (
+        ("loss_db", 1.0, "Loss of the coherent sum, dB" if cause.added else "Loss of peak, dB", HARMFUL_DB, "1 dB"),
+        ("shift_m", 100.0, "Shift over ground, cm", 100 * HARMFUL_CELLS * cell_m, "half a cell"),
+        ("phase_rad", 1.0, "Phase between the pairs, rad", None, ""),
+    )
+    names = " ".join(sorted({flag for one in outcomes for flag in one.flags.split()})) or "none"
+    title = (
+        f"{cause.title} — stated to the budget as: {cause.stated}\n"
+        f"flags: {names}; what is too small for an axis stands on its edge"
+    )
+    with panels(path, (12.5, 4.6), (1, len(quantities)), title=title) as every:
+        for axes, (quantity, scale, label, limit, text) in zip(every, quantities, strict=True):
+            _draw_panel(axes, outcomes, quantity, scale)
+            axes.set_ylabel(label)
+            axes.set_xlabel(with_unit(cause.title, cause.unit), fontsize=9)
+            if limit is not None:
+                axes.set_ylim(top=max(axes.get_ylim()[1], 2 * limit))
+                axes.axhline(limit, color="0.4", linewidth=0.9, linestyle=":")
+                axes.annotate(text, (0.01, limit), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
+
+
+def _draw_panel(axes: Axes, outcomes: Sequence[ErrorAtlasRow], name: str, scale: float) -> None:
+    groups, least = by_size([one for one in outcomes if np.isfinite(getattr(one, name))]), _LEAST[name]
+    sizes = np.array(list(groups))
+    drawn = [np.maximum(scale * np.array([getattr(one, name) for one in some]), least) for some in groups.values()]
+    means = np.array([max(scale * mean_of(some, name), least) for some in groups.values()])
+    ends = np.abs([[some.min(), some.max()] for some in drawn] - means[:, None]).T
+    axes.errorbar(
+        sizes, means, ends, color=_MEASURED, marker="o", capsize=3, label="measured: mean, least and most of the draws"
+    )
+    expected = [mean_of(some, f"expected_{name}") for some in groups.values()]
+    axes.plot(
+        sizes,
+        np.maximum(scale * np.array(expected), least),
+        color=_EXPECTED,
+        linestyle="--",
+        zorder=3,
+        label="expected by budget",
+    )
+    shares = np.array([np.mean([bool(one.flags) for one in some]) for some in groups.values()])
+    for most, label in ((True, "flag in most draws"), (False, "flag in some")):
+        at = (shares > 0.5) if most else (shares > 0) & (shares <= 0.5)
+        face = _FLAGGED if most else "none"
+        axes.plot(
+            sizes[at], means[at], "s", markersize=11, color=_FLAGGED, markerfacecolor=face, alpha=0.55, label=label
+        )
+    order_sizes(axes, sizes, logarithmic=True)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.8 * least)
+    axes.set_xticks(sizes, [f"{size:g}" for size in sizes], fontsize=8)
+    axes.set_xticks([], minor=True)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.grid(which="major", alpha=0.3)
+
+
+def draw_summary(rows: Sequence[CauseSummary], path: Path) -> None:
+    """Draw a table: per cause where harm and flag begin, how well it was expected, which alarms fail."""
+    headings = (
+        "1 dB lost at", "1 dB expected at", "wrong from", "flag from", "expected /\nmeasured", "alarms missed",
+        "alarms false",
+    )  # fmt: skip
+    draw_table(
+        path,
+        [_texts(row) for row in rows],
+        [[_colour(row, column) for column in range(len(headings))] for row in rows],
+        ([with_unit(CAUSES[row.cause].title, row.unit) for row in rows], headings),
+        title="What spoils an image, and whether a flag says so. Wrong: more than 1 dB or half a cell; right: less\n"
+        "than 0.3 dB, a tenth of a cell, 0.3 rad and 3 dB of ghosts. Missed: wrong, no flag; false: right with one.",
+    )
+
+
+def _texts(row: CauseSummary) -> list[str]:
+    def size(value: float) -> str:
+        return "—" if np.isnan(value) else f"{float(f'{value:.3g}'):g}"
+
+    def rate(value: float, count: int) -> str:
+        return "—" if not count else f"{100 * value:.0f} % of {count}"
+
+    ratio = "—" if np.isnan(row.expected_over_measured) else f"{row.expected_over_measured:.2f} ({row.ratio_of})"
+    sizes = (row.size_at_1_db, row.expected_at_1_db, row.size_of_harm, row.size_of_flag)
+    return [*map(size, sizes), ratio, rate(row.missed, row.wrong), rate(row.false, row.right)]
+
+
+def _colour(row: CauseSummary, column: int) -> float:
+    """Return how good a cell is, 0…1; NaN where it is neither."""
+    ratio = row.expected_over_measured
+    if column == 4 and ratio > 0:
+        return float(np.clip(1 - abs(np.log(ratio)) / np.log(3), 0, 1))
+    if column == 4 and ratio == 0:
+        return 0.0
+    return {5: 1 - row.missed, 6: 1 - row.false}.get(column, float("nan"))
+
+
+STUDY = Study(
+    row=ErrorAtlasRow,
+    charts={cause: (cause,) for cause in CAUSES},
+    cases=draws_of,
+    run=run_draw,
+    draw=draw_cause,
+    summaries=("summary.csv", "summary.png", "flags.csv"),
+    summarise=summarise,
+    digits=6,
+)
+"""A part is a cause; a case is a draw, at every size of the cause."""

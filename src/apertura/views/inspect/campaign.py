@@ -12,14 +12,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, load, problems_of
 from apertura.pipeline.examination.campaign import Examination, Key
 from apertura.pipeline.examination.facts import LogFacts
-from apertura.pipeline.examination.times import (
-    LOST_CAPTURE,
-    Span,
-    TimeFacts,
-    Times,
-    inside,
-    time_facts,
-)
+from apertura.pipeline.examination.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.views.inspect.report import Report
 
 _LINES = ("recorded", "logged")

@@ -1,0 +1,331 @@
+"""Cases by which autofocus is judged: a scene, a flight with errors in its logs, echoes and the truth."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import window_weights
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.transfer import transfer
+
+AREA_M = (-9.0, 5.0, 9.0, 25.0)
+GRID = SceneGrid("local", -10.0, 26.0, 0.05, (440, 400))
+CELL_M2 = 0.07 * 0.4
+"""A resolution cell of the flight past the scene, roughly."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetScene(Scatterers):
+    """Scatterers at places east, north and up, some of them targets.
+
+    Attributes
+    ----------
+    targets
+        (target,) int64, the scatterers whose peaks can be measured.
+    """
+
+    targets: NDArray[np.int64]
+
+
+def _five(generator: np.random.Generator) -> TargetScene:
+    places = np.array([(0, 5, 0), (-4, 10, 0), (0, 15, 0), (4, 20, 0), (0, 25, 0)], float)
+    return TargetScene(places, _phases(5, generator), np.arange(5))
+
+
+def _forty(generator: np.random.Generator) -> TargetScene:
+    """Points within 20 dB at the receiver; the fifteen brightest are measured."""
+    places = _spread(40, generator)
+    level = 10 ** (generator.uniform(-20, 0, 40) / 20)
+    amplitude = level * _phases(40, generator) * (np.hypot(places[:, 1], 10) / 18) ** 2
+    return TargetScene(places, amplitude, np.argsort(-level)[:15])
+
+
+def _texture(generator: np.random.Generator) -> TargetScene:
+    """Clutter whose power is log-normal, in spots of half a metre."""
+    clutter = _clutter(6000, generator)
+    spots = generator.standard_normal((64, 64))
+    waves = np.fft.fftfreq(64)[:, None] ** 2 + np.fft.fftfreq(64) ** 2
+    spots = np.fft.ifft2(np.fft.fft2(spots) * np.exp(-waves * (0.7 / (20 / 64)) ** 2 * 2 * np.pi**2)).real
+    low, size = np.array(AREA_M[:2]), np.array(AREA_M[2:]) - AREA_M[:2]
+    east, north = ((clutter.position_m[:, :2] - low) / size * 63).astype(int).T
+    return TargetScene(
+        clutter.position_m, clutter.amplitude * np.exp(0.6 * spots / spots.std())[east, north], clutter.targets
+    )
+
+
+def _points_over_clutter(above_db: float) -> Callable[[np.random.Generator], TargetScene]:
+    def scene(generator: np.random.Generator) -> TargetScene:
+        """Eight points so far above the clutter of one cell."""
+        clutter, places = _clutter(6000, generator), _spread(8, generator)
+        places[:, 0] *= 0.8
+        in_cell = CELL_M2 * 6000 / _area_m2()
+        amplitude = 10 ** (above_db / 20) * np.sqrt(in_cell) * _phases(8, generator)
+        return TargetScene(
+            np.vstack([clutter.position_m, places]), np.append(clutter.amplitude, amplitude), 6000 + np.arange(8)
+        )
+
+    return scene
+
+
+def _field(generator: np.random.Generator) -> TargetScene:
+    """Speckle that goes on beyond the scene on all sides: no edge of it is in the image."""
+    return _clutter(60_000, generator, (-18.0, 1.0, 18.0, 37.0))
+
+
+def _dense(generator: np.random.Generator) -> TargetScene:
+    """Fully developed speckle: three scatterers in a cell, no point."""
+    return _clutter(40_000, generator)
+
+
+SCENES: Mapping[str, Callable[[np.random.Generator], TargetScene]] = {
+    "five": _five,
+    "forty": _forty,
+    "texture": _texture,
+    "clutter+10": _points_over_clutter(10.0),
+    "clutter+20": _points_over_clutter(20.0),
+    "dense": _dense,
+    "field": _field,
+}
+
+
+def _clutter(
+    count: int, generator: np.random.Generator, area_m: tuple[float, float, float, float] = AREA_M
+) -> TargetScene:
+    parts = generator.standard_normal((2, count)) / np.sqrt(2)
+    return TargetScene(_spread(count, generator, area_m), parts[0] + 1j * parts[1], np.zeros(0, np.int64))
+
+
+def _spread(count: int, generator: np.random.Generator, area_m: tuple[float, float, float, float] = AREA_M) -> Floats:
+    east, north, far_east, far_north = area_m
+    places = generator.uniform((east, north), (far_east, far_north), (count, 2))
+    return np.concatenate([places, np.zeros((count, 1))], axis=1)
+
+
+def _phases(count: int, generator: np.random.Generator) -> NDArray[np.complex128]:
+    return np.asarray(np.exp(2j * np.pi * generator.random(count)))
+
+
+def _area_m2() -> float:
+    return (AREA_M[2] - AREA_M[0]) * (AREA_M[3] - AREA_M[1])
+
+
+PULSES_HZ = 100.0
+NODES = ("uav1", "uav2")
+_APART_M = 4.7
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedFlight:
+    """Where the logs have both nodes, metres, east, north, up.
+
+    Attributes
+    ----------
+    time_s
+        (pulse,) float64.
+    logged_m
+        Node → (pulse, 3) float64.
+    reach_m
+        East and north of a point, within which its peak is looked for.
+    """
+
+    time_s: Floats
+    logged_m: Mapping[str, Floats]
+    reach_m: tuple[float, float] = (0.5, 0.6)
+
+
+def _straight() -> LoggedFlight:
+    time_s = np.arange(3000) / PULSES_HZ
+    first = np.stack([time_s - 15, 0 * time_s, np.full(3000, 10.0)], -1)
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)))
+
+
+def _wobble() -> LoggedFlight:
+    plain = _straight()
+    swing = [np.sin(2 * np.pi * plain.time_s / period) for period in (4.3, 7.3, 2.9, 6.1, 8.3)]
+    rise = np.sin(2 * np.pi * plain.time_s / 5.1 + 1)
+    common = np.stack([0.2 * swing[0], 0.6 * swing[1] + 0.2 * swing[2], 0.5 * rise], -1)
+    second = np.stack([0 * rise, 0.5 * swing[3], 0.4 * swing[4]], -1)
+    first, other = plain.logged_m.values()
+    return LoggedFlight(plain.time_s, dict(zip(NODES, (first + common, other + common + second), strict=True)))
+
+
+def _circle() -> LoggedFlight:
+    """Around the scene's middle at 14 m, once."""
+    radius = 14.0
+    time_s = np.arange(int(2 * np.pi * radius * PULSES_HZ)) / PULSES_HZ
+
+    def around(turn: Floats) -> Floats:
+        return np.stack([radius * np.sin(turn), 15 - radius * np.cos(turn), np.full(len(turn), 10.0)], -1)
+
+    turn = time_s / radius
+    return LoggedFlight(time_s, dict(zip(NODES, (around(turn), around(turn + _APART_M / radius)), strict=True)))
+
+
+def _far() -> LoggedFlight:
+    """Past the scene at a kilometre, ten times as fast: one phase per pulse is the same for all of it."""
+    time_s = np.arange(3000) / PULSES_HZ
+    first = np.stack([10 * (time_s - 15), np.full(3000, -985.0), np.full(3000, 300.0)], -1)
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)), (1.2, 0.6))
+
+
+FLIGHTS: Mapping[str, Callable[[], LoggedFlight]] = {
+    "straight": _straight,
+    "wobble": _wobble,
+    "circle": _circle,
+    "far": _far,
+}
+
+
+def drawn_errors(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
+    """Return (pulse, 3) metres: white noise after a moving average over the correlation time, and a slow drift."""
+    step_s = time_s[1] - time_s[0]
+    width = max(1, round(errors.correlation_s / step_s))
+    total = np.cumsum(np.vstack([np.zeros(3), generator.standard_normal((len(time_s) + width, 3))]), axis=0)
+    noise = (total[width:] - total[:-width])[: len(time_s)] / np.sqrt(width)
+    return np.asarray(noise * errors.std_m + _drift(time_s) @ generator.standard_normal((4, 3)) * errors.drift_std_m)
+
+
+def _drift(time_s: Floats) -> Floats:
+    """Return (pulse, 4): offset, slope and a bow either way, together of about unit variance."""
+    part = (time_s - time_s[0]) / (time_s[-1] - time_s[0])
+    return np.stack([np.ones_like(part), 2 * part - 1, np.sin(np.pi * part), np.cos(np.pi * part)], -1) / 2
+
+
+BANDWIDTH_HZ, SUBCARRIERS = 409.6e6, 128
+FREQUENCY_HZ: NDArray[np.float64] = 1.2e9 + BANDWIDTH_HZ / SUBCARRIERS * np.arange(SUBCARRIERS, dtype=np.float64)
+PAIRS = {"mono": ("uav1-uav1",), "bi": ("uav1-uav2",), "joint": ("uav1-uav1", "uav1-uav2")}
+PROBES_M = np.array([(east, north, 0.0) for east in (-6.0, 0.0, 6.0) for north in (6.0, 10.0, 15.0, 20.0, 24.0)])
+PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a refinement is given, and what it is judged by.
+
+    Attributes
+    ----------
+    name
+        scene, geometry, pairs, sigma (m), SNR (dB) and seed.
+    sightings
+        Of all pairs, as the logs have them.
+    errors
+        Node → what is known of the errors of its log.
+    truth
+        What must be added to the logs.
+    targets_m
+        (target, 3) float64, of scatterers whose peaks can be measured.
+    probes
+        The same pairs over fifteen points elsewhere, `PROBES_M`, without noise: no refinement uses them.
+    reach_m
+        East and north of a point, within which its peak is looked for.
+    """
+
+    name: tuple[str, str, str, float, float | None, int]
+    sightings: tuple[Sighting, ...]
+    errors: Mapping[str, TrackErrors]
+    truth: TrackCorrection
+    targets_m: NDArray[np.float64]
+    probes: tuple[Sighting, ...]
+    reach_m: tuple[float, float]
+
+
+def case(
+    scene: str, geometry: str, pairs: str, sigma_m: float, snr_db: float | None, seed: int, *, drift_m: float = 0.0
+) -> Case:
+    """Return a case; tracks, scene and noise of a seed are drawn apart, so that each stays when another is changed.
+
+    Parameters
+    ----------
+    scene, geometry, pairs
+        Rows of `SCENES`, `FLIGHTS` and `PAIRS`.
+    sigma_m, drift_m
+        Standard deviations of the logs' errors in each axis.
+    snr_db
+        Range-compressed, per pulse, of the rms target, or of the mean range cell where the scene has no target;
+        None is without noise.
+    seed
+        Of everything random.
+    """
+    of_tracks, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
+    flight, scatterers = FLIGHTS[geometry](), SCENES[scene](of_scene)
+    errors = TrackErrors((sigma_m,) * 3, drift_std_m=drift_m)
+    streams = zip(NODES, of_tracks.spawn(len(NODES)), strict=True)
+    truth = TrackCorrection(flight.time_s, {node: drawn_errors(flight.time_s, errors, one) for node, one in streams})
+    probes = _probes(of_probes)
+    noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
+    return Case(
+        (scene, geometry, pairs, sigma_m, snr_db, seed),
+        tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
+        dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
+        truth,
+        scatterers.position_m[scatterers.targets],
+        tuple(sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
+        flight.reach_m,
+    )
+
+
+def _probes(generator: np.random.Generator) -> TargetScene:
+    phases = np.exp(2j * np.pi * generator.random(len(PROBES_M)))
+    return TargetScene(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
+
+
+def sighting(
+    pair: str,
+    flight: LoggedFlight,
+    truth: TrackCorrection,
+    scatterers: TargetScene,
+    snr_db: float | None,
+    generator: np.random.Generator,
+) -> Sighting:
+    """Return what a pair receives of some scatterers, with the length of the sidelink that the logs have restored.
+
+    Parameters
+    ----------
+    pair
+        transmitter-receiver, one of `NODES` each.
+    flight
+        Where the logs have the nodes.
+    truth
+        What must be added to the logs.
+    scatterers
+        What echoes.
+    snr_db
+        As of `case`; None is without noise.
+    generator
+        Of the noise.
+    """
+    tx, rx = pair.split("-")
+    logged = Aperture(flight.logged_m[tx], flight.logged_m[rx])
+    between_m = None if tx == rx else logged.tx_m - logged.rx_m
+    flown = truth.aperture(logged, pair, flight.time_s)
+    longer_m = -truth.longer_m(pair, flight.time_s, between_m)
+    echo = transfer(scatterers, flown, FREQUENCY_HZ, longer_m=longer_m, gridded=True)
+    if snr_db is not None:
+        std = np.sqrt(_signal_power(echo, scatterers, flown) * SUBCARRIERS / 10 ** (snr_db / 10) / 2)
+        parts = generator.standard_normal((*echo.shape, 2), np.float32)
+        echo += np.float32(std) * parts.view(np.complex64)[..., 0]
+    weights = window_weights("hann", SUBCARRIERS)
+    history = PhaseHistory(echo, FREQUENCY_HZ, weights, np.zeros(len(echo)), logged)
+    return Sighting(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
+
+
+def _signal_power(echo: NDArray[np.complex64], scatterers: TargetScene, flown: Aperture) -> float:
+    """Return the mean power of a target's echo, or of a range cell c/B of total path."""
+    if not len(scatterers.targets):
+        paths = flown[::10].path(scatterers.position_m[::10])
+        cells = np.ptp(paths, axis=1).mean() / (SPEED_OF_LIGHT_M_S / BANDWIDTH_HZ)
+        return float(np.mean(np.abs(echo) ** 2) / cells)
+    places, amplitude = (part[scatterers.targets] for part in (scatterers.position_m, scatterers.amplitude))
+    there, back = (np.linalg.norm(leg[::10, None] - places, axis=2) for leg in flown.legs)
+    return float(np.mean(np.abs(amplitude / (there * back)) ** 2))

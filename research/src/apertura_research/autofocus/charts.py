@@ -1,0 +1,259 @@
+"""The autofocus study: loss of peak against sigma of the tracks' errors, and images before and after."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from apertura.common.arrays import Floats
+from apertura.core.focus.engines import native
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.scene.grid import SceneGrid
+from apertura.methods.autofocus.inputs import Refinement, Sighting
+from apertura.views.chart.png import save_png
+from apertura_research.autofocus.cases import GRID, NODES, Case
+from apertura_research.autofocus.outcomes import (
+    ACCEPTED,
+    FLAGGED,
+    KINDS,
+    REFUSED,
+    SNR_DB,
+    TOO_FEW,
+    UNCORRECTED,
+    AutofocusRow,
+    case_of,
+    cases_of,
+    outcome_of,
+    refine_case,
+    run_case,
+)
+from apertura_research.sweep import Study, panels
+
+_LOGS, _PRODUCT = "#000000", "#0072b2"
+_MARKS = {
+    ACCEPTED: ("o", "#0072b2", "#0072b2"),
+    FLAGGED: ("D", "#0072b2", "#e69f00"),
+    REFUSED: ("X", "#d55e00", "#d55e00"),
+    TOO_FEW: ("s", "#d55e00", "none"),
+}
+_LEVELS_DB = (0, 0.1, 0.3, 1, 3, 10)
+_LINEAR_DB = 0.3  # below it the axis is linear: losses may be zero, or a little less
+_BESIDE = 0.06  # of the marks of a size's seeds, cm: they do not hide each other
+
+
+def draw_losses(_: str, outcomes: Sequence[AutofocusRow], path: Path) -> None:
+    """Draw a panel per scene: means over the seeds from logs and as the product leaves it, and its verdict on each."""
+    scenes = [scene for scene in KINDS if any(one.scene == scene for one in outcomes)]
+    seeds = len({one.seed for one in outcomes})
+    title = f"Loss at 15 places that no refinement uses, both pairs, SNR {SNR_DB:g} dB; lines: mean of {seeds} draws"
+    with panels(path, (4 * len(scenes) + 1, 5.6), (1, len(scenes)), title=title, sharey=True) as every:
+        for axes, scene in zip(every, scenes, strict=True):
+            rows = [one for one in outcomes if one.scene == scene]
+            _draw_scene(axes, rows)
+            _mark_verdicts(axes, rows)
+            axes.set_title(f"{KINDS[scene]}\n{tally(rows)}", fontsize=10)
+            axes.set_xlabel("σ of each log per axis, over 1 s, cm")
+        _scale(every[0], outcomes)
+
+
+def _draw_scene(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
+    sizes = sorted({one.sigma_cm for one in rows})
+    for name, colour, style, label in (
+        ("loss_db", _LOGS, "--", "from the logs"),
+        ("product_loss_db", _PRODUCT, "-", "as the product leaves it"),
+    ):
+        means = [np.mean([getattr(one, name) for one in rows if one.sigma_cm == size]) for size in sizes]
+        axes.plot(sizes, means, color=colour, linestyle=style, marker="_", markersize=12, zorder=1, label=label)
+    axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
+    axes.grid(alpha=0.3)
+
+
+def _mark_verdicts(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
+    """Mark each draw by its verdict; where it was refused also what it would have become."""
+    seeds = sorted({one.seed for one in rows})
+    beside = {seed: _BESIDE * (number - (len(seeds) - 1) / 2) for number, seed in enumerate(seeds)}
+    for verdict, (marker, edge, face) in _MARKS.items():
+        some = [one for one in rows if one.verdict == verdict]
+        places = [one.sigma_cm + beside[one.seed] for one in some]
+        losses = [one.product_loss_db for one in some]
+        axes.plot(places, losses, marker, color=edge, markerfacecolor=face, markersize=7, alpha=0.75, label=verdict)
+    refused = [one for one in rows if one.verdict == REFUSED]
+    axes.plot(
+        [one.sigma_cm + beside[one.seed] for one in refused],
+        [one.estimate_loss_db for one in refused],
+        "x", color="0.45", markersize=6, label="what was refused",
+    )  # fmt: skip
+
+
+def tally(rows: Sequence[AutofocusRow]) -> str:
+    """Return how many refinements were accepted, and how many of those did harm.
+
+    Examples
+    --------
+    >>> tally([AutofocusRow("five", 1.0, seed, 1.2, 0.1, 0.1, ACCEPTED, "", "") for seed in (1, 2)])
+    '2 of 2 accepted, 0 of them worse than the logs'
+    """
+    accepted = [one for one in rows if one.verdict in (ACCEPTED, FLAGGED)]
+    worse = [one for one in accepted if one.product_loss_db > one.loss_db]
+    return f"{len(accepted)} of {len(rows)} accepted, {len(worse)} of them worse than the logs"
+
+
+def _scale(axes: Axes, outcomes: Sequence[AutofocusRow]) -> None:
+    losses = [loss for one in outcomes for loss in (one.loss_db, one.product_loss_db, one.estimate_loss_db)]
+    axes.set_yscale("symlog", linthresh=_LINEAR_DB, linscale=0.6)
+    axes.set_yticks(_LEVELS_DB, [f"{level:g}" for level in _LEVELS_DB])
+    axes.set_yticks([], minor=True)
+    axes.set_ylim(min(-0.05, *losses), 1.2 * max(3.0, *losses))
+    axes.set_ylabel("Loss of peak, dB (linear below 0.3)")
+
+
+SIGMA_CM, SEED = 2.0, 1
+DEPTH_DB = 35.0
+
+_MIDDLE_M, _WITHIN_M = (0.0, 15.0), 4.0  # what is looked at closely is the brightest of the scene's middle
+_CLOSE_M, _FINE_M = 3.0, 0.015
+_AXES = ("east", "north", "up")
+_PANELS: list[Any] = [
+    ["whole 0", "whole 1", "whole 2"],
+    ["close 0", "close 1", "close 2"],
+    [*_AXES],
+    ["path"] * 3,
+]
+_COLOURS = ("#0072b2", "#d55e00")
+_LETTERS = 125  # of a line of the title
+
+
+def draw_case(scene: str, path: Path, *, sigma_cm: float = SIGMA_CM, seed: int = SEED) -> None:
+    """Draw one case of a scene of `KINDS` as PNG: the whole scene, a close look, and errors of the tracks over time.
+
+    Parameters
+    ----------
+    scene
+        A row of `KINDS`.
+    path
+        Of the PNG.
+    sigma_cm, seed
+        Of the logs' errors.
+    """
+    one = case_of(scene, sigma_cm, seed)
+    result = refine_case(one)
+    used = result.correction if result.accepted else UNCORRECTED
+    figure = Figure(figsize=(12.5, 16), layout="constrained")
+    panels = figure.subplot_mosaic(_PANELS, height_ratios=(1.2, 1.1, 0.6, 0.6))
+    place_m = _draw_images(figure, panels, one, {"logs": UNCORRECTED, _named(result): used, "true tracks": one.truth})
+    for number, name in enumerate(_AXES):
+        _draw_errors(panels[name], one, used, number)
+        panels[name].set_title(name, fontsize=10)
+    panels[_AXES[0]].set_ylabel("Error of the tracks, cm")
+    _draw_paths(panels["path"], one, used, place_m)
+    figure.suptitle(_title(one, result), fontsize=11)
+    save_png(figure, path)
+
+
+def _named(result: Refinement) -> str:
+    return "refined tracks" if result.accepted else "refused: the logs stay"
+
+
+def _title(one: Case, result: Refinement) -> str:
+    row = outcome_of(one, result)
+    flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flag"
+    head = (
+        f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at probes {row.loss_db:.2f} dB from the logs, "
+        f"{row.product_loss_db:.2f} dB as the product leaves it"
+    )
+    return f"{fill(head, _LETTERS)}\n{fill(f'{row.verdict}: {row.why}; {flags}', _LETTERS)}"
+
+
+def _draw_images(
+    figure: Figure, panels: Mapping[str, Axes], one: Case, tracks: Mapping[str, TrackCorrection]
+) -> Floats:
+    """Draw the first pair's images from each of some tracks, the last the true ones, and return what is looked at."""
+    true = image(one, one.truth, GRID)
+    place_m = _brightest(true)
+    for view, grid in (("whole", GRID), ("close", _about(place_m))):
+        images = {name: image(one, correction, grid) for name, correction in tracks.items()}
+        peak = images["true tracks"].max()
+        row = [panels[f"{view} {number}"] for number in range(len(images))]
+        for axes, (name, values) in zip(row, images.items(), strict=True):
+            shown = _draw_image(axes, values / peak, grid)
+            higher = f", peak {20 * np.log10(values.max() / peak):+.1f} dB" if view == "close" else ""
+            axes.set_title(name + higher, fontsize=10)  # pixels of the whole scene miss peaks by tenths of a decibel
+        row[0].set_ylabel("North, m")
+        figure.colorbar(shown, ax=row, label="dB against the true tracks' peak", pad=0.01, shrink=0.8)
+    return place_m
+
+
+def image(one: Case, correction: TrackCorrection, grid: SceneGrid) -> Floats:
+    """Return (row, column), magnitude: the first pair's image from corrected tracks."""
+    return np.asarray(np.abs(native.form(native.prepare(one.sightings[0].moved(correction)), grid.positions(0.0))))
+
+
+def _brightest(magnitude: Floats) -> Floats:
+    places = GRID.positions(0.0)
+    near = np.linalg.norm(places[..., :2] - _MIDDLE_M, axis=-1) < _WITHIN_M
+    return np.asarray(places[near][magnitude[near].argmax()].round(3) + 0.0)
+
+
+def _about(place_m: Floats) -> SceneGrid:
+    count = round(_CLOSE_M / _FINE_M)
+    west, north = place_m[0] - _CLOSE_M / 2, place_m[1] + _CLOSE_M / 2
+    return SceneGrid("local", float(west), float(north), _FINE_M, (count, count))
+
+
+def _draw_image(axes: Axes, magnitude: Floats, grid: SceneGrid) -> AxesImage:
+    west, south, east, north = grid.bounds_m
+    levels = 20 * np.log10(np.maximum(magnitude, 1e-6))
+    axes.set_xlabel("East, m")
+    return axes.imshow(levels, cmap="magma", vmin=-DEPTH_DB, vmax=0, extent=(west, east, south, north))
+
+
+def _draw_errors(axes: Axes, one: Case, used: TrackCorrection, number: int) -> None:
+    """Draw what logs are wrong by along one axis, and what is left of it as images are formed."""
+    time_s = one.truth.time_s
+    for node, colour in zip(NODES, _COLOURS, strict=True):
+        wrong = one.truth.at(node, time_s)[:, number]
+        _draw_pair(axes, time_s, (wrong, wrong - used.at(node, time_s)[:, number]), (node, colour))
+
+
+def _draw_paths(axes: Axes, one: Case, used: TrackCorrection, place_m: Floats) -> None:
+    """Draw by how much paths to a place are wrong, but for their mean: this is what blurs it."""
+    for sighting, colour in zip(one.sightings, _COLOURS, strict=False):
+        true, logged, now = (_path(sighting, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
+        errors = tuple(error - error.mean() for error in (true - logged, true - now))
+        _draw_pair(axes, sighting.time_s, errors, (sighting.pair, colour))
+    axes.set_title(
+        f"path to the place looked at closely, {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10
+    )
+    axes.set_ylabel("Error less its mean, cm")
+
+
+def _path(sighting: Sighting, tracks: TrackCorrection, place_m: Floats) -> Floats:
+    """Return (pulse,) metres: the path that tracks expect of a place's echo (docs/theory/autofocus.md, eq. 1)."""
+    aperture = tracks.aperture(sighting.profiles.aperture, sighting.pair, sighting.time_s)
+    longer_m = tracks.longer_m(sighting.pair, sighting.time_s, sighting.sidelink_m)
+    return np.asarray(aperture.path(place_m[None])[:, 0] - longer_m)
+
+
+def _draw_pair(axes: Axes, time_s: Floats, errors: tuple[Floats, Floats], named: tuple[str, str]) -> None:
+    (log, left), (name, colour) = errors, named
+    axes.plot(time_s, 100 * log, color=colour, alpha=0.35, linewidth=1, label=f"{name}, log")
+    axes.plot(time_s, 100 * left, color=colour, linewidth=1.2, label=f"{name}, left")
+    axes.axhline(0, color="0.3", linewidth=0.6)
+    axes.set_xlabel("Time, s")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7, ncols=2)
+
+
+STUDY = Study(
+    row=AutofocusRow,
+    charts={"losses": tuple(KINDS)},
+    cases=cases_of,
+    run=run_case,
+    draw=draw_losses,
+)
+"""A part is a scene; a case is a size of the logs' errors and a seed."""

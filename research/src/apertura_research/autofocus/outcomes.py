@@ -1,0 +1,220 @@
+"""What errors of the tracks cost with and without autofocus: losses and shifts of peaks against the true tracks."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import process_time
+
+import numpy as np
+
+from apertura.common.arrays import Floats
+from apertura.core.focus.engines import native
+from apertura.core.focus.engines.native_tables import Tables
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
+from apertura.methods.autofocus.refine import refine
+from apertura_research.autofocus.cases import GRID, PROBES_M, Case, case
+
+UNCORRECTED = TrackCorrection(np.zeros(1), {})
+_SEARCHES = ((33, 25), (9, 9), (9, 9))  # places east and north of ever finer searches for a peak
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Peaks of points in the images of all pairs.
+
+    Attributes
+    ----------
+    height
+        (pair, point) float64, magnitude.
+    place_m
+        (pair, point, 3) float64.
+    """
+
+    height: Floats
+    place_m: Floats
+
+
+def peaks(
+    sightings: Sequence[Sighting], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
+) -> Peaks:
+    """Return the highest peaks within reach of points (point, 3) as imaged from corrected tracks."""
+    by_pair = []
+    for one in sightings:
+        tables = native.prepare(one.moved(correction))
+        by_pair.append([_peak(tables, point, reach_m) for point in points_m])
+    height = np.array([[peak for peak, _ in row] for row in by_pair]).reshape(len(sightings), len(points_m))
+    place = np.array([[place for _, place in row] for row in by_pair]).reshape(*height.shape, 3)
+    return Peaks(height, place)
+
+
+def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tuple[float, Floats]:
+    east, north = reach_m
+    for columns, rows in _SEARCHES:
+        places = np.stack(np.meshgrid(np.linspace(-east, east, columns), np.linspace(-north, north, rows)), -1)
+        places = middle_m + np.concatenate([places, np.zeros((rows, columns, 1))], axis=-1)
+        image = np.abs(native.form(tables, places))
+        best = np.unravel_index(image.argmax(), image.shape)
+        middle_m, east, north = places[best], 2 * east / (columns - 1), 2 * north / (rows - 1)
+    return float(image[best]), middle_m
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a correction does to a case; NaN of targets where the scene has none.
+
+    Attributes
+    ----------
+    probe_loss_db, probe_worst_db, target_loss_db
+        Mean and lowest peak of probes, mean of targets, over points and pairs, against the true tracks.
+    probe_shift_cm, target_shift_cm
+        Median distance of peaks from where the true tracks have them.
+    """
+
+    probe_loss_db: float
+    probe_worst_db: float
+    probe_shift_cm: float
+    target_loss_db: float
+    target_shift_cm: float
+
+
+def judge(one: Case, correction: TrackCorrection = UNCORRECTED) -> Judgement:
+    """Return what a correction does to a case; that of the logs themselves by default.
+
+    The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
+    """
+    probe_loss, probe_shift = _against_truth(one, one.probes, PROBES_M, correction)
+    target_loss, target_shift = _against_truth(one, one.sightings, one.targets_m, correction)
+    return Judgement(
+        _mean(probe_loss), float(probe_loss.min()), _median(probe_shift), _mean(target_loss), _median(target_shift)
+    )
+
+
+def _against_truth(
+    one: Case, sightings: Sequence[Sighting], points_m: Floats, correction: TrackCorrection
+) -> tuple[Floats, Floats]:
+    """Return loss (dB) and shift (cm) of points, (pair, point) float64 each."""
+    true, now = (peaks(sightings, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
+    loss = 20 * np.log10(now.height / true.height)
+    return loss, 100 * np.linalg.norm(now.place_m - true.place_m, axis=-1)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if values.size else np.nan
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if values.size else np.nan
+
+
+def image_seconds(one: Sighting, *, thinning: int = 5) -> float:
+    """Return the processor time of an image of the whole scene of every fifth pulse, by the native engine."""
+    begun = process_time()
+    native.form(native.prepare(one.profiles[::thinning]), GRID.positions(0.0))
+    return process_time() - begun
+
+
+KINDS: Mapping[str, str] = {
+    "five": "the paper's five points",
+    "forty": "forty points",
+    "texture": "texture",
+    "dense": "fully developed speckle",
+}
+"""Rows of `SCENES` that are tried → how charts call them."""
+
+SIGMAS_CM = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
+SEEDS = (1, 2, 3)
+SNR_DB = 10.0
+
+LEAST_STATED_M = 0.005
+"""Logs without error are stated to have this: with less no refinement is requested."""
+
+ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: too few points"
+VERDICTS = (ACCEPTED, FLAGGED, REFUSED, TOO_FEW)
+
+
+@dataclass(frozen=True)
+class AutofocusRow:
+    """What errors of one size did to one case, mono- and bistatic pair together: a row of the CSV.
+
+    Attributes
+    ----------
+    loss_db, product_loss_db, estimate_loss_db
+        Mean over the probes, which no refinement uses, against the true tracks; positive where peaks are too low:
+        of the logs, of the tracks that the product images from, and of its estimate, accepted or not.
+    verdict
+        One of `VERDICTS`.
+    flags, why
+        As the product writes them.
+    """
+
+    scene: str
+    sigma_cm: float
+    seed: int
+    loss_db: float
+    product_loss_db: float
+    estimate_loss_db: float
+    verdict: str
+    flags: str
+    why: str
+
+
+def cases_of(scene: str) -> list[tuple[float, int]]:  # noqa: ARG001
+    """Return size (cm) and seed of every case of a scene of `KINDS`."""
+    return [(sigma_cm, seed) for sigma_cm in SIGMAS_CM for seed in SEEDS]
+
+
+def run_case(scene: str, size_and_seed: tuple[float, int]) -> list[AutofocusRow]:
+    """Return the outcome of one size and seed on one scene of `KINDS`, both pairs past it together.
+
+    Tracks of a seed are the same in every scene and in every size but for their scale.
+    """
+    one = case_of(scene, *size_and_seed)
+    return [outcome_of(one, refine_case(one))]
+
+
+def case_of(scene: str, sigma_cm: float, seed: int) -> Case:
+    """Return one case of the sweep."""
+    return case(scene, "straight", "joint", sigma_cm / 100, SNR_DB, seed)
+
+
+def refine_case(one: Case) -> Refinement:
+    """Return what the product makes of a case whose errors are stated as they are."""
+    return refine(one.sightings, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
+
+
+def _stated(known: TrackErrors) -> TrackErrors:
+    east, north, up = (max(std_m, LEAST_STATED_M) for std_m in known.std_m)
+    return replace(known, std_m=(east, north, up))
+
+
+def outcome_of(one: Case, result: Refinement) -> AutofocusRow:
+    """Return what a refinement leaves of a case's loss, and the verdict on it."""
+    before, after = (0.0 - judge(one, tracks).probe_loss_db for tracks in (UNCORRECTED, result.correction))
+    return AutofocusRow(
+        scene=one.name[0],
+        sigma_cm=round(100 * one.name[3], 6),
+        seed=one.name[5],
+        loss_db=round(before, 4),
+        product_loss_db=round(after if result.accepted else before, 4),
+        estimate_loss_db=round(after, 4),
+        verdict=verdict_of(result),
+        flags=" ".join(result.flags),
+        why=result.why,
+    )
+
+
+def verdict_of(result: Refinement) -> str:
+    """Return the product's verdict on a refinement, one of `VERDICTS`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from apertura.core.geometry.phase_centres import TrackCorrection
+    >>> nothing = TrackCorrection(np.zeros(1), {})
+    >>> verdict_of(Refinement(nothing, {}, True, "", flags={"prior_inconsistent": "twice as large"}))
+    'accepted with a flag'
+    """
+    if result.accepted:
+        return FLAGGED if result.flags else ACCEPTED
+    return TOO_FEW if "refinement_too_few_patches" in result.flags else REFUSED

@@ -1,0 +1,272 @@
+"""What each error of the paper does to a range profile and to the peaks, uncorrected."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from apertura.common.arrays import Complexes, Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.echo.sidelink import divide
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.simulation.impairments import Clock, Impairments, Timing, UniformPhase
+from apertura.simulation.presets import paper_waveform
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import straight_pair
+from apertura_research import point_response
+from apertura_research.paper.claims import Claim, compare, require
+from apertura_research.paper.experiments import profiles_at
+from apertura_research.paper_scene import (
+    NO_IMPAIRMENTS,
+    RX_AHEAD_M,
+    UNDISTURBED,
+    Disturbance,
+    PaperScene,
+    receive_pair,
+    reduced_scene,
+)
+from apertura_research.point_response import REACH_M, find_peaks, phase_history, range_tables, undisturbed_tables
+from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
+
+TIMING_S, SMALL_TIMING_S = 1e-9, 0.5e-9
+TARGET_M = 15.0
+_SLANT_M = np.linspace(17.5, 18.7, 4801)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One target's range profile on a fine axis, referenced to the band's start as the paper writes it."""
+
+    values: Complexes
+    carrier_hz: float
+
+    @property
+    def peak(self) -> int:
+        """Where it is largest."""
+        return int(np.abs(self.values).argmax())
+
+    @property
+    def phase(self) -> float:
+        """At its peak, rad: that of exp(−j2πf_cτ), the carrier's turn over the true delay."""
+        turned = self.carrier_hz * 2 * _SLANT_M[self.peak] / SPEED_OF_LIGHT_M_S
+        return float(np.angle(self.values[self.peak] * np.exp(-2j * np.pi * (turned % 1.0))))
+
+
+def effect_claims() -> list[Claim]:
+    """Return what timing and carrier phase do to the profile of one target."""
+    scene = _one_target()
+    still, moved, little, turned = (
+        _profile(scene, disturbance)
+        for disturbance in (
+            UNDISTURBED,
+            Disturbance(Impairments(timing=Timing(offset_s=TIMING_S))),
+            Disturbance(Impairments(timing=Timing(offset_s=SMALL_TIMING_S))),
+            Disturbance(Impairments(carrier_phase=UniformPhase(np.pi))),
+        )
+    )
+    magnitude_db = _change_db(still, turned)
+    return [
+        *_timing(scene, still, moved, TIMING_S),
+        require(
+            "a timing offset of 0.5 ns leaves the range profile",
+            _shift_cells(scene, still, little),
+            "cells",
+            limit="less than half a cell c/2B",
+            met=_shift_cells(scene, still, little) < 0.5,
+            style=".3f",
+            note=f"its peak is {20 * np.log10(_level(little) / _level(still)):+.3f} dB; the phase turns by "
+            f"{360 * scene.waveform.carrier_hz * SMALL_TIMING_S:.0f}°, which is what defocuses",
+        ),
+        require(
+            "a carrier phase leaves the magnitude of the range profile",
+            magnitude_db,
+            "dB",
+            limit="below −90 dB of the peak",
+            met=magnitude_db < -90,
+            style=".0f",
+            note=f"largest change anywhere; the phase turned by {np.degrees(turned.phase - still.phase) % 360:.0f}°",
+        ),
+    ]
+
+
+def _timing(scene: PaperScene, still: Profile, moved: Profile, late_s: float) -> list[Claim]:
+    """Return shift and phase of a capture that starts late: every echo seems earlier by as much."""
+    bandwidth_hz = len(scene.waveform.codes) * scene.waveform.subcarrier_spacing_hz
+    turn = (moved.phase - still.phase) / (2 * np.pi) % 1.0
+    return [
+        compare(
+            f"shift of the profile by a timing offset of {1e9 * late_s:g} ns, B·T",
+            _shift_cells(scene, still, moved),
+            "cells",
+            independent_model=bandwidth_hz * late_s,
+            within=0.01,
+            note="closed form B·T with B = 409.6 MHz",
+        ),
+        compare(
+            f"phase of the peak by a timing offset of {1e9 * late_s:g} ns, 2πf_cT",
+            turn,
+            "turns",
+            independent_model=scene.waveform.carrier_hz * late_s % 1.0,
+            within=0.005,
+            relative=False,
+            note="closed form f_cT modulo one turn, profile referenced to the start of the band; about the band's "
+            "middle, as this project's profiles are, it is f_mid·T",
+        ),
+    ]
+
+
+def _one_target() -> PaperScene:
+    target = Scatterers(np.array([[0.0, TARGET_M, 0.0]]), np.ones(1, np.complex128))
+    scene = reduced_scene(pulses=150, subcarriers=4096)
+    return replace(scene, scatterers=target, geometry=straight_pair(np.zeros(1), 10.0))
+
+
+def _profile(scene: PaperScene, disturbance: Disturbance) -> Profile:
+    radar, _, _ = receive_pair(scene, disturbance, np.random.default_rng(2))
+    values = profiles_at(phase_history(scene, radar), _SLANT_M)[0]
+    return Profile(values, scene.waveform.carrier_hz)
+
+
+def _shift_cells(scene: PaperScene, still: Profile, moved: Profile) -> float:
+    cell_m = SPEED_OF_LIGHT_M_S / (2 * len(scene.waveform.codes) * scene.waveform.subcarrier_spacing_hz)
+    return float(abs(_SLANT_M[moved.peak] - _SLANT_M[still.peak]) / cell_m)
+
+
+def _change_db(still: Profile, turned: Profile) -> float:
+    """Return the largest change of magnitude anywhere, against the peak."""
+    before, after = np.abs(still.values), np.abs(turned.values)
+    return 20 * float(np.log10(np.abs(after - before).max() / before.max()))
+
+
+def _level(profile: Profile) -> float:
+    return float(np.abs(profile.values[profile.peak]))
+
+
+DESTROYED_DB = -12.0
+"""Beyond it there is no peak to measure: the largest speckle near the target is reported."""
+
+
+@dataclass(frozen=True, eq=False)
+class UncorrectedError:
+    """One error of the table.
+
+    Attributes
+    ----------
+    sweep
+        The impairment; here it comes alone.
+    independent_model_db
+        Size → mean peak loss of an independent model, dB; `within_db` of it agrees.
+    pulses
+        That settle the losses: 150 agree with 300 to 0.03 dB where nothing is random.
+    draws
+        Over which the loss is averaged; 1 where nothing is random.
+    divided
+        Whether the sidelink is divided out (and its length is as wrong as the positions).
+    reach_m
+        How far peaks are looked for.
+    """
+
+    sweep: ImpairmentSweep
+    independent_model_db: Mapping[float, float]
+    pulses: int
+    subcarriers: int = 128
+    rx_ahead_m: float = 0.0
+    draws: int = 1
+    within_db: float = 0.5
+    divided: bool = False
+    reach_m: tuple[float, float] = REACH_M
+    note: str = ""
+
+    def scene(self, pulses: int) -> PaperScene:
+        """Return the scene with so many pulses."""
+        qpsk = self.sweep.sampled
+        return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=qpsk)
+
+    def disturbance(self, size: float) -> Disturbance:
+        """Return what goes wrong at one size."""
+        return self.sweep.disturbance(size, besides=NO_IMPAIRMENTS)
+
+
+def _sfo(khz: float) -> dict[str, object]:
+    """Return a sampling rate off by so much, the time error counted from the start of the DFT window."""
+    wave, off_hz = paper_waveform(), 1e3 * khz
+    start_s = wave.cyclic_prefix_s * off_hz / (wave.sample_rate_hz + off_hz)
+    return {"clock": Clock(sfo_hz=off_hz), "timing": Timing(offset_s=start_s)}
+
+
+ERRORS: Mapping[str, UncorrectedError] = {
+    "carrier_phase": UncorrectedError(
+        SWEEPS["carrier_phase"], {0.125: -0.23, 0.25: -0.92, 0.5: -3.96, 0.75: -10.5, 1.0: -30.0}, pulses=3000, draws=4
+    ),
+    "timing": UncorrectedError(
+        SWEEPS["timing"], {0.05: -0.29, 0.1: -1.18, 0.2: -5.2, 0.5: -14.6, 1.0: -23.0}, pulses=3000, draws=4
+    ),
+    "cfo": UncorrectedError(
+        SWEEPS["cfo"], {10: -0.15, 30: -1.39, 50: -4.1, 100: -31.5}, pulses=150, subcarriers=4096,
+        note="random QPSK code; a quadratic-phase code loses half as much, in dB, and shifts the targets",
+    ),
+    "sfo": UncorrectedError(
+        replace(SWEEPS["sfo"], receiver=_sfo), {100: -1.05, 200: -4.0, 400: -9.3, 1000: -15.0},
+        pulses=150, subcarriers=4096, reach_m=(0.16, 1.5),
+        note="time error counted from the DFT window; counted from the prefix a third more is lost, by defocusing",
+    ),
+    "localization": UncorrectedError(
+        replace(SWEEPS["localization"], title=SWEEPS["localization"].title + ", bistatic"),
+        {0.5: -0.31, 1: -1.24, 2: -5.0, 3: -10.5},
+        pulses=600, rx_ahead_m=RX_AHEAD_M, draws=40, within_db=1.0, divided=True,
+    ),
+}  # fmt: skip
+
+
+def loss_claims(name: str, *, draws: int | None = None, seed: int = 1) -> list[Claim]:
+    """Return a row for each size of a key of `ERRORS`: mean peak loss over five targets and all draws."""
+    error = ERRORS[name]
+    count = draws or error.draws
+    rows = []
+    for size, expected_db in error.independent_model_db.items():
+        losses = [peak_losses_db(error, size, np.random.default_rng([seed, draw])).mean() for draw in range(count)]
+        rows.append(_row(error, size, expected_db, np.array(losses)))
+    return rows
+
+
+def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Generator) -> Floats:
+    """Return (target,) loss of the peaks against the undisturbed scene, dB, negative."""
+    scene = _scene(error)
+    targets = scene.scatterers.position_m
+    radar, sidelink, _ = receive_pair(scene, error.disturbance(size), generator)
+    history = history_of(scene, radar, sidelink, divided=error.divided)
+    _, peaks = find_peaks(range_tables(history, targets), targets, reach_m=error.reach_m)
+    return point_response.amplitude_db(peaks / _undisturbed_peaks(error))
+
+
+def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
+    """Return what is focused: the radar alone, or divided by the sidelink."""
+    return point_response.phase_history(scene, divide(radar, sidelink) if divided else radar, divided=divided)
+
+
+@lru_cache(maxsize=2)
+def _scene(error: UncorrectedError) -> PaperScene:
+    return error.scene(error.pulses)
+
+
+@lru_cache(maxsize=2)
+def _undisturbed_peaks(error: UncorrectedError) -> Floats:
+    return find_peaks(undisturbed_tables(_scene(error)), _scene(error).scatterers.position_m)[1]
+
+
+def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Floats) -> Claim:
+    mean_db, count = float(losses_db.mean()), losses_db.size
+    destroyed = expected_db < DESTROYED_DB and mean_db < DESTROYED_DB
+    how = "destroyed: no peak is left to compare" if destroyed else f"to within {error.within_db:g} dB"
+    over = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "nothing random"
+    return compare(
+        f"uncorrected loss: {error.sweep.title} {size:g} {error.sweep.unit}",
+        mean_db,
+        "dB",
+        independent_model=expected_db,
+        within=np.inf if destroyed else error.within_db,
+        relative=False,
+        style=".2f",
+        note="; ".join(filter(None, (how, over, error.note))),
+    )

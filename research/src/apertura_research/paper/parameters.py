@@ -1,0 +1,186 @@
+"""The paper's equations, and the parameters that it derives from them."""
+
+import numpy as np
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.simulation.presets import paper_waveform
+from apertura_research.paper.claims import EXPLAINED, UNTESTABLE, Claim, compare, require
+
+HALF_POWER_OF_SINC = 0.886
+"""−3 dB width of |sinc(x)|²."""
+
+HALF_POWER_OF_HANN = 1.441
+"""−3 dB width of the response of a Hann window, in the same unit 1/B.
+
+Source: F. J. Harris, "On the use of windows for harmonic analysis with the DFT", Proc. IEEE 66 (1978), table I.
+"""
+
+
+def sfo_limit_hz(sample_rate_hz: float, bandwidth_hz: float, symbol_s: float) -> float:
+    """Return f_s(1 − 1/(1 + 1/(BT))): the last subcarrier drifts by one turn over the symbol.
+
+    Examples
+    --------
+    >>> round(sfo_limit_hz(1.024e9, 409.6e6, 12.5e-6))
+    199961
+    """
+    return sample_rate_hz * (1 - 1 / (1 + 1 / (bandwidth_hz * symbol_s)))
+
+
+def cfo_limit_hz(subcarrier_spacing_hz: float) -> float:
+    """Return Δf/10, which costs 20·lg sinc(0.1) = −0.14 dB.
+
+    Examples
+    --------
+    >>> cfo_limit_hz(100e3)
+    10000.0
+    """
+    return subcarrier_spacing_hz / 10
+
+
+def ground_range_resolution_m(
+    bandwidth_hz: float, ground_range_m: float, height_m: float, *, half_power: float = HALF_POWER_OF_SINC
+) -> float:
+    """Return half_power·c/2B·R/r_g, the −3 dB width on the ground abreast of the track.
+
+    Examples
+    --------
+    >>> [round(100 * ground_range_resolution_m(409.6e6, r, 10.0), 1) for r in (5.0, 25.0)]
+    [72.5, 34.9]
+    """
+    slant_m = np.hypot(ground_range_m, height_m)
+    return float(half_power * SPEED_OF_LIGHT_M_S / (2 * bandwidth_hz) * slant_m / ground_range_m)
+
+
+def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture_m: float) -> float:
+    """Return 0.886·λR/2L, the −3 dB width along the track of a short aperture.
+
+    Examples
+    --------
+    >>> round(100 * cross_range_resolution_m(1.40475e9, 12.51, 3.4), 1)
+    34.8
+    """
+    wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
+    return HALF_POWER_OF_SINC * wavelength_m * slant_range_m / (2 * aperture_m)
+
+
+def coherence_of_snr(snr: float, pulses: int) -> float:
+    """Return Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes in white noise of a given power SNR per compressed pulse.
+
+    Examples
+    --------
+    >>> round(coherence_of_snr(1e3, 200), 4)
+    0.999
+    """
+    return (snr + 1 / pulses) / (snr + 1)
+
+
+def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
+    """Return the power SNR of one compressed pulse at which M equal echoes in white noise are so coherent.
+
+    Notes
+    -----
+    Source: docs/theory/study.md, "Coherence factor": Γ = E|Σs|²/(M·E Σ|s|²) = (SNR + 1/M)/(SNR + 1).
+
+    Examples
+    --------
+    >>> [round(10 * float(np.log10(snr_of_coherence_factor(g, 200))), 1) for g in (0.986, 0.9995, 0.9999)]
+    [18.5, 33.0, 40.0]
+    """
+    return (coherence - 1 / pulses) / (1 - coherence)
+
+
+BITS = 14
+ADC_RATE_HZ = 4.096e9
+"""Before decimation by 4."""
+
+CLOCK_ERROR = 1e-8
+EXACT = 1e-6
+
+
+def parameter_claims() -> list[Claim]:
+    """Return bandwidth, duty cycles, data rates, clock limits, timing requirements and chirp bandwidth.
+
+    Examples
+    --------
+    >>> [claim.claim for claim in parameter_claims() if claim.verdict != "agrees"]
+    ['OFDM symbol T against 1/Δf', 'effective chirp ...', 'SFO limit in ppm of f_s', 'CFO of a ...', 'SFO of a ...']
+    """
+    return [*_waveform(), *_clocks(), *_timing(), *_sampling()]
+
+
+def _waveform() -> list[Claim]:
+    wave = paper_waveform()
+    band_mhz = len(wave.codes) * wave.subcarrier_spacing_hz / 1e6
+    rows = [compare("bandwidth N·Δf", band_mhz, "MHz", paper=409.6, within=EXACT)]
+    for prf_hz, percent, mbit_s in ((100.0, 0.15625, 44.8), (20.0, 0.03125, 8.96)):
+        duty = (wave.symbol_s + wave.cyclic_prefix_s) * prf_hz
+        rate_mbit_s, at = 2 * wave.sample_rate_hz * BITS * duty / 1e6, f"at {prf_hz:.0f} Hz"
+        note = "γ = (T + T_cp)·f_prf, not T alone"
+        rows.append(compare(f"duty cycle {at}", 100 * duty, "%", paper=percent, within=EXACT, style=".5g", note=note))
+        note = "2·f_s·ν·γ: I and Q both counted"
+        rows.append(compare(f"mean data rate {at}", rate_mbit_s, "Mbit/s", paper=mbit_s, within=EXACT, note=note))
+    period_us, symbol_us = 1e6 / wave.subcarrier_spacing_hz, 1e6 * wave.symbol_s
+    contradiction = (
+        f"the paper contradicts itself: T is {symbol_us / period_us:g} periods of 1/Δf; the symbol is "
+        f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
+        f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples"
+    )
+    name, texts = "OFDM symbol T against 1/Δf", ("12.5", "", f"{period_us:g}")
+    rows.append(Claim(name, *texts, "µs", EXPLAINED, contradiction))
+    kept = (wave.symbol_s - wave.cyclic_prefix_s) / wave.symbol_s
+    share = f"{100 * kept:g} % of B; the paper prints the formula and names no delay"
+    name = "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"
+    return [*rows, Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", UNTESTABLE, share)]
+
+
+def _clocks() -> list[Claim]:
+    wave = paper_waveform()
+    band_hz = len(wave.codes) * wave.subcarrier_spacing_hz
+    sfo_hz, cfo_hz = sfo_limit_hz(wave.sample_rate_hz, band_hz, wave.symbol_s), cfo_limit_hz(wave.subcarrier_spacing_hz)
+    sfo_ppm, cfo_ppm = 1e6 * sfo_hz / wave.sample_rate_hz, 1e6 * cfo_hz / wave.carrier_hz
+    at_carrier_hz, at_converter_hz = CLOCK_ERROR * wave.carrier_hz, CLOCK_ERROR * ADC_RATE_HZ
+    halved = (
+        f"the paper's 200 kHz are {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s between the two nodes; 100 ppm would be about "
+        f"the half of it that each of two clocks may be off in opposite directions ({sfo_ppm / 2:.1f} ppm)"
+    )
+    first = "is reached first where one clock feeds both"
+    swapped = (
+        "the paper contradicts itself: it prints 41 Hz for the CFO at the carrier of 1.2 GHz and 12 Hz for the SFO at "
+        "the converter's 4.096 GS/s; each is computed where the other is printed"
+    )
+    return [
+        compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper=200, within=1e-3, style=".5g"),
+        compare("SFO limit in ppm of f_s", sfo_ppm, "ppm", paper=100, within=0.05, note=halved),
+        compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper=10, within=EXACT),
+        compare("CFO limit in ppm of the carrier", cfo_ppm, "ppm", paper=8.3, within=0.005, style=".3g", note=first),
+        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper=41, within=0.01, reason=swapped),
+        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper=12, within=0.01, reason=swapped),
+    ]
+
+
+def _timing() -> list[Claim]:
+    range_error_m, speed_m_s, prf_hz = 0.02, 10.0, 100.0
+    samples_ps, tags_ms = 2e12 * range_error_m / SPEED_OF_LIGHT_M_S, 2e3 * range_error_m / speed_m_s
+    return [
+        compare("timing of the samples 2δR/c, δR = 2 cm", samples_ps, "ps", paper=133, within=0.005),
+        compare("association of pulses 1/f_prf at 100 Hz", 1e3 / prf_hz, "ms", paper=10, within=EXACT),
+        compare("time tags 2δR/v at 10 m/s", tags_ms, "ms", paper=4, within=EXACT),
+    ]
+
+
+def _sampling() -> list[Claim]:
+    """Return the pulses' spacing along the track against a quarter of the shortest wave: no look angle is aliased."""
+    shortest_m = SPEED_OF_LIGHT_M_S / float(paper_waveform().frequency_hz[-1])
+    limit = f"at most λ/4 = {25 * shortest_m:.2f} cm at the upper band edge, two ways"
+    return [
+        require(
+            f"alias-free sampling along the track: {what}",
+            100 * speed_m_s / prf_hz,
+            "cm",
+            limit=limit,
+            met=speed_m_s / prf_hz <= shortest_m / 4,
+            note=f"{speed_m_s:g} m/s at {prf_hz:g} Hz; enough in every direction, whatever the beam",
+        )
+        for what, speed_m_s, prf_hz in (("simulation", 1.0, 100.0), ("UAV flight", 0.5, 20.0))
+    ]

@@ -1,0 +1,177 @@
+"""What each size of an impairment does to the image under each correction of the sidelink."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Complexes, Floats
+from apertura.common.errors import CampaignError
+from apertura.core.echo.line_of_sight import fit_line_of_sight
+from apertura.core.echo.sidelink import METHODS, choose, measure
+from apertura.core.focus.inputs import PhaseHistory
+from apertura_research import point_response
+from apertura_research.paper_scene import receive_pair
+from apertura_research.point_response import find_peaks, mean_image
+from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
+
+REFUSED_DB = 40.0
+"""Loss entered where nothing is imaged; larger ones are clipped to it."""
+
+_REACH_M = (0.16, 1.0)
+
+
+@dataclass(frozen=True)
+class StabilityRow:
+    """What one impairment of one size did to the image under one correction: a row of the CSV.
+
+    Attributes
+    ----------
+    loss_db, loss_spread_db
+        Loss of the five peaks against the undisturbed scene, and its standard deviation over the draws.
+    coherence_factor
+        Mean over the targets and draws.
+    ground_width_m, cross_width_m
+        −3 dB widths of the third target, median over the draws; NaN where it has no main lobe.
+    floor_db
+        RMS of what is wrong at random pixels of the scene, against the mean peak.
+    pulses_used
+        Mean share of the pulses that were imaged.
+    chosen
+        Method that was applied in most draws; `refused` where none locks.
+    """
+
+    impairment: str
+    unit: str
+    size: float
+    method: str
+    loss_db: float
+    loss_spread_db: float
+    coherence_factor: float
+    ground_width_m: float
+    cross_width_m: float
+    floor_db: float
+    pulses_used: float
+    chosen: str
+    draws: int
+    seed: int
+
+
+def sizes_of(part: str) -> tuple[float, ...]:
+    """Return the sizes that a part, `IMPAIRMENT.METHOD`, is tried at."""
+    return SWEEPS[part.partition(".")[0]].sizes
+
+
+def run_size(part: str, size: float, *, seed: int = 1) -> list[StabilityRow]:
+    """Return the outcome of one size of an impairment of `SWEEPS` under a correction of `CHOICES`.
+
+    Draws depend on the seed and on their number alone: every method and size gets the same random numbers.
+    """
+    impairment, _, method = part.partition(".")
+    sweep = SWEEPS[impairment]
+    ideal = _undisturbed(sweep)
+    draws = [_draw(sweep, size, method, ideal, np.random.default_rng([seed, i])) for i in range(sweep.draws)]
+    measured = [one for one, _ in draws]
+    mean, spread = (_rounded(statistic(measured, axis=0)) for statistic in (np.mean, np.std))
+    width = _rounded(np.median(measured, axis=0))
+    chosen = [one for _, one in draws]
+    row = StabilityRow(
+        impairment=impairment,
+        unit=sweep.unit,
+        size=float(size),
+        method=method,
+        loss_spread_db=spread.loss_db,
+        **mean._replace(ground_width_m=width.ground_width_m, cross_width_m=width.cross_width_m)._asdict(),
+        chosen=max(sorted(set(chosen)), key=chosen.count),
+        draws=sweep.draws,
+        seed=seed,
+    )
+    return [row]
+
+
+class _Measured(NamedTuple):
+    loss_db: float
+    coherence_factor: float
+    ground_width_m: float
+    cross_width_m: float
+    floor_db: float
+    pulses_used: float
+
+
+def _rounded(values: Floats) -> _Measured:
+    return _Measured(*(round(float(value), 4) + 0.0 for value in values))
+
+
+class _Ideal(NamedTuple):
+    peaks: Floats
+    pixels_m: Floats
+    values: Complexes
+
+
+def _undisturbed(sweep: ImpairmentSweep) -> _Ideal:
+    """Return the peaks, and the image at random pixels, of the scene with nothing wrong."""
+    scene = sweep.flown(0.0)
+    tables = point_response.undisturbed_tables(scene)
+    pixels = point_response.random_pixels(np.random.default_rng(0))
+    peaks = find_peaks(tables, scene.scatterers.position_m, reach_m=_REACH_M)[1]
+    return _Ideal(peaks, pixels, mean_image(tables, pixels))
+
+
+def _draw(
+    sweep: ImpairmentSweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
+) -> tuple[_Measured, str]:
+    """Return what is measured of one draw, and the method applied."""
+    flown = sweep.flown(size)
+    radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
+    logged = sweep.logged(flown, size, generator)
+    kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
+    if not kept.any():
+        return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
+    history = point_response.phase_history(logged, transfer, divided=chosen != "none", pulses=kept)
+    return _measured(history, ideal, float(kept.mean()), flown.scatterers.position_m), chosen
+
+
+def correct(
+    method: str, radar: Complexes, sidelink: Complexes, recorded: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], Complexes, str]:
+    """Return which pulses are kept, their corrected transfer functions, and the method applied.
+
+    Pulses whose sidelink does not lock are dropped, as the pipeline drops them.
+
+    Parameters
+    ----------
+    method
+        One of `CHOICES`.
+    radar, sidelink
+        (pulse, subcarrier) complex64.
+    recorded
+        (pulse,) bool.
+    """
+    if method == "none":
+        return recorded, radar[recorded], "none"
+    kept = recorded.copy()
+    chosen = method
+    if method == "auto":
+        try:
+            state = measure(sidelink[recorded])
+        except CampaignError:
+            return np.zeros_like(kept), radar[:0], "refused"
+        chosen, _ = choose(state)
+        kept[recorded] = state.locked
+    else:
+        kept[recorded] = fit_line_of_sight(sidelink[recorded]).locked
+    if not kept.any():
+        return kept, radar[:0], "refused"
+    return kept, METHODS[chosen](radar[kept], sidelink[kept]), chosen
+
+
+def _measured(history: PhaseHistory, ideal: _Ideal, used: float, targets_m: Floats) -> _Measured:
+    tables = point_response.range_tables(history, targets_m)
+    positions, peaks = find_peaks(tables, targets_m, reach_m=_REACH_M)
+    gain_db = point_response.amplitude_db(peaks / ideal.peaks)
+    floor_db = point_response.error_floor_db(mean_image(tables, ideal.pixels_m), ideal.values, peaks)
+    widths_m = point_response.half_power_widths(lambda pixels: mean_image(tables, pixels), positions[2])
+    coherence = float(point_response.coherence_factors(history, positions).mean())
+    loss_db = float(np.clip(-gain_db, -REFUSED_DB, REFUSED_DB).mean())
+    return _Measured(loss_db, coherence, *widths_m, floor_db, used)

@@ -1,1 +1,0 @@
-"""Charts of speed, accuracy and stability, and the claims of the source paper."""

@@ -1,0 +1,224 @@
+"""Paths of echoes and transfer functions of point scatterers, for simulations, studies, benchmarks and tests.
+
+The exact sum costs one matrix product per pulse; for thousands of scatterers there is a gridded one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+from apertura.simulation.scene import Scatterers
+
+_BLOCK = 64  # subcarriers that share one exponential
+_TERMS = 2**22  # exponentials at once in the exact sum
+_SAMPLES = 2**20  # of range at once in the gridded one
+
+
+def transfer(
+    scatterers: Scatterers,
+    aperture: Aperture,
+    frequency_hz: Floats,
+    *,
+    longer_m: Floats | None = None,
+    spreading: bool = True,
+    gridded: bool = False,
+) -> NDArray[np.complex64]:
+    """Return H_pn = Σ_j a_j/(R_t·R_r)·exp(-j2πf_n(R_t + R_r + x_p)/c), the echo of scatterers per pulse and subcarrier.
+
+    R_t and R_r are the distances of scatterer j from transmitter and receiver at pulse p.
+
+    Parameters
+    ----------
+    scatterers
+        Positions (scatterer, 3) in the frame of the aperture, metres, and complex amplitudes at 1 m × 1 m.
+    aperture
+        True phase centres, (pulse, 3) metres each; nothing moves within a pulse.
+    frequency_hz
+        (subcarrier,) float64, f_n at RF, equally spaced.
+    longer_m
+        (pulse,) float64, x_p, metres by which the paths of a pulse are longer than geometry; None: zero.
+    spreading
+        Divide by R_t·R_r; otherwise every scatterer is as strong at any distance.
+    gridded
+        Spread echoes over samples of range instead of summing exactly: fast for thousands of scatterers, right to 3e-6.
+
+    Returns
+    -------
+    ndarray
+        (pulse, subcarrier) complex64.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, eqs. 1 and 2.
+
+    Examples
+    --------
+    >>> point = Scatterers(np.array([[0.0, 3.0, 0.0]]), np.array([1.0 + 0j]))
+    >>> bistatic = Aperture(np.zeros((1, 3)), np.array([[4.0, 0.0, 0.0]]))
+    >>> abs(transfer(point, bistatic, 1e9 + 1e6 * np.arange(2))).round(4)  # 1 / (3 m × 5 m)
+    array([[0.0667, 0.0667]], dtype=float32)
+    """
+    longer = np.zeros(len(aperture)) if longer_m is None else longer_m
+    form = _gridded if gridded else _summed
+    out = np.empty((len(aperture), len(frequency_hz)), np.complex64)
+    at_once = _pulses_at_once(len(scatterers.amplitude), len(frequency_hz), gridded=gridded)
+    for first in range(0, len(out), at_once):
+        part = slice(first, first + at_once)
+        out[part] = form(scatterers, aperture[part], frequency_hz, longer[part], spreading=spreading)
+    return out
+
+
+def spectrum(delay_s: Floats, amplitude: NDArray[np.complex128], frequency_hz: Floats) -> NDArray[np.complex128]:
+    """Return Σ a·exp(-j2πf_nτ) over the last axis: (..., path) → (..., subcarrier) complex128.
+
+    Parameters
+    ----------
+    delay_s
+        (..., path) float64, τ, seconds.
+    amplitude
+        (..., path) complex128, a.
+    frequency_hz
+        (subcarrier,) float64, f_n at RF, equally spaced.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, eq. 2. The exponential of subcarrier n = 64i + j is the product of two small ones,
+    so that many points cost one matrix product.
+
+    Examples
+    --------
+    >>> np.angle(spectrum(np.array([0.25e-6]), np.array([1.0 + 0j]), 1e9 + 1e6 * np.arange(4))).round(3) + 0.0
+    array([ 0.   , -1.571, -3.142,  1.571])
+    """
+    count = len(frequency_hz)
+    spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
+    coarse, fine = frequency_hz[::_BLOCK], np.arange(_BLOCK) * spacing_hz
+    left = amplitude[..., None, :] * np.exp(-2j * np.pi * coarse[:, None] * delay_s[..., None, :])
+    right = np.exp(-2j * np.pi * fine * delay_s[..., :, None])
+    return np.asarray((left @ right).reshape(*delay_s.shape[:-1], -1)[..., :count])
+
+
+def _pulses_at_once(scatterers: int, subcarriers: int, *, gridded: bool) -> int:
+    if gridded:
+        return max(1, _SAMPLES // (2 * subcarriers))
+    return max(1, _TERMS // (max(scatterers, 1) * (_BLOCK + -(-subcarriers // _BLOCK))))
+
+
+def _summed(
+    scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
+) -> NDArray[np.complex128]:
+    there, back = (np.linalg.norm(leg[:, None] - scatterers.position_m, axis=-1) for leg in aperture.legs)
+    amplitude = np.broadcast_to(scatterers.amplitude / (there * back if spreading else 1.0), there.shape)
+    return spectrum((there + back + longer_m[:, None]) / SPEED_OF_LIGHT_M_S, amplitude, frequency_hz)
+
+
+def _gridded(
+    scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
+) -> NDArray[np.complex128]:
+    from apertura.simulation.gridding import gridded_sum  # numba is slow to import, and few scatterers need none of it
+
+    points = scatterers.position_m, scatterers.amplitude
+    return gridded_sum(points, aperture.legs, frequency_hz, longer_m, spreading=spreading)
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths from the transmitter to one receiving channel, each array (pulse, path).
+
+    Attributes
+    ----------
+    delay_s, delay_rate
+        float64, seconds at the pulse's start, and their growth in seconds per second; zero: stop and go.
+    amplitude
+        complex128.
+    """
+
+    delay_s: Floats
+    amplitude: NDArray[np.complex128]
+    delay_rate: Floats
+
+    def and_also(self, other: "Paths") -> "Paths":
+        """Return both sets together."""
+        both = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Paths(*(np.concatenate(pair, axis=1) for pair in both))
+
+    def at(self, pulses: slice | NDArray[np.intp]) -> "Paths":
+        """Return those of some pulses."""
+        return Paths(self.delay_s[pulses], self.amplitude[pulses], self.delay_rate[pulses])
+
+
+def echo_paths(
+    tx_position_m: Floats,
+    rx_position_m: Floats,
+    scatterers: Scatterers,
+    *,
+    path_offset_m: float = 0.0,
+    tx_velocity_m_s: Floats | float = 0.0,
+    rx_velocity_m_s: Floats | float = 0.0,
+) -> Paths:
+    """Return the echoes of scatterers: delay (R_tx + R_rx + offset)/c, amplitude a/(R_tx·R_rx).
+
+    Parameters
+    ----------
+    tx_position_m, rx_position_m
+        (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
+    path_offset_m
+        Electrical path of the receiving channel beyond geometry, metres.
+    tx_velocity_m_s, rx_velocity_m_s
+        (pulse, 3) float64, for Doppler within the pulse; zero without.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, eq. 1.
+
+    Examples
+    --------
+    >>> point = Scatterers(np.array([[0.0, 3.0, 0.0]]), np.array([1.0 + 0j]))
+    >>> paths = echo_paths(np.zeros((1, 3)), np.array([[4.0, 0.0, 0.0]]), point)
+    >>> paths.delay_s * 299792458, paths.amplitude.real.round(4)
+    (array([[8.]]), array([[0.0667]]))
+    """
+    tx_range, tx_rate = _range_and_rate(tx_position_m, tx_velocity_m_s, scatterers.position_m)
+    rx_range, rx_rate = _range_and_rate(rx_position_m, rx_velocity_m_s, scatterers.position_m)
+    return Paths(
+        (tx_range + rx_range + path_offset_m) / SPEED_OF_LIGHT_M_S,
+        scatterers.amplitude / (tx_range * rx_range),
+        (tx_rate + rx_rate) / SPEED_OF_LIGHT_M_S,
+    )
+
+
+def direct_path(
+    tx_position_m: Floats,
+    rx_position_m: Floats,
+    *,
+    path_offset_m: float = 0.0,
+    relative_velocity_m_s: Floats | float = 0.0,
+) -> Paths:
+    """Return the one path from antenna to antenna: delay (R + offset)/c, amplitude 1/R, level inside 1 m.
+
+    Parameters
+    ----------
+    tx_position_m, rx_position_m, path_offset_m
+        As for `echo_paths`.
+    relative_velocity_m_s
+        (pulse, 3) float64, transmitter's less receiver's velocity.
+
+    Examples
+    --------
+    >>> direct_path(np.zeros((1, 3)), np.array([[4.0, 0.0, 0.0]])).amplitude
+    array([[0.25+0.j]])
+    """
+    distance, rate = _range_and_rate(tx_position_m - rx_position_m, relative_velocity_m_s, np.zeros((1, 3)))
+    delay = (distance + path_offset_m) / SPEED_OF_LIGHT_M_S
+    return Paths(delay, 1 / np.maximum(distance, 1.0).astype(np.complex128), rate / SPEED_OF_LIGHT_M_S)
+
+
+def _range_and_rate(antenna_m: Floats, velocity_m_s: Floats | float, points_m: Floats) -> tuple[Floats, Floats]:
+    sight = antenna_m[:, None, :] - points_m[None, :, :]
+    distance = np.sqrt(np.einsum("pki,pki->pk", sight, sight))
+    velocity = np.broadcast_to(np.asarray(velocity_m_s, np.float64), antenna_m.shape)
+    return distance, np.einsum("pki,pi->pk", sight, velocity) / np.maximum(distance, 1e-9)

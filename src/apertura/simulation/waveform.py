@@ -1,0 +1,371 @@
+"""What is transmitted: OFDM symbols and pulses given by their samples, and the sections that specify them."""
+
+from dataclasses import dataclass as plain_dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic.dataclasses import dataclass
+from scipy import fft
+
+from apertura.common.arrays import Floats
+from apertura.simulation.impairments import STRICT_KEYS
+
+
+@plain_dataclass(frozen=True)
+class TransmitWaveform:
+    """One OFDM symbol per pulse: s(t) = Σ c_n exp(j2πnΔf(t − T_cp)) for 0 ≤ t < T_cp + T.
+
+    Attributes
+    ----------
+    codes
+        (subcarrier,) complex128, c_n.
+    carrier_hz
+        RF frequency of subcarrier n = 0, which is baseband zero.
+    carrier_is
+        n = 0…N−1 (`band_start`) or −N/2…N/2−1 (`band_centre`).
+    subcarrier_spacing_hz, symbol_s, cyclic_prefix_s, sample_rate_hz
+        Δf, T, T_cp and f_s.
+
+    Examples
+    --------
+    >>> paper = TransmitWaveform(np.ones(4096), 1.2e9, "band_start", 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0)
+    >>> paper.dft_samples, paper.prefix_samples, paper.capture_samples
+    (10240, 3200, 16000)
+    """
+
+    codes: NDArray[np.complex128]
+    carrier_hz: float
+    carrier_is: Literal["band_start", "band_centre"]
+    subcarrier_spacing_hz: float
+    symbol_s: float
+    cyclic_prefix_s: float
+    sample_rate_hz: float
+    prf_hz: float
+
+    @property
+    def first_subcarrier(self) -> int:
+        """The smallest n."""
+        return 0 if self.carrier_is == "band_start" else -(len(self.codes) // 2)
+
+    @property
+    def baseband_hz(self) -> Floats:
+        """(subcarrier,) float64, nΔf."""
+        return np.asarray((self.first_subcarrier + np.arange(len(self.codes))) * self.subcarrier_spacing_hz, np.float64)
+
+    @property
+    def frequency_hz(self) -> Floats:
+        """(subcarrier,) float64, RF frequency."""
+        return self.carrier_hz + self.baseband_hz
+
+    @property
+    def duration_s(self) -> float:
+        """T_cp + T."""
+        return self.cyclic_prefix_s + self.symbol_s
+
+    @property
+    def dft_samples(self) -> int:
+        """Samples of one period 1/Δf."""
+        return round(self.sample_rate_hz / self.subcarrier_spacing_hz)
+
+    @property
+    def prefix_samples(self) -> int:
+        """Samples of the cyclic prefix."""
+        return round(self.cyclic_prefix_s * self.sample_rate_hz)
+
+    @property
+    def capture_samples(self) -> int:
+        """Samples of a triggered capture: prefix and symbol."""
+        return round(self.duration_s * self.sample_rate_hz)
+
+    @property
+    def mean_power(self) -> float:
+        """E|s|² of codes of unit modulus."""
+        return float(len(self.codes))
+
+    @property
+    def noise_at_unit_snr(self) -> float:
+        """E|n|² of samples whose noise in one bin of the DFT equals an echo of amplitude 1."""
+        return float(self.dft_samples)
+
+    @property
+    def sent(self) -> tuple[str, NDArray[np.complex64]]:
+        """Name and content of the file of what was sent."""
+        return "codes.npy", self.codes.astype(np.complex64)
+
+    def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the samples of a capture between which paths are present, (path,) each.
+
+        Parameters
+        ----------
+        arrival
+            (path,) float64, when the pulse arrives, in samples of the capture, ascending.
+        rate_hz
+            At which the receiver samples.
+        """
+        # from its first sample up to, not including, its end; a millionth of a sample is rounding
+        first, end = (np.ceil(arrival + extra - 1e-6).astype(int) for extra in (0.0, self.duration_s * rate_hz))
+        return first, end
+
+
+def qpsk_codes(count: int, generator: Generator) -> NDArray[np.complex128]:
+    """Return `count` random QPSK code symbols of unit modulus.
+
+    Examples
+    --------
+    >>> abs(qpsk_codes(3, np.random.default_rng(0))).round(12)
+    array([1., 1., 1.])
+    """
+    return np.asarray(np.exp(1j * np.pi * (generator.integers(0, 4, count) / 2 + 0.25)))
+
+
+def newman_codes(count: int) -> NDArray[np.complex128]:
+    """Return the quadratic-phase code exp(jπn²/N), whose symbol is nearly as flat in time as a chirp.
+
+    Notes
+    -----
+    Source: S. Boyd, "Multitone signals with low crest factor", IEEE Trans. Circuits Syst. 33 (1986).
+    """
+    return np.asarray(np.exp(1j * np.pi * np.arange(count) ** 2 / count))
+
+
+Complex = NDArray[np.complex128]
+_NEVER = 1 << 40  # samples, beyond any capture
+PulseName = Literal["chirp", "pn", "golay"]
+
+
+def pulse_samples(name: PulseName, *, bandwidth_hz: float, pulse_s: float, sample_rate_hz: float) -> Complex:
+    """Return the samples of a pulse of unit modulus, (sample,) complex128.
+
+    Parameters
+    ----------
+    name
+        chirp: a linear sweep over the bandwidth. pn, golay: chips of ±1 at the rate of the bandwidth, a maximum-length
+        sequence of 2^k - 1 or one of a complementary pair of 2^k, the longest that fits.
+    bandwidth_hz
+        Of codes: one of its whole parts is the sample rate's, so that chips are whole samples.
+    pulse_s
+        How long it lasts, at most.
+    sample_rate_hz
+        Complex samples per second.
+
+    Raises
+    ------
+    ValueError
+        If chips are no whole samples, or fewer than three fit.
+
+    Notes
+    -----
+    Source: M. J. E. Golay, "Complementary series", IRE Trans. Inf. Theory 7 (1961).
+
+    Examples
+    --------
+    >>> pulse_samples("golay", bandwidth_hz=1e6, pulse_s=9e-6, sample_rate_hz=1e6).real
+    array([ 1.,  1.,  1., -1.,  1.,  1., -1.,  1.])
+    """
+    count = round(pulse_s * sample_rate_hz)
+    if name == "chirp":
+        time_s = (np.arange(count) - (count - 1) / 2) / sample_rate_hz
+        return np.asarray(np.exp(1j * np.pi * bandwidth_hz / pulse_s * time_s**2))
+    repeat = sample_rate_hz / bandwidth_hz
+    chips = count // max(1, round(repeat))
+    if abs(repeat - round(repeat)) > 1e-6 or repeat < 0.5 or chips < 3:
+        raise ValueError(f"{chips} chips of {repeat:g} samples: at least 3, of whole samples each, are needed")
+    code = _maximum_length(int(np.log2(chips + 1))) if name == "pn" else _golay(int(np.log2(chips)))
+    return np.repeat(code, round(repeat)).astype(np.complex128)
+
+
+def _maximum_length(bits: int) -> Floats:
+    from scipy.signal import max_len_seq  # slow to import
+
+    return np.asarray(1.0 - 2.0 * max_len_seq(bits)[0])
+
+
+def _golay(doublings: int) -> Floats:
+    one, other = np.ones(1), np.ones(1)
+    for _ in range(doublings):
+        one, other = np.concatenate([one, other]), np.concatenate([one, -other])
+    return one
+
+
+@plain_dataclass(frozen=True)
+class TransmitPulse(TransmitWaveform):
+    """A pulse that is sent once, as the tones of a period so long that a capture hears nothing of its repetition.
+
+    Attributes
+    ----------
+    pulse
+        (sample,) complex128.
+    lead_s, listen_s
+        How long a capture begins before the pulse, and the longest delay whose echo it holds whole.
+    band_hz
+        Baseband frequencies that it is demodulated at.
+
+    Notes
+    -----
+    Source: docs/theory/waveforms.md, "Simulated".
+    """
+
+    pulse: Complex
+    lead_s: float
+    listen_s: float
+    band_hz: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls,
+        pulse: Complex,
+        *,
+        carrier_hz: float,
+        sample_rate_hz: float,
+        prf_hz: float,
+        lead_s: float,
+        listen_s: float,
+        band_hz: tuple[float, float],
+    ) -> "TransmitPulse":
+        """Return the pulse as tones c_k = S_k/M, which begin `lead_s` after the capture."""
+        kept = round((lead_s + listen_s) * sample_rate_hz) + len(pulse)
+        # twice over: what a fractional delay leaves around the edges of a pulse has faded before it comes again
+        period = int(fft.next_fast_len(2 * (kept + len(pulse)) // 2)) * 2
+        numbers = np.arange(period) - period // 2
+        codes = np.roll(fft.fft(pulse, period, norm="forward"), period // 2)
+        codes = codes * np.exp(-2j * np.pi * numbers * lead_s * sample_rate_hz / period)
+        spacing_hz = sample_rate_hz / period
+        tones = codes, carrier_hz, "band_centre", spacing_hz, 1 / spacing_hz, 0.0, sample_rate_hz, prf_hz
+        return cls(*tones, pulse, lead_s, listen_s, band_hz)  # type: ignore[arg-type]
+
+    @property
+    def capture_samples(self) -> int:
+        """Samples of a triggered capture: what goes before the pulse, the pulse, and its longest delay."""
+        return round((self.lead_s + self.listen_s) * self.sample_rate_hz) + len(self.pulse)
+
+    @property
+    def mean_power(self) -> float:
+        """E|s|² while the pulse lasts."""
+        return float(np.mean(np.abs(self.pulse) ** 2))
+
+    @property
+    def noise_at_unit_snr(self) -> float:
+        """E|n|² of samples whose noise equals an echo of amplitude 1 in a bin of the band, on average."""
+        length = self.capture_samples
+        number = fft.fftfreq(length, 1 / self.sample_rate_hz)
+        inside = (number >= self.band_hz[0]) & (number <= self.band_hz[1])
+        return float(np.mean(np.abs(fft.fft(self.pulse, length)[inside]) ** 2) / length)
+
+    @property
+    def sent(self) -> tuple[str, NDArray[np.complex64]]:
+        """Name and content of the file of what was sent."""
+        return "pulse.npy", self.pulse.astype(np.complex64)
+
+    def presence(self, arrival: Floats, rate_hz: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the samples of a capture between which paths are present: all, or none where it hears nothing.
+
+        The edges of a pulse are in its tones; what a fractional delay leaves beyond them is received, too.
+        """
+        lead = self.lead_s * rate_hz
+        early, late = arrival < -lead - len(self.pulse), arrival >= self.capture_samples - lead
+        return np.where(early, -1, np.where(late, _NEVER, 0)), np.where(early, -1, _NEVER)
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class WaveformSpecification:
+    """One OFDM symbol per pulse; docs/theory/simulate.md, eq. 3."""
+
+    subcarriers: int = Field(gt=1, description="number of subcarriers N")
+    carrier_hz: float = Field(gt=0, description="RF frequency of subcarrier n = 0, Hz")
+    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz")
+    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s")
+    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s")
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
+    carrier_is: Literal["band_start", "band_centre"] = Field(
+        default="band_start", description="n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+    )
+    code: Literal["qpsk", "newman"] = Field(default="qpsk", description="random QPSK, or Newman's flat symbol")
+    kind: Literal["ofdm"] = Field(default="ofdm", kw_only=True, repr=False)
+
+    @model_validator(mode="after")
+    def _dft_fits(self) -> Self:
+        length = self.sample_rate_hz / self.subcarrier_spacing_hz
+        if abs(length - round(length)) > 1e-6 * length or self.subcarriers > round(length):
+            raise ValueError(
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f}, the DFT length, must be an integer "
+                f"not below subcarriers={self.subcarriers}"
+            )
+        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
+            raise ValueError(f"symbol_s={self.symbol_s:g} is shorter than 1/subcarrier_spacing_hz")
+        return self
+
+    def drawn(self, generator: Generator) -> TransmitWaveform:
+        """Return the waveform with its code symbols."""
+        codes = qpsk_codes(self.subcarriers, generator) if self.code == "qpsk" else newman_codes(self.subcarriers)
+        sent = {name: value for name, value in vars(self).items() if name not in {"subcarriers", "code", "kind"}}
+        return TransmitWaveform(codes, **sent)
+
+    def section(self, _: TransmitWaveform) -> dict[str, Any]:
+        """Return the section `waveform` of the config."""
+        stated = {name: value for name, value in vars(self).items() if name not in {"code", "kind"}}
+        return {"kind": self.kind, "codes": "raw/codes.npy", **stated}
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
+class PulseSpecification:
+    """A pulse that is sent once per trigger; docs/theory/waveforms.md, "Simulated"."""
+
+    pulse: PulseName = Field(description="chirp, pn (maximum-length sequence) or golay")
+    carrier_hz: float = Field(gt=0, description="RF frequency of baseband zero, the middle of the pulse's band, Hz")
+    bandwidth_hz: float = Field(gt=0, description="swept by the chirp, or rate of the chips, Hz")
+    pulse_s: float = Field(gt=0, description="how long it lasts, at most, s")
+    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds whole, s")
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz")
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz")
+    lead_s: float = Field(default=0.0, ge=0, description="how long before the pulse captures begin, s")
+    band_hz: tuple[float, float] | None = Field(default=None, description="as in the config; null: ±bandwidth_hz/2")
+    filter: Literal["auto", "inverse", "matched"] = Field(default="auto", description="as in the config")
+    kind: Literal["samples"] = Field(default="samples", kw_only=True, repr=False)
+
+    @model_validator(mode="after")
+    def _can_be_sampled(self) -> Self:
+        if self.bandwidth_hz > self.sample_rate_hz:
+            raise ValueError(f"bandwidth_hz={self.bandwidth_hz:g} is beyond sample_rate_hz={self.sample_rate_hz:g}")
+        self._sampled()
+        return self
+
+    def _sampled(self) -> NDArray[np.complex128]:
+        sizes = {name: getattr(self, name) for name in ("bandwidth_hz", "pulse_s", "sample_rate_hz")}
+        return pulse_samples(self.pulse, **sizes)
+
+    def drawn(self, _: Generator) -> TransmitPulse:
+        """Return the pulse; nothing of it is random."""
+        half = self.bandwidth_hz / 2
+        names = ("carrier_hz", "sample_rate_hz", "prf_hz", "lead_s", "listen_s")
+        stated = {name: getattr(self, name) for name in names}
+        return TransmitPulse.of(self._sampled(), **stated, band_hz=self.band_hz or (-half, half))
+
+    def section(self, sent: TransmitWaveform) -> dict[str, Any]:
+        """Return the section `waveform` of the config, for the pulse as it was drawn."""
+        if not isinstance(sent, TransmitPulse):
+            raise TypeError("drawn from another specification")
+        names = ("carrier_hz", "sample_rate_hz", "prf_hz", "lead_s", "listen_s", "filter")
+        stated = {name: getattr(self, name) for name in names}
+        pulse_s = len(sent.pulse) / self.sample_rate_hz
+        return {
+            "kind": self.kind,
+            "pulse": "raw/pulse.npy",
+            "pulse_s": pulse_s,
+            "band_hz": list(sent.band_hz),
+            **stated,
+        }
+
+
+def _with_kind(value: Any) -> Any:
+    """Return what a document says of a waveform, with the kind that it is of where it does not say."""
+    return {"kind": "ofdm", **value} if isinstance(value, dict) else value
+
+
+TransmittedSpecification = Annotated[
+    Annotated[WaveformSpecification | PulseSpecification, Field(discriminator="kind")], BeforeValidator(_with_kind)
+]
+"""By `kind`; an OFDM symbol where a specification does not say."""
