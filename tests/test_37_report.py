@@ -21,12 +21,12 @@ from apertura.views.report.image_drawings import (
     Measured,
     draw_budget,
     draw_cuts,
-    draw_panels,
     draw_phase,
     sidelink_error_rad,
     steadiness,
 )
 from apertura.views.report.page import Heading, Paragraph, Picture, Table, page, rst_table, rst_text
+from apertura.views.report.panels import draw_panels
 
 HOSTILE = """`a <javascript:alert(1)>`_ |b| *c* {{ 7 * 7 }} <script>alert("1")</script> $\\frac{x$ ../../etc &amp; it's
 .. raw:: html

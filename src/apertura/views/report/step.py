@@ -32,9 +32,9 @@ from apertura.views.image_report import (
     verdict_row,
 )
 from apertura.views.report import PAGE, PANELS, PICTURES
-from apertura.views.report.image_drawings import draw_panels
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
+from apertura.views.report.panels import draw_panels
 
 ASKED = ("key", "value")
 """Headings of what was asked."""
