@@ -18,7 +18,9 @@ import yaml
 from folders import SHARED, copy_writable
 from matplotlib import image
 
-from apertura.core.echo.dechirp import FrequencySweep
+from apertura.core.echo.dechirp import Sweep
+from apertura.formats.tracks.track import make_track
+from apertura.pipeline.examination.facts import log_facts
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.views.inspect.look import inspect_path, look
 from apertura.views.inspect.pictures import draw_history
@@ -204,6 +206,18 @@ def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(s
     (root / "config/clocks.tsv").unlink()
     assert "apertura align" in look(raw / f"{node}.out").missing[0]
     assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
+
+
+def test_an_axis_without_a_stated_deviation_is_not_known(tmp_path):
+    track = make_track(
+        np.datetime64("2025-05-14T09:30", "ns") + np.arange(3) * np.timedelta64(1, "s"),
+        np.array([[48.0, 11.0, 500.0]] * 3),
+        position_std_m=np.array([[0.01, 0.02, np.nan]] * 3),
+        node="uav1",
+        where=tmp_path / "x.csv",
+    )
+    assert log_facts(track).stated_std_m == (0.01, 0.02, None)
+    assert log_facts(track.drop_vars("position_std")).stated_std_m is None
 
 
 def test_the_offset_of_a_recorders_clock_is_applied_once(tiny):

@@ -98,10 +98,10 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
     """Print the problems of a campaign folder, one line each; return how many there are."""
-    found = problems(root, without=without)
-    for problem in found:
+    wrong = problems(root, without=without)
+    for problem in wrong:
         print(as_typed(as_line(problem)), file=stream or sys.stdout)
-    return len(found)
+    return len(wrong)
 
 
 def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
@@ -116,10 +116,10 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     paranoid
         Read every input again, also those that have not changed since they were hashed.
     """
-    found = print_problems(root)
+    count = print_problems(root)
     campaign, _ = load(Path(root))
-    if campaign is None or found:
-        return found
+    if campaign is None or count:
+        return count
     from apertura.pipeline.check.stale import damaged_results, stale_lines, stale_results
 
     lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))

@@ -60,7 +60,7 @@ class Examination:
 
     @property
     def transmitted_problems(self) -> list[CampaignError]:
-        """What is wrong with the file."""
+        """What is wrong with the file of what was transmitted."""
         return self._transmitted[1]
 
     @cached_property
@@ -85,12 +85,12 @@ class Examination:
 
     @cached_property
     def recorded(self) -> dict[Key, RecordingFacts]:
-        """What their headers say."""
+        """What the headers of these recordings say."""
         return {key: recording_facts(recording) for key, recording in self.recordings.items()}
 
     @property
     def recording_problems(self) -> list[CampaignError]:
-        """Why the others cannot be opened."""
+        """Why other recordings cannot be opened."""
         return self._recordings[1]
 
     @property
@@ -98,9 +98,14 @@ class Examination:
         """Flight logs that can be read, as `track` stages."""
         return self._tracks[0]
 
+    @cached_property
+    def logs(self) -> dict[Key, LogFacts]:
+        """What these logs hold."""
+        return {key: log_facts(track) for key, track in self.tracks.items()}
+
     @property
     def track_problems(self) -> list[CampaignError]:
-        """Why the others cannot be opened."""
+        """Why other logs cannot be read."""
         return self._tracks[1]
 
     @cached_property
@@ -163,11 +168,6 @@ class Examination:
                 problems.append(problem)
         return opened, problems
 
-    @cached_property
-    def logs(self) -> dict[Key, LogFacts]:
-        """What each of them holds."""
-        return {key: log_facts(track) for key, track in self.tracks.items()}
-
     @property
     def frame(self) -> str:
         """What positions are in, ecef or local; empty where only the samples say."""
@@ -225,7 +225,7 @@ class Examination:
 
     @property
     def ground_problems(self) -> list[CampaignError]:
-        """Why it cannot be opened."""
+        """Why the ground cannot be opened."""
         return self._ground[1]
 
     @property

@@ -66,7 +66,8 @@ class LogFacts:
     median_speed_m_s, largest_speed_m_s
         Between epochs, metres per second.
     stated_std_m
-        Median standard deviation to north, east and up, metres, as the log states it; None where it does not.
+        Median standard deviation to north, east and up, metres, as the log states it; None of an axis, or of all,
+        where it does not.
     remarks
         What a person should know of how it was read.
     """
@@ -83,7 +84,7 @@ class LogFacts:
     length_m: float
     median_speed_m_s: float
     largest_speed_m_s: float
-    stated_std_m: tuple[float, ...] | None
+    stated_std_m: tuple[float | None, ...] | None
     remarks: tuple[str, ...]
 
 
@@ -94,9 +95,6 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
     speed_m_s = steps_m / np.diff(seconds(times))
     logged = np.isfinite(track.attitude.values)
     places = geodetic_from_ecef(position) if frame == "ecef" else position
-    stated = None
-    if "position_std" in track and np.isfinite(track.position_std.values).any():
-        stated = tuple(float(value) for value in np.nanmedian(track.position_std.values, axis=0))
     return LogFacts(
         times=time_facts(times, longer=LONG_GAP),
         dropped={why: int(count) for why, count in track.attrs["dropped"].items()},
@@ -110,9 +108,16 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
         length_m=float(steps_m.sum()),
         median_speed_m_s=float(np.median(speed_m_s)),
         largest_speed_m_s=float(speed_m_s.max()),
-        stated_std_m=stated,
+        stated_std_m=_stated_std_m(track),
         remarks=tuple(track.attrs.get("remarks", ())),
     )
+
+
+def _stated_std_m(track: "xr.Dataset") -> tuple[float | None, ...] | None:
+    if "position_std" not in track:
+        return None
+    known = [axis[np.isfinite(axis)] for axis in track.position_std.values.T]
+    return tuple(float(np.median(axis)) if axis.size else None for axis in known) if any(map(len, known)) else None
 
 
 def log_faults(track: "xr.Dataset") -> CheckedTrack:
