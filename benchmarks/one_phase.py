@@ -11,8 +11,8 @@ from statistics import median
 from time import process_time
 
 import numpy as np
-from apertura_research.autofocus.cases import AREA_M, GRID, PROBES_M, Case, case
-from apertura_research.autofocus.outcomes import UNCORRECTED, Peaks, image_seconds, peaks
+from apertura_research.autofocus.cases import AREA_M, GRID, PROBES_M, AutofocusCase, case
+from apertura_research.autofocus.outcomes import UNCORRECTED, PointPeaks, image_seconds, peaks
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -67,7 +67,7 @@ def main() -> None:
     Console(width=170).print(table)
 
 
-def _case(key: Key) -> tuple[Case, SpaceVariance]:
+def _case(key: Key) -> tuple[AutofocusCase, SpaceVariance]:
     scene, flight, pair, size_cm, snr_db, seed = key
     one = case(scene, flight, pair, float(size_cm) / 100, float(snr_db), int(seed))
     sighting = one.sightings[0]
@@ -78,7 +78,7 @@ def _case(key: Key) -> tuple[Case, SpaceVariance]:
     return one, space_variance(paths, CORNERS_M, [one.errors[node] for node in dict.fromkeys(sighting.nodes)])
 
 
-def _outcomes(one: Case) -> Iterator[tuple[str, Outcome]]:
+def _outcomes(one: AutofocusCase) -> Iterator[tuple[str, Outcome]]:
     image_s = image_seconds(one.sightings[0])
     true, before = (peaks(one.probes, tracks, PROBES_M, one.reach_m) for tracks in (one.truth, UNCORRECTED))
     for method in (*METHODS, "tracks"):
@@ -93,7 +93,7 @@ def _outcomes(one: Case) -> Iterator[tuple[str, Outcome]]:
         )
 
 
-def _found(one: Case, method: str) -> Refinement:
+def _found(one: AutofocusCase, method: str) -> Refinement:
     """Return what a method makes of a case, from its search for points on."""
     if method == "tracks":
         return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
@@ -101,13 +101,13 @@ def _found(one: Case, method: str) -> Refinement:
     return refine_one_phase(one.sightings, found, one.errors, method=method)
 
 
-def _outcome(found: Refinement, true: Peaks, before: Peaks, after: Peaks, images: float) -> Outcome:
+def _outcome(found: Refinement, true: PointPeaks, before: PointPeaks, after: PointPeaks, images: float) -> Outcome:
     before_db, after_db = (20 * np.log10(each.height / true.height) for each in (before, after))
     gain_db = float(found.report.get("gain_held_out_db", np.nan))
     return Outcome(before_db, after_db, _off_cm(true, before), _off_cm(true, after), gain_db, found.accepted, images)
 
 
-def _off_cm(true: Peaks, now: Peaks) -> float:
+def _off_cm(true: PointPeaks, now: PointPeaks) -> float:
     return 100 * float(np.median(np.linalg.norm(now.place_m - true.place_m, axis=-1)))
 
 

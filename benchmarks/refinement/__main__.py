@@ -16,7 +16,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from apertura_research.autofocus.cases import GRID, Case, case
+from apertura_research.autofocus.cases import GRID, AutofocusCase, case
 from apertura_research.autofocus.outcomes import UNCORRECTED, image_seconds, judge
 
 from apertura.core.scene.terrain import FlatGround
@@ -29,12 +29,12 @@ Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")
 
 
-def refined(one: Case) -> Refinement:
+def refined(one: AutofocusCase) -> Refinement:
     """Return what the product makes of a case."""
     return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
 
 
-def by_speckle(one: Case) -> Refinement:
+def by_speckle(one: AutofocusCase) -> Refinement:
     """Return what ground without points tells."""
     lasting_s = min(errors.correlation_s for errors in one.errors.values())
     time_s = one.sightings[0].time_s
@@ -45,17 +45,17 @@ def by_speckle(one: Case) -> Refinement:
     return refined_by_speckle(SpeckleTiles.of(pairs, found), prior, knots_s)
 
 
-def left(_: Case) -> Refinement:
+def left(_: AutofocusCase) -> Refinement:
     """Return the logs as they are."""
     return Refinement(UNCORRECTED, {}, accepted=False, why="left as it is")
 
 
-def told(one: Case) -> Refinement:
+def told(one: AutofocusCase) -> Refinement:
     """Return the true tracks."""
     return Refinement(one.truth, {}, accepted=True, why="the truth")
 
 
-ATTEMPTS: Mapping[str, Callable[[Case], Refinement]] = {
+ATTEMPTS: Mapping[str, Callable[[AutofocusCase], Refinement]] = {
     "refine": refined,
     "speckle": by_speckle,
     "none": left,
@@ -73,7 +73,7 @@ def keys(asked: str) -> Iterator[Key]:
     yield from product(*(part.split(",") for part in parts), drawn)
 
 
-def row(key: Key, attempt: Callable[[Case], Refinement], *, drift_m: float) -> dict[str, Any]:
+def row(key: Key, attempt: Callable[[AutofocusCase], Refinement], *, drift_m: float) -> dict[str, Any]:
     """Return one row of the table: loss and shift before and after, accepted or not, and what it cost."""
     scene, geometry, pairs, sigma_cm, snr_db, seed = key
     one = case(scene, geometry, pairs, float(sigma_cm) / 100, float(snr_db), int(seed), drift_m=drift_m)

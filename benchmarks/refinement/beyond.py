@@ -14,7 +14,7 @@ from apertura_research.autofocus.cases import (
     PAIRS,
     PROBES_M,
     SCENES,
-    Case,
+    AutofocusCase,
     TargetScene,
     drawn_errors,
     sighting,
@@ -37,7 +37,7 @@ OTHERS = {
 """What else is wrong → arm of the first node, metres to the right of its course; height, metres; drift stated."""
 
 
-def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> Case:
+def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
     """Return a case whose first node's antenna is off to its right, and whose ground lies higher than is taken."""
     of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
     flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
@@ -52,7 +52,7 @@ def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed
     lifted = dataclasses.replace(scatterers, position_m=scatterers.position_m + [0, 0, height_m])
     probes = TargetScene(PROBES_M + [0, 0, height_m], np.ones(len(PROBES_M), complex), np.arange(len(PROBES_M)))
     noises = of_noise.spawn(2)
-    return Case(
+    return AutofocusCase(
         ("forty", flight_name, "joint", SIGMA_M, 10.0, seed),
         tuple(
             sighting(pair, flight, truth, lifted, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)

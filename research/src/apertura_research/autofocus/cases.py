@@ -210,7 +210,7 @@ PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class AutofocusCase:
     """What a refinement is given, and what it is judged by.
 
     Attributes
@@ -242,7 +242,7 @@ class Case:
 
 def case(
     scene: str, geometry: str, pairs: str, sigma_m: float, snr_db: float | None, seed: int, *, drift_m: float = 0.0
-) -> Case:
+) -> AutofocusCase:
     """Return a case; tracks, scene and noise of a seed are drawn apart, so that each stays when another is changed.
 
     Parameters
@@ -264,7 +264,7 @@ def case(
     truth = TrackCorrection(flight.time_s, {node: drawn_errors(flight.time_s, errors, one) for node, one in streams})
     probes = _probes(of_probes)
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
-    return Case(
+    return AutofocusCase(
         (scene, geometry, pairs, sigma_m, snr_db, seed),
         tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
         dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),

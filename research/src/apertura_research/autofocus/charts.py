@@ -16,7 +16,7 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.autofocus.inputs import Refinement, Sighting
 from apertura.views.chart.png import save_png
-from apertura_research.autofocus.cases import GRID, NODES, Case
+from apertura_research.autofocus.cases import GRID, NODES, AutofocusCase
 from apertura_research.autofocus.outcomes import (
     ACCEPTED,
     FLAGGED,
@@ -159,7 +159,7 @@ def _named(result: Refinement) -> str:
     return "refined tracks" if result.accepted else "refused: the logs stay"
 
 
-def _title(one: Case, result: Refinement) -> str:
+def _title(one: AutofocusCase, result: Refinement) -> str:
     row = outcome_of(one, result)
     flags = f"flags: {row.flags.replace(' ', ', ')}" if row.flags else "no flag"
     head = (
@@ -170,7 +170,7 @@ def _title(one: Case, result: Refinement) -> str:
 
 
 def _draw_images(
-    figure: Figure, panels: Mapping[str, Axes], one: Case, tracks: Mapping[str, TrackCorrection]
+    figure: Figure, panels: Mapping[str, Axes], one: AutofocusCase, tracks: Mapping[str, TrackCorrection]
 ) -> Floats:
     """Draw the first pair's images from each of some tracks, the last the true ones, and return what is looked at."""
     true = image(one, one.truth, GRID)
@@ -188,7 +188,7 @@ def _draw_images(
     return place_m
 
 
-def image(one: Case, correction: TrackCorrection, grid: SceneGrid) -> Floats:
+def image(one: AutofocusCase, correction: TrackCorrection, grid: SceneGrid) -> Floats:
     """Return (row, column), magnitude: the first pair's image from corrected tracks."""
     return np.asarray(np.abs(native.form(native.prepare(one.sightings[0].moved(correction)), grid.positions(0.0))))
 
@@ -212,7 +212,7 @@ def _draw_image(axes: Axes, magnitude: Floats, grid: SceneGrid) -> AxesImage:
     return axes.imshow(levels, cmap="magma", vmin=-DEPTH_DB, vmax=0, extent=(west, east, south, north))
 
 
-def _draw_errors(axes: Axes, one: Case, used: TrackCorrection, number: int) -> None:
+def _draw_errors(axes: Axes, one: AutofocusCase, used: TrackCorrection, number: int) -> None:
     """Draw what logs are wrong by along one axis, and what is left of it as images are formed."""
     time_s = one.truth.time_s
     for node, colour in zip(NODES, _COLOURS, strict=True):
@@ -220,7 +220,7 @@ def _draw_errors(axes: Axes, one: Case, used: TrackCorrection, number: int) -> N
         _draw_pair(axes, time_s, (wrong, wrong - used.at(node, time_s)[:, number]), (node, colour))
 
 
-def _draw_paths(axes: Axes, one: Case, used: TrackCorrection, place_m: Floats) -> None:
+def _draw_paths(axes: Axes, one: AutofocusCase, used: TrackCorrection, place_m: Floats) -> None:
     """Draw by how much paths to a place are wrong, but for their mean: this is what blurs it."""
     for sighting, colour in zip(one.sightings, _COLOURS, strict=False):
         true, logged, now = (_path(sighting, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))

@@ -13,14 +13,14 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
 from apertura.methods.autofocus.refine import refine
-from apertura_research.autofocus.cases import GRID, PROBES_M, Case, case
+from apertura_research.autofocus.cases import GRID, PROBES_M, AutofocusCase, case
 
 UNCORRECTED = TrackCorrection(np.zeros(1), {})
 _SEARCHES = ((33, 25), (9, 9), (9, 9))  # places east and north of ever finer searches for a peak
 
 
 @dataclass(frozen=True, eq=False)
-class Peaks:
+class PointPeaks:
     """Peaks of points in the images of all pairs.
 
     Attributes
@@ -37,7 +37,7 @@ class Peaks:
 
 def peaks(
     sightings: Sequence[Sighting], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
-) -> Peaks:
+) -> PointPeaks:
     """Return the highest peaks within reach of points (point, 3) as imaged from corrected tracks."""
     by_pair = []
     for one in sightings:
@@ -45,7 +45,7 @@ def peaks(
         by_pair.append([_peak(tables, point, reach_m) for point in points_m])
     height = np.array([[peak for peak, _ in row] for row in by_pair]).reshape(len(sightings), len(points_m))
     place = np.array([[place for _, place in row] for row in by_pair]).reshape(*height.shape, 3)
-    return Peaks(height, place)
+    return PointPeaks(height, place)
 
 
 def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tuple[float, Floats]:
@@ -78,7 +78,7 @@ class Judgement:
     target_shift_cm: float
 
 
-def judge(one: Case, correction: TrackCorrection = UNCORRECTED) -> Judgement:
+def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> Judgement:
     """Return what a correction does to a case; that of the logs themselves by default.
 
     The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
@@ -91,7 +91,7 @@ def judge(one: Case, correction: TrackCorrection = UNCORRECTED) -> Judgement:
 
 
 def _against_truth(
-    one: Case, sightings: Sequence[Sighting], points_m: Floats, correction: TrackCorrection
+    one: AutofocusCase, sightings: Sequence[Sighting], points_m: Floats, correction: TrackCorrection
 ) -> tuple[Floats, Floats]:
     """Return loss (dB) and shift (cm) of points, (pair, point) float64 each."""
     true, now = (peaks(sightings, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
@@ -173,12 +173,12 @@ def run_case(scene: str, size_and_seed: tuple[float, int]) -> list[AutofocusRow]
     return [outcome_of(one, refine_case(one))]
 
 
-def case_of(scene: str, sigma_cm: float, seed: int) -> Case:
+def case_of(scene: str, sigma_cm: float, seed: int) -> AutofocusCase:
     """Return one case of the sweep."""
     return case(scene, "straight", "joint", sigma_cm / 100, SNR_DB, seed)
 
 
-def refine_case(one: Case) -> Refinement:
+def refine_case(one: AutofocusCase) -> Refinement:
     """Return what the product makes of a case whose errors are stated as they are."""
     return refine(one.sightings, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
 
@@ -188,7 +188,7 @@ def _stated(known: TrackErrors) -> TrackErrors:
     return replace(known, std_m=(east, north, up))
 
 
-def outcome_of(one: Case, result: Refinement) -> AutofocusRow:
+def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
     """Return what a refinement leaves of a case's loss, and the verdict on it."""
     before, after = (0.0 - judge(one, tracks).probe_loss_db for tracks in (UNCORRECTED, result.correction))
     return AutofocusRow(
