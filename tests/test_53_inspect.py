@@ -18,7 +18,7 @@ import yaml
 from folders import SHARED, copy_writable
 from matplotlib import image
 
-from apertura.core.echo.dechirp import Sweep
+from apertura.core.echo.dechirp import FrequencySweep
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.examination.facts import log_facts
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
