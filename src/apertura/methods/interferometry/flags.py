@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from apertura.common.flags.raised import Flags
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -56,7 +58,7 @@ MOST_FOLDED = 0.01
 """Share of the pixels told whose places several pixels show."""
 
 
-def raised(measured: Measured) -> dict[str, str]:
+def raised(measured: Measured) -> Flags:
     """Return the limits that an interferogram exceeds: flag → what was measured.
 
     Examples
@@ -64,7 +66,7 @@ def raised(measured: Measured) -> dict[str, str]:
     >>> sorted(raised(Measured(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
-    one, flags = measured, {}
+    one, flags = measured, Flags()
     if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
         beyond = ": the tracks lie further apart than any coherence reaches" if one.overlap == 0 else ""
         flags["interferogram_decorrelated"] = (
