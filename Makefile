@@ -66,6 +66,8 @@ wheel: $(SETUP)
 	$(BIN)/uv build --wheel --no-build-isolation --out-dir build/wheel .
 	$(BIN)/auditwheel repair --wheel-dir dist build/wheel/*.whl
 
+# What pytest makes of the asserts is kept for the next run, also where Python is told to write no bytecode.
+test test-slow: export PYTHONDONTWRITEBYTECODE :=
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
 

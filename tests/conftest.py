@@ -4,10 +4,15 @@ Nothing of apertura is imported before a test needs it: the process that only ha
 """
 
 import fcntl
+import gc
+import os
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
 import pytest
+
+# Arrays here are small, and a test has one core: threads of BLAS that wait for work took a third of all time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # They run in other environments: of roc-validator, of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
@@ -29,6 +34,11 @@ def pytest_collection_modifyitems(config, items):
     gone = [f"{function}[{row}]" for function, row in named.keys() - met]
     if gone and not any("::" in arg for arg in config.args):
         raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(gone))}")
+
+
+def pytest_collection_finish():
+    """What was imported stays: no search for garbage needs to look at it again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

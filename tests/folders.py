@@ -132,12 +132,24 @@ def quality_of(campaign: Campaign, pair: str) -> dict[str, Any]:
     return quality
 
 
+def image_of(campaign: Campaign, pair: str) -> np.ndarray:
+    """Return the pixels of a pair of flight f01."""
+    pixels: np.ndarray = open_stage(campaign.stage("image", "f01", pair), "image").image.values
+    return pixels
+
+
 def edit_config(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change a campaign's config in place."""
     path = root / "config" / "config.yaml"
     document = yaml.safe_load(path.read_text())
     change(document)
     path.write_text(yaml.safe_dump(document))
+
+
+def state(root: Path, section: str, **keys: object) -> Campaign:
+    """Set keys of a section of a campaign's config; return the campaign."""
+    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
+    return Campaign.load(root)
 
 
 def edit_meta(root: Path, node: str, change: Callable[[dict[str, Any]], object]) -> None:

@@ -23,8 +23,10 @@ from apertura.pipeline.store import (
     manifest_of,
     mark_rewritten,
     open_array,
+    open_document,
     open_stage,
     resume,
+    save_document,
     save_stage,
     sharing,
     write_blocks,
@@ -61,6 +63,16 @@ def test_a_changed_file_is_named_with_the_manifest_to_delete(tmp_path):
     chunk.write_bytes(b"x")
     with pytest.raises(CampaignError, match=r"position/.*track\.manifest\.json and run the workflow again"):
         open_stage(tmp_path / "track.zarr", "track").load()
+
+
+def test_a_document_that_is_not_as_it_was_written_is_refused(tmp_path):
+    """Also where it is still a document: its hash is what its manifest says, or it is not read."""
+    path = tmp_path / "scene.json"
+    save_document(path, {"height_m": 1.0})
+    assert open_document(path) == {"height_m": 1.0}
+    path.write_text(path.read_text().replace("1.0", "2.0"))
+    with pytest.raises(CampaignError, match="not as they were written"):
+        open_document(path)
 
 
 def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):

@@ -131,7 +131,7 @@ def aimed(position_m, middle_m, width_deg):
     return Beam(axes, angle, gain, angle, gain)
 
 
-@pytest.mark.quick("0.5-2", "2.0-1", "10.0-5")
+@pytest.mark.quick("0.5-2", "2.0-1")
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
 @pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
 def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):

@@ -102,7 +102,7 @@ def budget(path):
 DRAWN = (geometry, pulses, phase, cuts, waterfall, panels, budget)
 
 
-@pytest.mark.quick("waterfall", "cuts")
+@pytest.mark.quick("cuts")
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
 def test_a_picture_is_as_wide_as_a_page_clips_nothing_and_is_the_same_every_time(draw, tmp_path):
     draw(tmp_path / "one.png")

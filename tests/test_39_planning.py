@@ -50,7 +50,7 @@ SETTINGS = (
 )
 
 
-@pytest.mark.quick("1-hann", "3-none")
+@pytest.mark.quick("1-hann")
 @compiled
 @pytest.mark.parametrize("window", ["none", "hann"])
 @pytest.mark.parametrize("seed", [1, 3, 9])
@@ -78,7 +78,7 @@ def white(seed: int, window: str, generator: np.random.Generator):
     return replace(drawn, history=history, profiles=compressed(history, drawn.grid, window), job=job)
 
 
-@pytest.mark.quick("1", "5")
+@pytest.mark.quick("1")
 @pytest.mark.parametrize("seed", range(6))
 def test_the_certified_error_is_met_and_the_first_setting_does(seed):
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=90)

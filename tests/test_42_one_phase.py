@@ -5,7 +5,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from folders import STAND_ON_ALL, copy_writable, edit_config, quality_of, run_steps
+from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, quality_of, run_steps, state
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
@@ -15,7 +15,6 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
-from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.config.processing import Processing
 from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
@@ -30,11 +29,6 @@ from apertura.views.score import score
 PAIRS = ("uav1-uav1", "uav1-uav2")
 ENOUGH, LACKING = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)
 PLACES_M = ((-9, -8.5), (0, -10), (8, -6), (-5, -3), (4, -1), (-10, 2), (10, 4), (-1, 5.5), (5, 9.5), (-8, 10.5))
-
-
-def state(root, section, **keys):
-    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
-    return Campaign.load(root)
 
 
 def far_away():
@@ -66,10 +60,6 @@ def campaigns(tmp_path_factory):
     edit_config(mended, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     state(right, "processing", autofocus="off")
     return {root.name: run_steps(root, exports=root is mended) for root in (right, mended)}
-
-
-def image_of(campaign, pair):
-    return open_stage(campaign.stage("image", "f01", pair), "image").image.values
 
 
 def opened(campaign):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import STAND_ON_ALL, copy_writable, edit_config, ingest_all, quality_of, run_steps
+from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, ingest_all, quality_of, run_steps, state
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
@@ -39,11 +39,6 @@ PAIRS = ("uav1-uav1", "uav1-uav2")
 FOUND = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))
 
 
-def state(root, section, **keys):
-    edit_config(root, lambda document: document.setdefault(section, {}).update(keys))
-    return Campaign.load(root)
-
-
 def refresh(campaign):
     """Make what images of the first flight begin with."""
     ingest_all(campaign)
@@ -52,10 +47,6 @@ def refresh(campaign):
     scene.scene(campaign)
     for pair in PAIRS:
         profile.profile(campaign, "f01", pair)
-
-
-def image_of(campaign, pair):
-    return open_stage(campaign.stage("image", "f01", pair), "image").image.values
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def test_a_node_that_sends_with_a_random_phase_is_flagged_in_its_own_image(tmp_p
     assert set(flags) == {"phase_unstable"}
 
 
-@pytest.mark.quick("2.5-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("peak_to_peak_db", "flagged"), [(1.5, False), (2.5, True)])
 def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagged):
     flags = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(peak_to_peak_db, 5e-9))).attrs["flags"]
@@ -74,7 +74,7 @@ def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
     assert ("saturated_sidelink" in flags) is flagged
 
 
-@pytest.mark.quick("30.0-divide", "-5.0-two_parameter")
+@pytest.mark.quick("30.0-divide")
 @pytest.mark.parametrize(
     ("snr_db", "method"),
     [(30.0, "divide"), (8.0, "wiener"), (-5.0, "two_parameter"), (-14.0, "two_parameter")],
@@ -86,7 +86,7 @@ def test_auto_takes_the_cheapest_adequate_correction_and_flags_none(tmp_path, sn
     assert "sidelink_noisy" not in attrs["flags"]
 
 
-@pytest.mark.quick("8.0-True")
+@pytest.mark.slow
 @pytest.mark.parametrize(("snr_db", "flagged"), [(8.0, True), (12.0, False)])
 def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, flagged):
     campaign = flown(tmp_path, sidelink_snr_db=snr_db)

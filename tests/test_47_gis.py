@@ -100,7 +100,7 @@ def known_rasters():
     return rasters
 
 
-@pytest.fixture(scope="module", params=["EPSG:32632", LOCAL])
+@pytest.fixture(scope="module", params=["EPSG:32632", pytest.param(LOCAL, marks=pytest.mark.slow)])
 def control(request, tmp_path_factory):
     """Every kind of raster with a control point in it, and where that is."""
     north_m = 5363701.65 if request.param != LOCAL else 40.0

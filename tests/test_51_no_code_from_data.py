@@ -273,8 +273,8 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
     "words",
     [
         "--profile profiles/own",
-        "--profile {linked}",
         *slow(
+            "--profile {linked}",
             "--profile=./profiles/slurm",
             "--profile {campaign}/profiles/slurm",
             "--prof {campaign}/profiles/slurm",

@@ -3,21 +3,42 @@
 Apart from the table of what flags mean, which only pages and summaries read: other words there make no image again.
 """
 
-from collections.abc import Mapping
-from typing import Self
+from collections.abc import Container, Iterable, Mapping
+from typing import ClassVar, Self
 
 
 class Flags(dict[str, str]):
     """Flags of a stage or an image: name in `apertura.common.flags.FLAGS` → one line of what was measured.
 
+    Raises
+    ------
+    KeyError
+        If a name is no row of that table, however it is set.
+
     Examples
     --------
-    >>> found = Flags.merged({"fix_lost": "3 of 90 pulses of uav1"}, {"fix_lost": "7 of 90 pulses of uav2"})
-    >>> found["fix_lost"]
+    >>> found = Flags.merged({"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "7 of 90 pulses of uav2"})
+    >>> found["fix_poor"]
     '3 of 90 pulses of uav1; 7 of 90 pulses of uav2'
     >>> Flags.merged(found, found) == found
     True
+    >>> Flags({"fix_pour": "9 of 90 pulses of uav1"})
+    Traceback (most recent call last):
+    KeyError: 'fix_pour is no row of apertura.common.flags.FLAGS'
     """
+
+    rows: ClassVar[Container[str]] = ()
+    """Names of the table, which sets them: every import of this module loads the package before it."""
+
+    def __init__(self, flags: Mapping[str, str] | Iterable[tuple[str, str]] = ()) -> None:
+        super().__init__()
+        for name, line in dict(flags).items():
+            self[name] = line
+
+    def __setitem__(self, name: str, line: str) -> None:
+        if name not in self.rows:
+            raise KeyError(f"{name} is no row of apertura.common.flags.FLAGS")
+        super().__setitem__(name, line)
 
     @classmethod
     def merged(cls, *several: Mapping[str, str]) -> Self:

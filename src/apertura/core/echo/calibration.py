@@ -13,6 +13,7 @@ from scipy.special import gammainccinv, gammaincinv
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.flags.raised import Flags
 from apertura.core.echo.captures import AT_ONCE
 
 FALSE_REFLECTOR = 1e-3
@@ -112,7 +113,7 @@ def estimate_path_offset(
     parts = _refine(groups, frequency_hz, offset_m[peak])
     mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
     contrast_db = 10 * float(np.log10(power[peak] / max(surroundings, 1e-30)))
-    flags = {}
+    flags = Flags()
     if std_m > NEEDED_STD_M:
         flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
     rival_db, rival_m = _rival(offset_m, power, peak, frequency_hz)

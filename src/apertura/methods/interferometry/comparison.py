@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
+from apertura.common.flags.raised import Flags
 from apertura.methods.interferometry.coherence import chance, formed, unbiased
 from apertura.methods.interferometry.heights import (
     Known,
@@ -81,7 +82,7 @@ MOST_FOLDED = 0.01
 """Share of the pixels told whose places several pixels show."""
 
 
-def raised(measured: InterferogramCounts) -> dict[str, str]:
+def raised(measured: InterferogramCounts) -> Flags:
     """Return the limits that an interferogram exceeds: flag → what was measured.
 
     Examples
@@ -89,7 +90,7 @@ def raised(measured: InterferogramCounts) -> dict[str, str]:
     >>> sorted(raised(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
-    one, flags = measured, {}
+    one, flags = measured, Flags()
     if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
         beyond = ": the tracks lie further apart than any coherence reaches" if one.overlap == 0 else ""
         flags["interferogram_decorrelated"] = (

@@ -8,6 +8,7 @@ import numpy as np
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.flags.raised import Flags
 from apertura.core.echo.compression import phasors, turned
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
@@ -197,9 +198,9 @@ def widths(
     return width(steps[0], lambda apart: power(offset_s + apart, path_m)), path_width
 
 
-def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> dict[str, str]:
+def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> Flags:
     """Return what makes an offset doubtful: others nearly as good, the edge of the search, little contrast."""
-    flags: dict[str, str] = {}
+    flags = Flags()
     away = np.abs(offsets_s - best_s) > 4 * width_s
     rival = float(power.max(initial=0.0, where=away)) / float(power.max())
     if rival > 10 ** (RIVAL_DB / 10):

@@ -11,6 +11,7 @@ import xarray as xr
 
 from apertura.common.contracts import MEASURED, QUOTED, RASTERS, STAGES, Window
 from apertura.common.documents import undamaged
+from apertura.common.flags.raised import Flags
 from apertura.core.combination.sums import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.core.quality.measures import survey
 from apertura.core.scene.grid import SceneGrid
@@ -323,16 +324,17 @@ def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> d
     """Return how each flight's reference image lies against the first flight's, and its flags."""
     (first, image), *others = references.items()
     between: dict[str, Any] = {}
-    flags: dict[str, dict[str, str]] = {}
+    flags: dict[str, Flags] = {}
     for name, other in others:
         found = agreement_of(image, other, grid)
         between[name] = agreement_report(found)
         if found is not None and found.shifted:
-            flags[name] = {
-                "flights_apart": f"{found.points} bright points of flight {name} lie {100 * found.shift_m:.1f} ± "
+            line = (
+                f"{found.points} bright points of flight {name} lie {100 * found.shift_m:.1f} ± "
                 f"{100 * found.shift_std_m:.1f} cm from where flight {first} has them, {100 * found.shift_east_m:+.1f} "
                 f"cm east and {100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
-            }
+            )
+            flags[name] = Flags({"flights_apart": line})
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 

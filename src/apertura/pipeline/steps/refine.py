@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.flags.raised import Flags
 from apertura.common.provenance import merged
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
@@ -99,7 +100,7 @@ def refined_stage(
         },
         attrs={
             "frame": scene.grid.frame,
-            "flags": dict(found.flags),
+            "flags": Flags(found.flags),
             "nodes": nodes,
             "pairs": list(further_m),
             "decisions": {one.name: {"value": one.value, "reason": one.reason} for one in decisions},
