@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from apertura.common.flags import FLAGS
-from apertura.common.flags.raised import Flags
+from apertura.common.flag_table import FLAGS
+from apertura.common.flags import Flags
 from website.pages import PAGES
 
 ROOT = Path(__file__).parents[1]

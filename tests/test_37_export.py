@@ -15,7 +15,7 @@ import zarr
 from rasterio import Affine
 
 from apertura.common.errors import CampaignError, ContractError
-from apertura.common.flags import FLAGS
+from apertura.common.flag_table import FLAGS
 from apertura.core.geometry.geodesy import local_crs
 from apertura.formats.export import exports_in
 from apertura.formats.export.cog import write_power, write_slc

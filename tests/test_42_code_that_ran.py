@@ -70,7 +70,7 @@ CHANGES = [
     ("formats/tracks/csv_track.py", "code", READ - {"raw"}),
     ("formats/recordings/sigmf.py", "code", READ - {"track"}),
     ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
-    ("common/flags/images.py", "code", {"page", "report", "map"}),
+    ("common/flag_table.py", "code", {"page", "report", "map"}),
     ("common/errors.py", "code", set()),
     ("pipeline/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),

@@ -2,7 +2,7 @@
 
 import re
 
-from apertura.common.flags import FLAGS
+from apertura.common.flag_table import FLAGS
 
 _HEAD = """# Flags
 
@@ -17,7 +17,7 @@ the table that closes a run. It never stops a run. Without one, no known limit w
 _FOOT = """
 Limits and how they follow: [echo methods](theory/echo_methods.md), [tracks](theory/tracks.md),
 [planner](theory/planner.md), [terrain](theory/terrain.md), [waveforms](theory/waveforms.md),
-[FMCW](theory/fmcw.md), [focus](theory/focus.md). Written by `make pages` from `FLAGS` of `apertura.common.flags`.
+[FMCW](theory/fmcw.md), [focus](theory/focus.md). Written by `make pages` from `FLAGS` of `apertura.common.flag_table`.
 """
 
 _PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")

@@ -6,7 +6,7 @@ from typing import Any
 
 from apertura.common.documents import undamaged
 from apertura.common.errors import shown
-from apertura.common.flags import FLAGS
+from apertura.common.flag_table import FLAGS
 from apertura.core.quality.budget import is_stated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import open_listed

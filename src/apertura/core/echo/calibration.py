@@ -13,7 +13,7 @@ from scipy.special import gammainccinv, gammaincinv
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.echo.captures import AT_ONCE
 
 FALSE_REFLECTOR = 1e-3

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, correct_clock, spread

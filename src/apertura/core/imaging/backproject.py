@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.documents import validated
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.focus.inputs import PhaseHistory, Profiles

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import reached
 from apertura.core.echo.compression import compress, range_step

@@ -6,7 +6,7 @@ from typing import Any
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.antenna.illumination import decide_antennas
 from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.focus.engines.engine import Setting, power_sum_db

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Terrain

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.methods.interferometry.coherence import chance, formed, unbiased
 from apertura.methods.interferometry.heights import (
     Known,

@@ -8,7 +8,7 @@ import numpy as np
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.echo.compression import phasors, turned
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.demodulate import remove_path

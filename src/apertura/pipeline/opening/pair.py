@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import sha256_file
 from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.antenna.illumination import Illumination, illuminate

@@ -10,7 +10,7 @@ from rich.filesize import decimal
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.job import Job

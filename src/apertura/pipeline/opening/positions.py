@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.geometry.track_checks import CheckedTrack
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
 from apertura.core.combination.sums import choose_fusion
 from apertura.core.focus.inputs import PhaseHistory

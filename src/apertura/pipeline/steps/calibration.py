@@ -8,7 +8,7 @@ import xarray as xr
 
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import canonical_json, chained_sha256
 from apertura.core.echo.calibration import estimate_path_offset, reflector_history
 from apertura.core.geometry.aperture import Aperture

@@ -5,7 +5,7 @@ from typing import Any
 
 import xarray as xr
 
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform

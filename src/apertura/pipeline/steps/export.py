@@ -10,7 +10,7 @@ import xarray as xr
 from rasterio import Affine
 
 from apertura.common.atomic import write_json
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
 from apertura.core.quality.measures import Amplitude, BlockRaster, survey
 from apertura.core.quality.point_targets import find_peak

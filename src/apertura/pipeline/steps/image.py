@@ -10,7 +10,7 @@ import xarray as xr
 
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.core.focus.engines import instruction_set
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.certify import certified, measures

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.flags.raised import Flags
+from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of

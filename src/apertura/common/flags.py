@@ -1,14 +1,16 @@
-"""Flags that were raised: name → what was measured; one way to bring those of several parts together.
+"""Flags that were raised: name → what was measured; one way to merge those of several parts.
 
-Apart from the table of what flags mean, which only pages and summaries read: other words there make no image again.
+Apart from `apertura.common.flag_table`, which no code hash counts: other words there make no image again.
 """
 
-from collections.abc import Container, Iterable, Mapping
-from typing import ClassVar, Self
+from collections.abc import Iterable, Mapping
+from typing import Self
+
+from apertura.common.flag_table import FLAGS
 
 
 class Flags(dict[str, str]):
-    """Flags of a stage or an image: name in `apertura.common.flags.FLAGS` → one line of what was measured.
+    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → one line of what was measured.
 
     Raises
     ------
@@ -24,11 +26,8 @@ class Flags(dict[str, str]):
     True
     >>> Flags({"fix_pour": "9 of 90 pulses of uav1"})
     Traceback (most recent call last):
-    KeyError: 'fix_pour is no row of apertura.common.flags.FLAGS'
+    KeyError: 'fix_pour is no row of apertura.common.flag_table.FLAGS'
     """
-
-    rows: ClassVar[Container[str]] = ()
-    """Names of the table, which sets them: every import of this module loads the package before it."""
 
     def __init__(self, flags: Mapping[str, str] | Iterable[tuple[str, str]] = ()) -> None:
         super().__init__()
@@ -36,8 +35,8 @@ class Flags(dict[str, str]):
             self[name] = line
 
     def __setitem__(self, name: str, line: str) -> None:
-        if name not in self.rows:
-            raise KeyError(f"{name} is no row of apertura.common.flags.FLAGS")
+        if name not in FLAGS:
+            raise KeyError(f"{name} is no row of apertura.common.flag_table.FLAGS")
         super().__setitem__(name, line)
 
     @classmethod
