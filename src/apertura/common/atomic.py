@@ -125,7 +125,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let an `OSError` of the body say which file it is about: that of a write does not know.
+    """Add the path to an `OSError` of the body: that of a write lacks it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A campaign folder as one value: its settings, its flights, and where everything in it lies."""
+"""A campaign folder as one value: settings, flights and paths."""
 
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
@@ -64,7 +64,7 @@ class Campaign(RawFolder):
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """The settings as JSON values, but for those that say where to compute and change no result."""
+        """The settings as JSON values, without those that only state where to compute."""
         return self.settings.model_dump(mode="json", exclude={"processing": {"scheduler"}})
 
     @property
@@ -96,7 +96,7 @@ class Campaign(RawFolder):
 
     @property
     def sent_file(self) -> Path:
-        """The file of what was transmitted: code symbols, or the samples of a pulse."""
+        """The file of the transmitted signal: code symbols, or the samples of a pulse."""
         key = getattr(self.settings.waveform, "file_key", "")
         return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
 
@@ -137,11 +137,11 @@ class Campaign(RawFolder):
         return own
 
     def clock(self, flight: str, node: str) -> ClockRow:
-        """Return how a node's recorder stands to its log in a flight."""
+        """Return the clock of a node's recorder against its log in a flight."""
         return self._clocks.get((flight, node), ClockRow(flight, node))
 
     def node(self, flight: str, node: str) -> Node:
-        """Return the settings of a node as they hold in a flight: what clocks.tsv says of its tags goes first."""
+        """Return the settings of a node in a flight; clocks.tsv overrides its stated time tags."""
         stated, std_s = self.settings.nodes[node], self.clock(flight, node).std_s
         return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
 
@@ -150,7 +150,7 @@ class Campaign(RawFolder):
         return {(clock.flight, clock.node): clock for clock in self.clocks}
 
     def relevant(self, stage: str, pair: str = "", *, flight: str = "") -> dict[str, Any]:
-        """Return the settings that matter for a stage of a pair, as JSON values: no more, so that no more reruns."""
+        """Return the settings that affect a stage of a pair, as JSON values: no others, to avoid needless reruns."""
         settings, processing = self.values, self.values["processing"]
         beams = self.antennas(pair) if pair else {}
         stated = {point: beam.model_dump(mode="json") for point, (_, beam) in beams.items()}
@@ -185,7 +185,7 @@ class Campaign(RawFolder):
         return chosen.get(stage, {})
 
     def _relevant_to_echo(self, flight: str, pair: str, beams: Collection[str]) -> dict[str, Any]:
-        """Return what matters for a pair's echo: whether there are beams, not what they are."""
+        """Return the settings that affect a pair's echo: whether there are beams, not their shapes."""
         settings = self.values
         nodes = {
             node: {key: value for key, value in settings["nodes"][node].items() if key != "antennas"}
@@ -197,8 +197,8 @@ class Campaign(RawFolder):
             "segments": [list(segment) for segment in self.segments_of(flight, pair)],
             "clocks": [asdict(self._clocks[flight, node]) for node in nodes if (flight, node) in self._clocks],
         }
-        asked = {key: settings["processing"][key] for key in ("sidelink", "accuracy_db")}
-        always = {"waveform": settings["waveform"], "nodes": nodes, **asked}
+        requested = {key: settings["processing"][key] for key in ("sidelink", "accuracy_db")}
+        always = {"waveform": settings["waveform"], "nodes": nodes, **requested}
         return always | {name: value for name, value in stated.items() if value}
 
     def log_settings(self, node: str) -> dict[str, Any]:

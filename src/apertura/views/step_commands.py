@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from apertura.common.processes import as_typed, given
-from apertura.common.progress import telling, told_at
+from apertura.common.progress import progress_path, reporting_to
 
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
 
@@ -21,7 +21,7 @@ def _run(function: str, campaign: Path, *arguments: str, **options: object) -> N
     from apertura.pipeline.campaign import Campaign
 
     opened = Campaign.load(given(campaign))
-    with telling(opened.result(*told_at([function.rpartition(":")[2], *arguments]))):
+    with reporting_to(opened.result(*progress_path([function.rpartition(":")[2], *arguments]))):
         written = pkgutil.resolve_name(function)(opened, *arguments, **options)
     for path in [written] if isinstance(written, Path) else written:
         print(as_typed(path))

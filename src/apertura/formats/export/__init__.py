@@ -1,6 +1,6 @@
 """Files for other programs: one module per format, one row per file.
 
-A row says the file's name, which raster it is written from and what writes it. Rows drive the rules of the workflow,
+A row states the file's name, its source raster and the function that writes it. Rows drive the rules of the workflow,
 the steps and the tests; nothing else names a product. To add one, write a function such as
 `apertura.formats.export.cog.write_power` and add its row to `EXPORTS`; or, from another package, register an `Export`
 as entry point of group ``apertura.exports``. Importing this module imports no format.
@@ -57,15 +57,15 @@ class Export:
         ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.formats.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
-    laid
-        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
+    mosaicked
+        Whether the rasters of all flights are mosaicked: GDAL cannot mosaic complex ones.
     """
 
     file: str
     source: str
     function: str
     pictured: bool = False
-    laid: bool = True
+    mosaicked: bool = True
 
     @property
     def module(self) -> str:
@@ -74,7 +74,7 @@ class Export:
 
     @property
     def style(self) -> bool:
-        """Whether it says how QGIS shows the raster of its name."""
+        """Whether it is the style in which QGIS shows the raster of its name."""
         return self.module == "apertura.formats.export.style"
 
     @property
@@ -85,13 +85,13 @@ class Export:
 
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", mosaicked=False),
     Export("power.tif", "image", "apertura.formats.export.cog:write_power"),
     Export("power.qml", "image", "apertura.formats.export.style:write_linear_style"),
     Export("db.tif", "image", "apertura.formats.export.db:write_db"),
     Export("db.qml", "image", "apertura.formats.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.formats.export.quicklook:write_quicklook", pictured=True),
-    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", mosaicked=False),
     Export("coherent_power.tif", "coherent", "apertura.formats.export.cog:write_power"),
     Export("coherent_power.qml", "coherent", "apertura.formats.export.style:write_linear_style"),
     Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db"),
@@ -182,7 +182,7 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
             for row in (row for kind in kinds for row in exports_in(kind)):
-                if row.laid and row.file.endswith(".tif"):
+                if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
                     found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
     return found

@@ -14,8 +14,7 @@ from apertura.common.atomic import replacement
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 
-# ---- What a CPHD file says of a pair besides its samples: where and when, of which scene, and each pulse's
-# parameters
+# ---- Metadata of a CPHD file, and parameters of each pulse ----------------------------------------------------------
 
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
@@ -141,8 +140,7 @@ class CphdCollection:
         return table
 
 
-# ---- Compensated phase history (CPHD 1.1.0, NGA.STND.0068-1) of one pair, for other processors and for `apertura`
-# itself
+# ---- Compensated phase history of one pair (CPHD 1.1.0, NGA.STND.0068-1) --------------------------------------------
 #
 # Signals are Σ a·exp(-j2πf(τ-τ_ref)), SGN -1, where τ_ref is the delay of the reference point of the scene, one for
 # all pulses (docs/formats/phase_history.md, "CPHD"). Metadata and pulse parameters are written by sarkit, samples in

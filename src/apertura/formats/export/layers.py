@@ -1,4 +1,4 @@
-"""Layers that explain an image: angles of view, where it saw nothing or too much, and how many pulses made it."""
+"""Layers of an image: angles of view, mask of shadow and layover, and number of pulses."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from apertura.common.errors import ContractError
 from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, write_cog
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
-"""Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
+"""Bits of the mask, and its value where no pulse makes the pixel; 0 is visible once."""
 
 CLASSES = {
     0: ("valid", (255, 255, 255)),

@@ -195,7 +195,7 @@ def round_length(most_m: float) -> float:
 
 
 def from_origin(origin: float, value: float, _position: int | None) -> str:
-    """Return the label of a tick that counts from an origin, as matplotlib asks for it."""
+    """Return the label of a tick that counts from an origin, as a formatter of matplotlib."""
     return number(value - origin)
 
 

@@ -49,7 +49,7 @@ POSITIONS = ("tx_position", "rx_position")
 
 
 def check_array(name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
-    """Raise ValueError if an array of a file, not read yet, is not what the layout says.
+    """Raise ValueError if an array of a file, not read yet, violates the layout.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
     path
         The file or folder, for messages.
     fields
-        Arrays of `LAYOUT`, each with the dimensions that `check_array` asks for, and ``frame`` as text, which counts
+        Arrays of `LAYOUT`, each with the dimensions that `check_array` requires, and ``frame`` as text, which counts
         where there are positions.
 
     Raises

@@ -25,7 +25,7 @@ _EARTH_M = (6.3e6, 1e8)
 
 
 class Samples(Protocol):
-    """Transfer functions, (pulse, subcarrier), read as they are asked for: an array, or what behaves so."""
+    """Transfer functions, (pulse, subcarrier), read lazily: an array, or an array-like."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -57,7 +57,7 @@ class History:
     reference_delay
         (pulse,) float64, seconds: τ_ref.
     path_limit
-        (pulse,) float64, metres of total path beyond which there are no echoes; infinite where nothing says.
+        (pulse,) float64, metres of total path beyond which there are no echoes; infinite where not stated.
     used
         (pulse,) bool, those that hold echoes.
     frame
@@ -123,7 +123,7 @@ def largest_by_row(
 
 
 def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dataset":
-    """Return the `echo` stage of files that follow each other; samples are read as they are asked for.
+    """Return the `echo` stage of files that follow each other; samples are read lazily.
 
     Parameters
     ----------

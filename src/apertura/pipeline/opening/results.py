@@ -24,7 +24,7 @@ _OF_THE_CAMPAIGN = {"cube", "terrain"}
 
 @dataclass(frozen=True)
 class OpenCampaign:
-    """A validated campaign folder with its results; everything is read when it is asked for.
+    """A validated campaign folder with its results; everything is read on first use.
 
     Attributes
     ----------

@@ -13,7 +13,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
 from apertura_research.study.refinement.echoes import transfer
 from apertura_research.study.refinement.flights import FLIGHTS, NODES, Flight, drawn_errors
 from apertura_research.study.refinement.scenes import GRID, SCENES, Scatterers
@@ -33,7 +33,7 @@ class Case:
     ----------
     name
         scene, geometry, pairs, sigma (m), SNR (dB) and seed.
-    sightings
+    records
         Of all pairs, as the logs have them.
     errors
         Node → what is known of the errors of its log.
@@ -48,11 +48,11 @@ class Case:
     """
 
     name: tuple[str, str, str, float, float | None, int]
-    sightings: tuple[Sighting, ...]
+    records: tuple[PairRecord, ...]
     errors: Mapping[str, TrackErrors]
     truth: TrackCorrection
     targets_m: NDArray[np.float64]
-    probes: tuple[Sighting, ...]
+    probes: tuple[PairRecord, ...]
     reach_m: tuple[float, float]
 
 
@@ -82,11 +82,11 @@ def case(
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
     return Case(
         (scene, geometry, pairs, sigma_m, snr_db, seed),
-        tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(record(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
         dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
         truth,
         scatterers.places_m[scatterers.targets],
-        tuple(sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
         flight.reach_m,
     )
 
@@ -96,14 +96,14 @@ def _probes(generator: np.random.Generator) -> Scatterers:
     return Scatterers(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
 
 
-def sighting(
+def record(
     pair: str,
     flight: Flight,
     truth: TrackCorrection,
     scatterers: Scatterers,
     snr_db: float | None,
     generator: np.random.Generator,
-) -> Sighting:
+) -> PairRecord:
     """Return what a pair saw of some scatterers, given back the sidelink's length that the logs have.
 
     Parameters
@@ -132,7 +132,7 @@ def sighting(
         echo += np.float32(std) * parts.view(np.complex64)[..., 0]
     weights = window_weights("hann", SUBCARRIERS)
     history = PhaseHistory(echo, FREQUENCY_HZ, weights, np.zeros(len(echo)), logged)
-    return Sighting(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
+    return PairRecord(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
 
 
 def _signal_power(echo: NDArray[np.complex64], scatterers: Scatterers, flown: Aperture) -> float:

@@ -10,7 +10,7 @@ from apertura.common.arrays import Floats
 from apertura.core.focus.engines import native
 from apertura.core.focus.engines.native_tables import Tables
 from apertura.core.geometry.phase_centres import TrackCorrection
-from apertura.methods.autofocus.inputs import Sighting
+from apertura.methods.autofocus.inputs import PairRecord
 from apertura_research.study.refinement.cases import PROBES_M, Case
 from apertura_research.study.refinement.scenes import GRID
 
@@ -35,14 +35,14 @@ class Peaks:
 
 
 def peaks(
-    sightings: Sequence[Sighting], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
+    records: Sequence[PairRecord], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
 ) -> Peaks:
     """Return the highest peaks within reach of points (point, 3) as imaged from corrected tracks."""
     found = []
-    for one in sightings:
+    for one in records:
         tables = native.prepare(one.moved(correction))
         found.append([_peak(tables, point, reach_m) for point in points_m])
-    height = np.array([[peak for peak, _ in row] for row in found]).reshape(len(sightings), len(points_m))
+    height = np.array([[peak for peak, _ in row] for row in found]).reshape(len(records), len(points_m))
     place = np.array([[place for _, place in row] for row in found]).reshape(*height.shape, 3)
     return Peaks(height, place)
 
@@ -83,17 +83,17 @@ def judge(one: Case, correction: TrackCorrection = UNCORRECTED) -> Judgement:
     The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
     """
     probe_loss, probe_shift = _against_truth(one, one.probes, PROBES_M, correction)
-    target_loss, target_shift = _against_truth(one, one.sightings, one.targets_m, correction)
+    target_loss, target_shift = _against_truth(one, one.records, one.targets_m, correction)
     return Judgement(
         _mean(probe_loss), float(probe_loss.min()), _median(probe_shift), _mean(target_loss), _median(target_shift)
     )
 
 
 def _against_truth(
-    one: Case, sightings: Sequence[Sighting], points_m: Floats, correction: TrackCorrection
+    one: Case, records: Sequence[PairRecord], points_m: Floats, correction: TrackCorrection
 ) -> tuple[Floats, Floats]:
     """Return loss (dB) and shift (cm) of points, (pair, point) float64 each."""
-    true, now = (peaks(sightings, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
+    true, now = (peaks(records, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
     loss = 20 * np.log10(now.height / true.height)
     return loss, 100 * np.linalg.norm(now.place_m - true.place_m, axis=-1)
 
@@ -106,7 +106,7 @@ def _median(values: Floats) -> float:
     return float(np.median(values)) if values.size else np.nan
 
 
-def image_seconds(one: Sighting, *, thinning: int = 5) -> float:
+def image_seconds(one: PairRecord, *, thinning: int = 5) -> float:
     """Return the processor time of an image of the whole scene of every fifth pulse, by the native engine."""
     begun = process_time()
     native.form(native.prepare(one.profiles[::thinning]), GRID.positions(0.0))

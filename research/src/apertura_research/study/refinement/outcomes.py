@@ -73,7 +73,7 @@ def drawn(scene: str, sigma_cm: float, seed: int) -> Case:
 
 def refined(one: Case) -> Refinement:
     """Return what the product makes of a case whose errors are stated as they are."""
-    return refine(one.sightings, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
+    return refine(one.records, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
 
 
 def _stated(known: TrackErrors) -> TrackErrors:
