@@ -22,9 +22,9 @@ _REMEDIES = {
     errno.EISDIR: "Move away the folder that stands where a file should be",
     errno.ENOTEMPTY: "Move away what stands there",
     errno.ENAMETOOLONG: "Give flights and nodes shorter names",
-    errno.EPIPE: "Whoever read the output has gone",
+    errno.EPIPE: "The reader of the output has gone",
 }
-"""Error number of the system → what a person can do about it."""
+"""Error number of the system → remedy."""
 
 _LONGEST = {"where": 400, "found": 1000, "expected": 1000, "remedy": 400}
 """Characters of each part of a message; text of untrusted files may be of any length."""
@@ -122,7 +122,7 @@ def explained(error: BaseException) -> str | None:
     Returns
     -------
     str or None
-        What it was, where, how much is free there and what to do; None for any other error, a defect of the product.
+        Message with path, free space and remedy; None for any other error, a defect of the product.
 
     Examples
     --------

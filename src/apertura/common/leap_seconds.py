@@ -40,7 +40,7 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
     Returns
     -------
     ndarray
-        Of the same shape, int64, s. After `KNOWN_UNTIL` it is what it was then; with a notice.
+        Of the same shape, int64, s. After `KNOWN_UNTIL` it stays constant, with a notice.
 
     Raises
     ------

@@ -137,7 +137,7 @@ _TRIES, _BETWEEN_S = 20, 0.02
 
 
 def hold(root: Path) -> IO[str]:
-    """Hold a campaign folder until the file returned is closed, or its process ends.
+    """Lock a campaign folder until the returned file is closed, or its process ends.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def hold(root: Path) -> IO[str]:
 
 
 def holder(root: Path) -> str | None:
-    """Return who holds a campaign folder: process, machine, since when; None if nobody does.
+    """Return the holder of a campaign's lock: process, machine, start; None if it is free.
 
     Examples
     --------

@@ -128,7 +128,7 @@ class Provenance:
             Stages of one line, whose settings agree; or name → stage of several lines, such as the pairs of a flight,
             whose settings are kept apart under their names.
         settings, inputs
-            What of the config mattered, and role → sha256 of files read, now.
+            Settings used, and role → sha256 of files read, of this stage alone.
         software
             Name → version of what runs now.
 

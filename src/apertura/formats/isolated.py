@@ -49,7 +49,7 @@ class UnreadableError(ValueError):
 def read_isolated(
     function: str, paths: Sequence[Path], *, seconds: float | None = None, memory_bytes: int | None = None
 ) -> list[dict[str, NDArray[Any]]]:
-    """Return what a reader makes of each file, in one process for all.
+    """Return the result of a reader for each file, in one process for all.
 
     Parameters
     ----------

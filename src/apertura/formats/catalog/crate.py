@@ -46,11 +46,11 @@ class CrateJob:
     code_sha256
         Of the code that ran.
     settings
-        What of the config mattered to it.
+        Settings that affect it.
     sources
-        Names of what it was made from: results by their manifests (``results/…``), and inputs.
+        Names of its sources: results by their manifests (``results/…``), and inputs.
     files
-        What it made, manifests last.
+        Files that it made, manifests last.
     doubts
         Why it would not be made so today, a line each.
     """
@@ -85,7 +85,7 @@ class CrateRun:
     jobs
         In the order in which they can run.
     inputs
-        What the campaign consists of, beside its results.
+        Files of the campaign beside its results.
     workflow
         Files of the workflow, as they lie beside the crate.
     """

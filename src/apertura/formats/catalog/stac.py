@@ -170,11 +170,11 @@ class FileFacts:
     Attributes
     ----------
     title
-        What a person would call it.
+        Title for people.
     bands
         Of a raster: fields of the raster extension, one mapping a band.
     inputs
-        File → sha256 of what a raster was made from.
+        Source file of a raster → sha256.
     """
 
     title: str
@@ -278,7 +278,7 @@ class Image:
     flight, name
         Which: a pair, 'coherent' or 'noncoherent'.
     title
-        What a person would call it.
+        Title for people.
     geometry
         GeoJSON, longitude and latitude of WGS 84; None in a local frame, or where nothing was illuminated.
     acquisition

@@ -243,7 +243,7 @@ def write_exports(
     folder
         Where they go.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and what a person would call it.
+        Source → (y, x) raster on the campaign's grid, and its title.
     tags
         Of every file, name → text.
     radiometry

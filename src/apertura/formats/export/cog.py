@@ -39,7 +39,7 @@ class NorthUpRaster(Protocol):
 
 @dataclass(frozen=True)
 class Band:
-    """What a raster file holds.
+    """Band of a raster file.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ def write_slc(
     tags
         Provenance, name → text.
     title
-        What a person would call it; becomes the TIFF's ImageDescription.
+        Title for people, the TIFF's ImageDescription.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def write_cog(
     image
         (y, x), north-up.
     band
-        What the file will hold.
+        Dtype, no data, unit and description.
     value
         Block of `image` → block of the file, in the dtype of `band`.
 

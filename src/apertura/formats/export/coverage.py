@@ -1,4 +1,4 @@
-"""What the flights of a campaign cover: a picture of looks, pairs, footprints and tracks, and the same for a GIS."""
+"""Coverage of a campaign: looks, pairs, footprints and tracks as a picture and for a GIS."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

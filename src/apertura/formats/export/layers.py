@@ -19,7 +19,7 @@ CLASSES = {
     SHADOW | LAYOVER: ("shadow and layover", (150, 20, 60)),
     OUTSIDE: ("outside, no data", (0, 0, 0)),
 }
-"""Value of the mask → what it means, and its colour."""
+"""Value of the mask → meaning and colour."""
 
 INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
 BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")

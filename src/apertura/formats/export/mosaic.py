@@ -28,7 +28,7 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
     rasters
         Files of one band, real, all on one grid, the lowest first.
     title
-        What a person would call it.
+        Title for people.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.E
 
 
 def _common(radiometries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what the rasters agree on of what their values mean, and levels that span them all."""
+    """Return the radiometry that all rasters share, and levels that span them all."""
     common = {
         name: value for name, value in radiometries[-1].items() if all(one.get(name) == value for one in radiometries)
     }

@@ -1,4 +1,4 @@
-"""What a pixel's value means, in words for the band and as values for the tag."""
+"""Radiometry of a raster: meaning of its values, in words for the band and as JSON for the tag."""
 
 import json
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ TAG = "APERTURA_RADIOMETRY"
 
 @dataclass(frozen=True)
 class Radiometry:
-    """What the values of a raster mean, whichever file shows them.
+    """Meaning of the values of a raster, in any of its files.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target that eve
 
 
 def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict[str, Radiometry]:
-    """Return what the sums of a flight's pairs mean, by their source in `apertura.formats.export.SOURCES`.
+    """Return the radiometry of the sums of a flight's pairs, by their source in `apertura.formats.export.SOURCES`.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     Parameters
     ----------
     path
-        ``….qml``; complete or absent. A raster of that name lies beside it: its tag `radiometry.TAG` tells
+        ``….qml``; complete or absent. A raster of that name lies beside it: its tag `radiometry.TAG` states
         peak and noise floor.
     *_, **__
         What other products are written from.

@@ -22,7 +22,7 @@ from apertura.formats.phase_histories.phase_history import LARGEST, History, joi
 
 _EXPECTED = "a CPHD file, version 1.0.1 or 1.1.0, of samples over frequency (DomainType FX), not compressed"
 _FORMATS = {"CF8": ">c8", "CI4": ">i2", "CI2": "i1"}
-"""SignalArrayFormat → what a sample is made of: one complex number, or two whole ones."""
+"""SignalArrayFormat → dtype of a sample: one complex number, or two integers."""
 
 _LARGEST = {
     "TxTime": 1e7,
@@ -34,7 +34,7 @@ _LARGEST = {
     "TOA1": 1.0,
     "TOA2": 1.0,
 }
-"""What a parameter of a pulse may be, s and Hz; 1e8 m for positions."""
+"""Largest parameters of a pulse, s and Hz; 1e8 m for positions."""
 
 _CYCLES = 1e-5
 """By which a pulse's frequencies may turn an echo at the edge of its swath against those of another: -84 dB."""
@@ -43,7 +43,7 @@ _NORMAL = 1
 """SIGNAL of a pulse with an echo; 0: none, 2: noise, 3: noise of normal level."""
 
 _ATMOSPHERE_S = 1e-7
-"""Delay (s) of 30 m, more than troposphere and ionosphere add to any path; used where a file does not state it."""
+"""Seconds, 30 m of path: more than troposphere and ionosphere add to any path, where a file does not state it."""
 
 _REACH = 1e-3  # of a step: FX1 and FX2 are rounded
 

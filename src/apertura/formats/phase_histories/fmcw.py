@@ -23,7 +23,7 @@ from apertura.formats.times import utc_times
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
 _LARGEST = 1e15
-"""What a sample may be: its square is a float32."""
+"""Largest sample: its square is a float32."""
 
 _FARTHEST_S = 2.0**33
 """Since 1970, what nanoseconds can count."""

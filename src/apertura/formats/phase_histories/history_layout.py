@@ -29,7 +29,7 @@ class Field(NamedTuple):
     kinds: str
     """Of numpy's dtypes."""
     largest: float
-    """What it may hold."""
+    """Range of its values."""
     optional: bool = False
 
 
@@ -42,7 +42,7 @@ LAYOUT: Mapping[str, Field] = {
     "reference_delay": Field(("pulse",), "fiu", 1.0),
     "path_limit": Field(("pulse",), "fiu", 1e12, optional=True),
 }
-"""Name → what it is; Hz, metres, seconds."""
+"""Name → array of the layout; Hz, metres, seconds."""
 
 POSITIONS = ("tx_position", "rx_position")
 """Left out where flight logs hold them."""
@@ -86,7 +86,7 @@ def check_attributes(frame: object, units: object, *, placed: bool) -> None:
 
 
 def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
-    """Return what a file of this layout holds.
+    """Return the arrays of a file of this layout.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 LARGEST = 1e30
-"""What a sample may hold: its square is a number that float32 still adds."""
+"""Largest sample: its square still adds up in float32."""
 
 _BLOCK_BYTES = 8 << 20
 _EARTH_M = (6.3e6, 1e8)
@@ -33,7 +33,7 @@ class Samples(Protocol):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """What it gives."""
+        """Type of its values."""
 
     def __getitem__(self, index: Any) -> NDArray[Any]: ...
 
@@ -85,12 +85,12 @@ class History:
 def largest_by_row(
     name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError]
 ) -> NDArray[np.float64]:
-    """Return the largest magnitude along the first axis of what a file holds, read in blocks.
+    """Return the largest magnitude of an array along its first axis, read in blocks.
 
     Parameters
     ----------
     name
-        What the file calls it.
+        Its name in the file.
     values
         (row, …) numbers.
     largest

@@ -25,7 +25,7 @@ _APART_S = 1.5
 """By what seconds and clock step apart where the clock stood still: a whole second is late by 1 s at most."""
 
 _TOLERANCE_S = 0.1
-"""How well the seconds of a part must tell its clock's zero, and how far an epoch may lie outside its second: AirData's
+"""Seconds, accuracy of a part's clock zero, and how far an epoch may lie outside its second: AirData's
 interval."""
 
 _ROUNDING_S = 1e-6

@@ -200,7 +200,7 @@ def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") 
     key
         Field of `LogOptions`.
     found
-        What the log leaves open.
+        Value that the log lacks.
     node, where
         Whose log, and its file.
     remedy

@@ -97,7 +97,7 @@ PARTS = 8
 
 _BY_CHANCE = 1e-3  # false alarm rate of the test against the log's stated errors
 _SLACK = 1.5  # factor on the variance: the image determines its modes not wholly
-_REACH_CELLS, _STEPS = 3.0, 37
+_REACH_CELLS, _STEPS = 3.0, 37  # of the line in range on which a point is searched: cells on either side, samples
 _SLIP_SIGMA = 4.0  # standard deviations from which a shift in range is a slip
 _LEAST_POINTS = 3  # that must agree on the shift of a part of the aperture
 _DOMINATES = 4.0  # peak power of a part's image of a point against the median of a line through it
@@ -156,13 +156,13 @@ class Evidence:
         )
         if self.accepted:
             return line
-        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are asked for" + (
+        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are required" + (
             ", and no slip" if self.slip else ""
         )
 
     @cached_property
     def slip(self) -> str:
-        """Which parts of the aperture see the points where a wavelength of path puts them; nothing if none does."""
+        """Line on parts of the aperture whose images are shifted by a wavelength of path; empty if none is."""
         if self.apart_sigma > MOST_APART_SIGMA:
             return (
                 f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks "

@@ -58,7 +58,7 @@ class Blocks:
 
     Attributes
     ----------
-    sighting
+    record
         The pair.
     edges
         (knot + 1,) int64, first pulse of each block, and the number of pulses.
@@ -67,7 +67,7 @@ class Blocks:
     aperture
         Mean phase centres of each block's pulses, as the logs have them.
     sidelink_m
-        (block, 3) float64, mean of the sighting's; None where it has none.
+        (block, 3) float64, mean of the pair's; None where it has none.
     """
 
     record: PairRecord
@@ -229,8 +229,8 @@ def _towards(
 
 # ---- Sharpness as a function of the tracks, from cached contributions -----------------------------------------------
 
-MOST_WEIGHT = 1e4
-_WEIGHT_OF_RATIO = 3.0
+MOST_WEIGHT = 1e4  # of a patch: bounds the influence of one bright point (eq. 11)
+_WEIGHT_OF_RATIO = 3.0  # weight of a patch over its ratio of peak power to surroundings (eq. 11)
 _SIDELOBES = 1e-3
 """Power of a point's sidelobes beyond its own patch, of an aperture without weights, whatever its tracks."""
 
@@ -279,7 +279,7 @@ class Sharpness:
         Pair → patch → what its blocks add.
     reference
         Node → (knot, 3) float64, metres: corrections that the contributions were cached at.
-    seen
+    statistics
         Pair → patch → what it showed then.
     used
         (patch,) bool, patches that count.

@@ -44,7 +44,7 @@ class SpaceVariance:
         """Of the choice, in one line."""
         return (
             f"one phase per pulse leaves {self.residual_rad:.2g} rad rms and {-self.loss_db:.2g} dB at the scene's "
-            f"edges, {MOST_LOSS_DB:g} dB are borne"
+            f"edges, {MOST_LOSS_DB:g} dB are accepted"
         )
 
 
@@ -102,10 +102,10 @@ Patches = Sequence[NDArray[np.complex64]]
 _SHRINK = 0.7  # of the window, from one pass to the next
 _EDGE_DB, _WIDER = 10.0, 1.5  # the window holds what is brighter below the peak, and half as much again
 _LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance, over its mean squared
-_SETTLED_RAD = 0.05
-_MOST_PASSES = 30
+_SETTLED_RAD = 0.05  # rms change of the phases below which passes end
+_MOST_PASSES = 30  # of phase gradient
 _CHOICES = 2  # of the brightest pixels, before and after they have been sharpened
-_MOST_STEPS = 100
+_MOST_STEPS = 100  # of L-BFGS-B in minimum entropy
 
 
 def phase_gradient(patches: Patches) -> Floats:

@@ -29,13 +29,13 @@ LEAST_PATCHES = 4
 MOST_VALUES = 2**27
 """Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are used."""
 
-_ENOUGH = 12 * CLEAR
+_ENOUGH = 12 * CLEAR  # sum of the ratios at which no more patches are taken
 _SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are less accurate
 _RANGE_CELLS = 1.5  # half of a patch along the line of sight
 _LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half of a patch across it
 _BANDWIDTH = 0.66  # of an error that lasts τ, in 1/τ: its sidelobes should stay in the patch
-_MOST_PIXELS = 1000
-_PULSES = 256
+_MOST_PIXELS = 1000  # of a patch
+_PULSES = 256  # sampled for the directions and cells of a patch
 _SHARE = 0.4  # of all patches, at most, in one ninth of the scene
 
 
@@ -180,10 +180,10 @@ _APART = 0.6  # least distance of patches, in halves of a patch
 MOST_LOOKS = 24
 """Parts of the aperture: each as long as an error lasts, or longer."""
 
-_SIDE_PX = 512
+_SIDE_PX = 512  # of parts of the image formed at once
 _ABOUT_CELLS = 12  # of range: radius of the surroundings
 _SIDELOBES = 1e-3  # of the brightest: fainter places may be its sidelobes
-_MOST_PLACES = 500
+_MOST_PLACES = 500  # of candidates kept
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch,
 
 _FOLDS = 4  # of cross-validation: each part of the patches is left out of one fit
 _APART_CELLS = 2.0  # of range, c/B of total path: patches nearer than that share noise
-_BLOCKS_PER_CORRELATION_TIME = 10  # at least, to an error's correlation time
+_BLOCKS_PER_CORRELATION_TIME = 10  # at least
 _BETWEEN_BLOCKS_RAD2 = 0.1  # by which an error grows from block to block: linear between them, an eighth is left
 _LINEAR = 1 / 8  # of that growth is left by offsets that are linear between blocks
 _PULSES = 4096  # read at a time
@@ -79,7 +79,7 @@ def refine_one_phase(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much the echoes of a pair lie further, in total path, than its logs say.
+    """Path offsets of a pair's echoes against its logs, in total path.
 
     Attributes
     ----------

@@ -37,8 +37,8 @@ from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle,
 
 _LEAST_RATIO = 30.0  # peak power of a point over its surroundings, for a measured place
 _LEAST_STD_M = 0.01  # of a point's place between pairs: bistatic scattering centres differ
-_ZOOMS, _SIDE = 3, 9
-_ROUNDS = 3
+_ZOOMS, _SIDE = 3, 9  # of the search for a point's place: rounds, samples along a side
+_ROUNDS = 3  # of least squares in the gauge, linearised anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +188,8 @@ def _rms(residuals: Floats) -> float:
 FOLDS = 4
 """Of cross-validation: a quarter of the patches is left out of the fit and decides on acceptance."""
 
-_KNOTS_PER_CORRELATION_TIME = 10  # to an error's correlation time
-_LEAST_KNOTS = 64
+_KNOTS_PER_CORRELATION_TIME = 10  # of corrections, by the shortest correlation time of an error
+_LEAST_KNOTS = 64  # of a flight
 _FEW = 8  # patches: with fewer, each quarter is left out of one fit
 _LOST_TO_TIES_DB = 0.1  # contrast that fixing the gauge may cost
 _STAGES = 3  # of caching contributions and sharpening

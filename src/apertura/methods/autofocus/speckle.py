@@ -28,7 +28,7 @@ SAMPLING = 0.85
 """Pixels over Nyquist of the image: products of two images are only summed."""
 
 _CELLS_WIDE = 2.5  # of a tile, in cells of an aperture that is flown while an error lasts
-_STEPS = 64
+_STEPS = 64  # pulses sampled for the size and pixels of a tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,8 +329,9 @@ LEAST_EVEN = 0.25
 """Least share of the ground that must be even: sidelobes of a few points agree by chance."""
 
 LEAST_TILES = 8
+"""Least number of tiles: with fewer, none would be left for validation."""
 
-_STAGES, _ITERATIONS = 2, 15
+_STAGES, _ITERATIONS = 2, 15  # of caching contributions; steps of L-BFGS-B in each
 _HELD_OUT = 4  # every fourth tile is left out of the fit
 
 
@@ -392,20 +393,24 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
     }
     if len(ground.pairs) < 2 or count < LEAST_TILES:
         why = (
-            "speckle of one pair says nothing of its tracks" if len(ground.pairs) < 2 else f"{count} tiles are too few"
+            "speckle of one pair does not determine its tracks"
+            if len(ground.pairs) < 2
+            else f"{count} tiles are too few"
         )
         flags = {"refinement_too_few_patches": why}
         return Refinement(TrackCorrection(knots_s, prior.tracks(nothing)), std_m, False, why, {"tiles": count}, flags)
     held_out = np.arange(count) % _HELD_OUT == 2
-    first_s = _coherence(ground, prior, nothing, held_out)
-    told = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
-    agreed = SpeckleEvidence(first_s[0], told[0], count, _coherence(ground, prior, nothing, np.ones_like(held_out))[1])
-    found = _solved(ground, prior, np.ones_like(held_out)) if agreed.accepted else nothing
-    coherence = [round(agreed.before, 3), round(agreed.after, 3)]
-    report: dict[str, Any] = {"tiles": count, "even": round(agreed.even, 3), "coherence": coherence}
-    flags = {} if agreed.accepted else {"refinement_rejected": agreed.why}
+    before = _coherence(ground, prior, nothing, held_out)
+    after = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
+    evidence = SpeckleEvidence(
+        before[0], after[0], count, _coherence(ground, prior, nothing, np.ones_like(held_out))[1]
+    )
+    found = _solved(ground, prior, np.ones_like(held_out)) if evidence.accepted else nothing
+    coherence = [round(evidence.before, 3), round(evidence.after, 3)]
+    report: dict[str, Any] = {"tiles": count, "even": round(evidence.even, 3), "coherence": coherence}
+    flags = {} if evidence.accepted else {"refinement_rejected": evidence.why}
     correction = TrackCorrection(knots_s, prior.tracks(found))
-    return Refinement(correction, std_m, agreed.accepted, agreed.why, report, flags)
+    return Refinement(correction, std_m, evidence.accepted, evidence.why, report, flags)
 
 
 def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:

@@ -93,7 +93,7 @@ def interferogram_flags(measured: InterferogramCounts) -> dict[str, str]:
     if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
         beyond = ": the tracks lie further apart than any coherence reaches" if one.overlap == 0 else ""
         flags["interferogram_decorrelated"] = (
-            f"{one.coherent} of {one.common} pixels that both images see are more coherent than chance; in the median "
+            f"{one.coherent} of {one.common} pixels visible to both are more coherent than chance; in the median "
             f"coherence is {one.coherence:.2f} where chance makes {one.chance:.2f} and geometry leaves "
             f"{one.overlap:.2f} of the spectrum in common{beyond}"
         )

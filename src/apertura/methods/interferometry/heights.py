@@ -225,7 +225,7 @@ MARGIN = 1.4
 
 
 _STEPS = 30  # of the fixed-point search for the pixel that shows a place
-_MOST_COVERED = 1.5  # twice is folded over
+_MOST_COVERED = 1.5  # pixels that may show one place: 2 mean layover
 _TOLERANCE_PX = 0.05  # tolerance of that search
 
 
@@ -293,7 +293,7 @@ class PlacedHeights:
     std
         (y, x) float64, metres, by the phase's scatter alone.
     folded
-        Places that more than one pixel shows by the heights found: laid over, or unwrapped by whole turns too far.
+        Places that more than one pixel shows by these heights: layover, or errors of unwrapping by whole turns.
     """
 
     height: Floats

@@ -22,9 +22,9 @@ AMBIGUITY_DB = -1.0
 LEAST_CONTRAST_DB = 6.0
 """Peak over the median of all offsets: less is chance."""
 
-_STEPS_PER_WAVE = 8
-_OVERSAMPLING = 8
-_WIDTH_DB = -1.0
+_STEPS_PER_WAVE = 8  # offsets per wavelength of change of the fastest path
+_OVERSAMPLING = 8  # of paths
+_WIDTH_DB = -1.0  # level of the peak at which widths are measured
 
 
 @dataclass(frozen=True)

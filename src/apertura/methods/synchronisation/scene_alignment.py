@@ -25,7 +25,7 @@ from apertura.methods.synchronisation.clock_alignment import (
 MOST_PIXELS = 96
 """Along a side of the coarse image on which offsets are tried."""
 
-_OVERSAMPLING = 2.0
+_OVERSAMPLING = 2.0  # of range profiles
 _ABOUT_CELLS = 8  # of range: half a side of the fine image about the brightest place
 _FINE = 4  # pixels per cell of the fine image
 _MAXIMA = 3  # of the coarse search that are refined

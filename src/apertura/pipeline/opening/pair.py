@@ -1,4 +1,4 @@
-"""A pair, opened once: its pulses, its antennas' beams, its echo, or what the flight logs promise of it."""
+"""A pair, opened once: pulses, beams and echo, or before that is formed its geometry from the flight logs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -159,7 +159,7 @@ def _refuse(
     )
 
 
-# ---- The echo of a recorder that hands over transfer functions, as it lies in raw/; its positions may lie in a log
+# ---- Echo of a recorder of transfer functions; positions of its own or by logs --------------------------------------
 
 
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
@@ -241,7 +241,7 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     )
 
 
-# ---- A pair, opened once: from its echo, or before that is formed from what the flight logs promise ----------------
+# ---- A pair, opened from its echo, or before that from the flight logs ----------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +305,7 @@ class OpenPair:
 
 
 def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> OpenPair:
-    """Return what is known of a pair: `echo`, its stage as far as it is formed, or what the logs promise."""
+    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs."""
     waveform = campaign.settings.waveform
     if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
         echo = open_stage(campaign.stage("echo", flight, pair), "echo")
@@ -335,7 +335,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform) -> OpenPair:
-    """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
+    """Return the pair expected from the logs: the transmitter's pulses within all logs."""
     frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))

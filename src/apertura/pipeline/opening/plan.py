@@ -105,7 +105,7 @@ def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[Bu
 
 
 def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
-    """Return what the spline between the epochs of the logs errs by: noise that lasts an epoch."""
+    """Return the error of the spline between epochs of the logs: noise of one epoch's correlation time."""
     stated = pair.report.get("positions", {})
     errors = [stated.get(leg, {}).get("interpolation_m") for leg in ("tx", "rx")[: len(pair.positions)]]
     if any(error is None for error in errors):
@@ -117,7 +117,7 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
 
 
 def arithmetic_line(error_db: float) -> BudgetLine:
-    """Return what the numerical error measured costs."""
+    """Return the loss by the measured numerical error."""
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
     )

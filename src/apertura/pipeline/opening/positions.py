@@ -115,7 +115,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
 
 
 def _log_report(node: NodeLog) -> dict[str, Any]:
-    """Return what a person should know of how a log was read and smoothed, where there is something."""
+    """Return the report on reading and smoothing of a log; empty without remarks."""
     values = {"smoothing_residual_m": node.smoothing_residual_m} | {
         name: node.track.attrs.get(name) for name in ("source", "remarks")
     }
@@ -155,7 +155,7 @@ def stated_error(settings: Node) -> dict[str, Any]:
 
 
 def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
-    """Return what of a node's log touches its pulses: flag → one line."""
+    """Return the faults of a node's log that affect its pulses: flag → one line."""
     checked, lines = node.checked, {}
     begin, end = node.log_seconds(at[[0, -1]]) + np.array([-1.0, 1.0]) * 2 * node.interval_s
     for name, what in _LINES.items():

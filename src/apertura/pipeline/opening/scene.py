@@ -242,9 +242,9 @@ def open_scene(campaign: Campaign) -> OpenScene:
 
 
 def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
-    """Return the scene as `open_scene`, or what it will be; voids of a DEM are refused here as they will be.
+    """Return the scene as `open_scene`, or before that as planned; voids of a DEM are rejected here too.
 
-    `flown` gives what the first image flight flew; needed only where something is `auto`.
+    `flown` gives the apertures of the first image flight; needed only where something is `auto`.
     """
     requested = campaign.settings.scene
     if (
@@ -272,7 +272,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     campaign
         With its settings.
     flown
-        Gives what the first image flight flew; needed only where something is `auto`.
+        Gives the apertures of the first image flight; needed only where something is `auto`.
     """
     requested, chosen = campaign.settings.scene, {}
     crs, bounds, spacing = requested.crs, requested.bounds_m, requested.spacing_m

@@ -236,7 +236,7 @@ def _blocks(samples: NDArray[Any]) -> Iterator[NDArray[Any]]:
 
 
 def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> None:
-    """Raise CampaignError unless what was written is what a run would read."""
+    """Raise CampaignError unless a run would read back the written campaign."""
     for flight in campaign.flights:
         for node in flight.participants:
             recording = open_recording(campaign.recording_files(flight.name, node))

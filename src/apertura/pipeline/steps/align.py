@@ -18,7 +18,7 @@ from apertura.pipeline.opening.acquisition import Unaligned, unaligned
 from apertura.pipeline.opening.scene import ConfiguredGround
 
 NEAR_S = 5.0
-"""Largest offset searched for a clock in UTC, seconds: more than leap-second and logging delays leave."""
+"""Largest offset searched for a clock in UTC, seconds; of a clock without UTC every offset is searched."""
 
 
 def align(

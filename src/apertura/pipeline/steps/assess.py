@@ -41,7 +41,7 @@ from apertura.pipeline.store import open_stage, save_document
 # ---- Hypotheses that would sharpen a bad image, tried on a bright place ---------------------------------------------
 
 LEAST_GAIN_DB = 1.0
-"""Least gain of the peak power by which a hypothesis is reported: smaller gains occur by chance."""
+"""Least gain of the measure at which a hypothesis is reported; below 2 dB weak evidence (docs/theory/focus.md)."""
 
 _SIDE_PX = 128
 _PIXELS_PER_CELL = 2.5

@@ -113,7 +113,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What both rules open: where the stage goes, what it quotes, what forms it."""
+    """Common inputs of both rules: folder of the stage, reports that it quotes, formation."""
 
     folder: Path
     echo: xr.Dataset

@@ -36,7 +36,7 @@ _FEWEST_ROWS = 16
 
 
 def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDArray[Any]]) -> None:
-    """Write a stage whose array `name` comes in blocks; what `wip` held is begun anew.
+    """Write a stage whose array `name` comes in blocks; earlier content of `wip` is discarded.
 
     Parameters
     ----------

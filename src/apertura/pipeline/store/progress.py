@@ -97,7 +97,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     wip, folder
         As `writing` yields and takes them.
     lineage
-        What it was made from, as `write_manifest` takes it.
+        Its sources, settings and code, for `write_manifest`.
     **attributes
         Attributes of the stage that are known only now, such as what was measured on it.
     """
@@ -105,7 +105,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
         from apertura.pipeline.store.chunks import update_attributes
 
         update_attributes(wip, attributes)
-    for partial in wip.rglob("*.partial"):  # what a killed writer left
+    for partial in wip.rglob("*.partial"):  # of a killed writer
         partial.unlink()
     files = sha256_tree(wip)
     with naming(_lock_of(folder)), _lock_of(folder).open("w", encoding="utf-8") as lock:
