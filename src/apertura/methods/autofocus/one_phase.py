@@ -12,7 +12,7 @@ from apertura.common.arrays import Floats
 from apertura.core.quality.path_errors import PointPaths
 from apertura.methods.autofocus.inputs import NodePrior, TrackErrors
 
-# ---- Space variance: path errors of the scene's edges against those of its middle -----------------------------------
+# ---- Space variance: path errors of the scene's edges against its middle --------------------------------------------
 
 
 MOST_LOSS_DB = 0.1

@@ -32,7 +32,7 @@ from apertura.methods.autofocus.patches import (
 from apertura.methods.autofocus.solve import Gauge, Problem, State, effects, find_gauge, prominent_point_start
 from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
-# ---- Gauge fixed by pairs that show points at one place, and by reference points ------------------------------------
+# ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 
 
 _LEAST_RATIO = 30.0  # peak power of a point over its surroundings, for a measured place

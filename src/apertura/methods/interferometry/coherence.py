@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 
-# ---- Common band of two images, and the window that coherence is estimated over -------------------------------------
+# ---- Common band of two images, and the window of coherence ---------------------------------------------------------
 
 
 def common_band(

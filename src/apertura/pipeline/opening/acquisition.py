@@ -26,7 +26,7 @@ from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.transmitted import Transmitted, check_mixing
 from apertura.pipeline.store import manifest_of, open_stage
 
-# ---- Recording of one node in one flight: samples by channel, antennas by pulse -------------------------------------
+# ---- Recording of one node: samples by channel, antennas by pulse ---------------------------------------------------
 
 
 @dataclass(frozen=True)

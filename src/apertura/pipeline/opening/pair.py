@@ -159,7 +159,7 @@ def _refuse(
     )
 
 
-# ---- Echo of a recorder of transfer functions; positions of its own or by logs --------------------------------------
+# ---- Echo of a recorder of transfer functions, and its positions ----------------------------------------------------
 
 
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:

@@ -106,7 +106,7 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[s
     }
 
 
-# ---- Coherence and phase between the images of a cube: a flight's pairs, and a pair's flights ----------------------
+# ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
 _TILES_AT_ONCE = 4
 """Along a side: tiles are read with a margin, and what they share is read once."""

@@ -101,7 +101,7 @@ def rows_of_chunk(row_bytes: int) -> int:
     return max(_FEWEST_ROWS, 1 << (max(1, _CHUNK_BYTES // max(1, row_bytes)).bit_length() - 1))
 
 
-# ---- Chunks on disk: written through, renamed, checked by their sum on reading --------------------------------------
+# ---- Chunks on disk: written through, renamed, checked on reading ---------------------------------------------------
 
 # What a user has set for zarr (ZARR_…, ~/.config/zarr) changes no byte of ours: one order of arrays and of sums.
 zarr.config.update(zarr.config.defaults[0], priority="new")
